@@ -1,0 +1,59 @@
+# The commands of this project; `make` alone lists them. All of them work in .venv, which the first one makes.
+#   make test PYTHON=python3.12    with that Python, where .venv is not there yet
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+INSTALLED := $(VENV)/.installed
+PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
+PYTEST := $(BIN)/python -m pytest -q --cov --cov-report=term --cov-fail-under=90
+
+.DEFAULT_GOAL := help
+.PHONY: help run test test-all lint format bench clean
+
+help: ## list the commands
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-9s %s\n", $$1, $$2 }' Makefile
+
+run: $(INSTALLED) ## a small discovery, from nothing to its report, in runs/quick
+	@$(BIN)/lpo run --preset quick --out runs/quick
+
+test: $(INSTALLED) ## the tests, without the slow ones, and their coverage
+	@$(PYTEST)
+
+test-all: $(INSTALLED) ## all tests, the slow ones too
+	@$(PYTEST) -m "slow or not slow"
+
+lint: $(INSTALLED) ## style, format and types; changes nothing
+	@$(BIN)/ruff check
+	@$(BIN)/ruff format --check
+	@$(BIN)/mypy
+
+format: $(INSTALLED) ## put every file into the project's format
+	@$(BIN)/ruff check --fix-only
+	@$(BIN)/ruff format
+
+bench: $(INSTALLED) ## measure the speed of training and evolution
+	@$(BIN)/python -m experiments.benchmark
+
+clean: ## remove caches and build outputs; .venv and runs stay
+	@rm -rf build dist site htmlcov coverage.xml .coverage .coverage.* *.egg-info
+	@rm -rf .hypothesis .mypy_cache .pytest_cache .ruff_cache
+	@find . -path ./$(VENV) -prune -o -path ./.git -prune -o -name __pycache__ -type d -prune -exec rm -rf {} +
+
+# An existing .venv is kept if its Python and pip still start. setuptools goes in first, so that
+# building the package uses the tested version and not whatever is newest that day.
+$(INSTALLED): pyproject.toml constraints.txt
+	@$(BIN)/python -m pip --version >/dev/null 2>&1 || { \
+	  command -v $(PYTHON) >/dev/null || { \
+	    echo "make: found no $(PYTHON): install Python 3.11 or newer, or name one with PYTHON=/path/to/python3." >&2; exit 1; }; \
+	  $(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
+	    echo "make: $(PYTHON) is $$($(PYTHON) -V 2>&1), this project needs Python 3.11 or newer: name one with PYTHON=python3.12, say." >&2; exit 1; }; \
+	  echo "Making $(VENV) with $$($(PYTHON) -V) ..."; \
+	  $(PYTHON) -m venv --clear $(VENV) || { \
+	    rm -rf $(VENV); echo "make: $(PYTHON) could not make $(VENV): install its venv module (python3-venv on Debian and Ubuntu)." >&2; exit 1; }; }
+	@$(BIN)/python -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
+	  echo "make: $(VENV) holds $$($(BIN)/python -V 2>&1), this project needs Python 3.11 or newer: remove $(VENV) and try again." >&2; exit 1; }
+	@echo "Installing what the project needs into $(VENV) (a few minutes the first time) ..."
+	@$(PIP) install -c constraints.txt setuptools
+	@$(PIP) install -c constraints.txt --no-build-isolation -e '.[dev]'
+	@touch $@

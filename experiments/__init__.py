@@ -1,0 +1,1 @@
+"""Experiments and benchmarks, one module each: `python -m experiments.NAME`."""

@@ -1,0 +1,108 @@
+"""Check numerically that a drift is one: the conditions of mirror learning on a dense grid.
+
+Kuba et al. (2022) ask of a drift f that f >= 0 everywhere, and that its value and its gradient vanish where the new policy
+equals the old. Those carry the guarantee of monotonic improvement; a learned drift should not be used without them.
+"""
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lpo.drift import Drift
+from scb.agents.ppo import MAX_LOG_RATIO
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """What was found on the grid.
+
+    Attributes:
+      holds: finite and non-negative everywhere, and value and gradient zero at ratio 1.
+      minimum: smallest penalty on the grid.
+      value_at_one, gradient_at_one: largest |f| and |df/dr| at ratio 1 over all advantages.
+      slope_at_0_001, slope_at_0_01: largest |df/dr| at |r - 1| = 0.001 and 0.01. Not a condition, but a drift whose slope
+        jumps just outside its dead zone is one in name only.
+      finite: no NaN or infinity, out to the largest ratio that training meets.
+      grid: what the grid was.
+    """
+
+    holds: bool
+    minimum: float
+    value_at_one: float
+    gradient_at_one: float
+    slope_at_0_001: float
+    slope_at_0_01: float
+    finite: bool
+    grid: str
+
+    def as_dict(self) -> dict[str, Any]:
+        return asdict(self)
+
+    def __str__(self) -> str:
+        verdict = "is a drift" if self.holds else "is NOT a drift"
+        return (
+            f"{verdict}: min f {self.minimum:.3g}, at ratio 1 |f| {self.value_at_one:.3g} and |df/dr| "
+            f"{self.gradient_at_one:.3g}, |df/dr| {self.slope_at_0_001:.3g} at |r - 1| = 0.001 and "
+            f"{self.slope_at_0_01:.3g} at 0.01 ({self.grid})"
+        )
+
+
+def certify(
+    drift: Drift, parameters: Any, num_ratios: int = 2001, num_advantages: int = 401
+) -> Certificate:
+    """Evaluates a drift on a grid of ratios and advantages, and its slope around ratio 1.
+
+    Args:
+      drift: any member of the contract.
+      parameters: its parameters.
+      num_ratios: points of log-ratio, in [-3, 3] and, a quarter as many, out to the bound that training clips at.
+      num_advantages: points of advantage in [-10, 10], the tails of a normalised minibatch.
+    """
+    inner = np.linspace(-3.0, 3.0, num_ratios | 1)
+    outer = np.linspace(-MAX_LOG_RATIO, MAX_LOG_RATIO, (num_ratios // 4) | 1)
+    log_ratios = jnp.asarray(np.union1d(inner, outer), jnp.float32)
+    advantages = jnp.linspace(-10.0, 10.0, num_advantages | 1)
+    progress_values = (0.0, 0.5, 1.0)
+
+    def penalty(log_ratio: jax.Array, advantage: jax.Array, progress: float) -> jax.Array:
+        return drift(
+            parameters, log_ratio[None], advantage[None], jnp.full((1,), progress, jnp.float32)
+        )[0]
+
+    def over_advantages(function: Any) -> Any:
+        return jax.vmap(function, in_axes=(None, 0, None))
+
+    def slope(log_ratio: jax.Array, advantage: jax.Array, progress: float) -> jax.Array:
+        # d f / d r = (d f / d log r) / r
+        return jax.grad(penalty)(log_ratio, advantage, progress) / jnp.exp(log_ratio)
+
+    values = jax.jit(jax.vmap(over_advantages(penalty), in_axes=(0, None, None)))
+    slopes = jax.jit(jax.vmap(over_advantages(slope), in_axes=(0, None, None)))
+
+    def largest_slope(ratios: list[float]) -> float:
+        points = jnp.log(jnp.asarray(ratios))
+        return max(
+            float(jnp.abs(slopes(points, advantages, progress)).max())
+            for progress in progress_values
+        )
+
+    grid = [np.asarray(values(log_ratios, advantages, progress)) for progress in progress_values]
+    at_one = [np.asarray(values(jnp.zeros(1), advantages, p)) for p in progress_values]
+    finite = all(np.isfinite(x).all() for x in grid)
+    minimum = float(min(np.nanmin(x) for x in grid))
+    value_at_one = float(max(np.abs(x).max() for x in at_one))
+    gradient_at_one = largest_slope([1.0])
+    return Certificate(
+        holds=finite and minimum >= 0.0 and value_at_one == 0.0 and gradient_at_one == 0.0,
+        minimum=minimum,
+        value_at_one=value_at_one,
+        gradient_at_one=gradient_at_one,
+        slope_at_0_001=largest_slope([0.999, 1.001]),
+        slope_at_0_01=largest_slope([0.99, 1.01]),
+        finite=finite,
+        grid=f"{len(log_ratios)} log-ratios in [-{MAX_LOG_RATIO:g}, {MAX_LOG_RATIO:g}] x "
+        f"{len(advantages)} advantages in [-10, 10] x 3 training fractions",
+    )

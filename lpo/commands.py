@@ -1,0 +1,307 @@
+"""What the subcommands of `lpo` do. Their docstrings are the command line's help."""
+
+import shlex
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from lpo import figures
+from lpo.certificate import certify
+from lpo.drift import LearnedDrift
+from lpo.generalization import Comparison, compare, learning_curves, training_setting
+from lpo.meta_training import MetaTraining, MetaTrainingConfig
+from lpo.objectives import load_objective, save_objective
+from lpo.pipeline import PRESETS as RUN_PRESETS
+from lpo.pipeline import meta_training_artefact, run_pipeline
+from scb.artefacts import package_versions
+from scb.errors import UserError
+from scb.evolution import EvolutionConfig, evolve
+from scb.runs import Run, settle, write_json
+from scb.statistics import estimate
+
+META_TRAINING_PRESETS: dict[str, dict[str, Any]] = {
+    "quick": {"population_size": 32, "generations": 60},
+    "paper": {"population_size": 64, "generations": 512},
+}
+
+
+def seed_list(count: int, first: int) -> list[int]:
+    """`count` consecutive seeds; a UserError where there are none or one is negative."""
+    if count < 1:
+        raise UserError(f"seeds is {count}: give at least 1.")
+    if first < 0:
+        raise UserError(f"seed is {first}: it must be 0 or larger.")
+    return list(range(first, first + count))
+
+
+def command_line() -> str:
+    """The command that is running, as one would type it."""
+    return shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])
+
+
+def run(
+    preset: str | None = None,
+    seed: int | None = None,
+    out: Path = Path("runs/quick"),
+    resume: Path | None = None,
+    objective: str | None = None,
+) -> None:
+    """The whole path: learn an objective on the Pendulum bandit, train PPO with it, judge it.
+
+    Meta-trains a drift on the shipped bandit, then trains PPO with its own clip, with DPO and with the learned drift on
+    Pendulum and on Brax Hopper, on the same seeds, and writes report.html, figures and results.json.
+
+    Args:
+      preset: quick (a quarter of an hour on two cores) or paper (the paper's sizes; hours).
+      seed: decides everything; the seeds that report are apart from those that learn.
+      out: folder to write; must be new or empty.
+      resume: a folder that an earlier, interrupted `lpo run` wrote: do what is missing there.
+      objective: take this objective (a zoo name or file.npz) instead of learning one.
+    """
+    settings = settle(
+        {"command": "run", "seed": seed, "objective": objective}, RUN_PRESETS, preset, resume
+    )
+    settings["seed"] = settings["seed"] or 0
+    folder = Run.open(resume or out, settings, resume=resume is not None)
+    report = run_pipeline(folder, settings, command_line())
+    Console().print(f"report: {report}")
+
+
+def meta_train_command(
+    environment: str | None = None,
+    preset: str | None = None,
+    seed: int | None = None,
+    out: Path = Path("runs/meta-train"),
+    resume: Path | None = None,
+    fitness: str | None = None,
+    reward_noise: float | None = None,
+    base: str | None = None,
+    strategy: str | None = None,
+    population_size: int | None = None,
+    generations: int | None = None,
+    agents_per_candidate: int | None = None,
+    sigma: float | None = None,
+    learning_rate: float | None = None,
+    contexts: int | None = None,
+    evaluation_episodes: int | None = None,
+    backend: str | None = None,
+    wandb: str | None = None,
+) -> None:
+    """Learn an objective: evolve a drift on a bandit, or on an environment.
+
+    Args:
+      environment: where the inner loop trains: Synthetic-Pendulum-v1, Pendulum-v1, hopper, ...
+      preset: quick (60 generations of 32) or paper (512 of 64); single flags override it.
+      seed: decides everything.
+      out: folder to write; must be new or empty.
+      resume: a run folder to continue; its settings apply, and a flag that contradicts them is an error.
+      fitness: transfer (return of the bandit-trained agent in the evaluation environment), return (in the bandit), or
+        area (mean of the return over training).
+      reward_noise: noise on the bandit's reward, in its standard deviations. Without it the drift overfits the bandit.
+      base: ppo (the network corrects PPO's clip) or none.
+      strategy: any of evosax's, by name (Open_ES, SNES, CMA_ES, ...).
+      population_size: candidates a generation.
+      generations: how many.
+      agents_per_candidate: inner agents whose mean is a candidate's fitness.
+      sigma: standard deviation of the search distribution.
+      learning_rate: of the outer loop's Adam.
+      contexts: contexts that a batch of the bandit holds.
+      evaluation_episodes: of each inner agent.
+      backend: Brax physics, for Brax environments.
+      wandb: project to log to, with the extra `wandb`.
+    """
+    settings = settle(
+        {
+            "command": "meta-train",
+            "environment": environment,
+            "seed": seed,
+            "fitness": fitness,
+            "reward_noise": reward_noise,
+            "base": base,
+            "strategy": strategy,
+            "population_size": population_size,
+            "generations": generations,
+            "agents_per_candidate": agents_per_candidate,
+            "sigma": sigma,
+            "learning_rate": learning_rate,
+            "contexts": contexts,
+            "evaluation_episodes": evaluation_episodes,
+            "backend": backend,
+        },
+        META_TRAINING_PRESETS,
+        preset,
+        resume,
+    )
+    config = meta_training_config(settings)
+    problem = MetaTraining(config)
+    folder = Run.open(resume or out, settings, resume=resume is not None, wandb_project=wandb)
+    outcome = evolve(problem, config.evolution, folder)
+    folder.close()
+    path, certificate = save_objective(
+        folder.folder / "objective.npz",
+        config.drift,
+        outcome.mean,
+        meta_training_artefact(problem, outcome, settings, command_line()),
+    )
+    figures.save(
+        figures.meta_training_curve(outcome.metrics, config.environment, config.fitness),
+        folder.folder / "figures" / "meta_training.png",
+    )
+    console = Console()
+    console.print(f"objective: {path}")
+    console.print(f"it {certificate}")
+
+
+def meta_training_config(settings: Mapping[str, Any]) -> MetaTrainingConfig:
+    """A MetaTrainingConfig from flat settings; what is None keeps its default."""
+
+    def given(**names: str) -> dict[str, Any]:
+        return {
+            field: settings[name] for field, name in names.items() if settings.get(name) is not None
+        }
+
+    default = MetaTrainingConfig()
+    evolution = EvolutionConfig(
+        **{
+            "strategy": default.evolution.strategy,
+            "sigma": default.evolution.sigma,
+            "learning_rate": default.evolution.learning_rate,
+            "mean_evaluations": default.evolution.mean_evaluations,
+            **given(
+                strategy="strategy",
+                population_size="population_size",
+                num_generations="generations",
+                sigma="sigma",
+                learning_rate="learning_rate",
+                seed="seed",
+            ),
+        }
+    )
+    drift = LearnedDrift(**given(base="base"))
+    environment = settings.get("environment") or default.environment
+    fitness = {} if environment.startswith("Synthetic-") else {"fitness": "return"}
+    return MetaTrainingConfig(
+        drift=drift,
+        evolution=evolution,
+        **{
+            **fitness,
+            **given(
+                environment="environment",
+                fitness="fitness",
+                reward_noise="reward_noise",
+                agents_per_candidate="agents_per_candidate",
+                contexts="contexts",
+                evaluation_episodes="evaluation_episodes",
+                backend="backend",
+            ),
+        },
+    )
+
+
+def train(
+    environment: str = "Pendulum-v1",
+    objective: str = "ppo",
+    steps: int | None = None,
+    seeds: int = 1,
+    seed: int = 0,
+    backend: str | None = None,
+    sampled_actions: bool = False,
+    out: Path | None = None,
+) -> None:
+    """Train PPO with an objective in an environment, and print how well it ends.
+
+    Args:
+      environment: Pendulum-v1, CartPole-v1, hopper, Synthetic-Pendulum-v1, ...
+      objective: ppo, ppo-0.3 (clip 0.3), dpo, none, a zoo name, or path.npz.
+      steps: environment steps; the environment's own setting where left out.
+      seeds: agents to train.
+      seed: the first of their seeds.
+      backend: Brax physics: generalized, positional or spring.
+      sampled_actions: evaluate sampled actions rather than the most likely ones.
+      out: folder for curves.json and curves.png.
+    """
+    curves = learning_curves(
+        environment,
+        load_objective(objective),
+        seed_list(seeds, seed),
+        setting=training_setting(environment, steps),
+        backend=backend,
+        mode_actions=not sampled_actions,
+    )
+    for point, returns in zip(curves.steps, curves.returns.T, strict=True):
+        print(f"{point:>9} steps: return {np.mean(returns):.1f}")
+    print(f"final return, IQM: {estimate(curves.final)}")
+    if out is not None:
+        _write_comparison(out, Comparison([curves]))
+
+
+def evaluate(
+    environment: str = "Pendulum-v1",
+    objectives: tuple[str, ...] = ("ppo", "dpo"),
+    steps: int | None = None,
+    seeds: int = 10,
+    seed: int = 1000,
+    backend: str | None = None,
+    sampled_actions: bool = False,
+    out: Path | None = None,
+) -> None:
+    """Compare objectives: train PPO with each on the same seeds, and print final scores with intervals.
+
+    Args:
+      environment: where to train.
+      objectives: any of ppo, ppo-0.3, dpo, none, zoo names, files; the first is the reference of the differences.
+      steps: environment steps; the environment's own setting where left out.
+      seeds: agents of each objective.
+      seed: the first of their seeds.
+      backend: Brax physics: generalized, positional or spring.
+      sampled_actions: evaluate sampled actions rather than the most likely ones.
+      out: folder for comparison.json and curves.png.
+    """
+    if not objectives:
+        raise UserError("no objectives: give at least one, such as --objectives ppo dpo.")
+    comparison = compare(
+        environment,
+        [load_objective(name) for name in objectives],
+        seed_list(seeds, seed),
+        setting=training_setting(environment, steps),
+        backend=backend,
+        mode_actions=not sampled_actions,
+    )
+    table = Table(
+        "objective", "final IQM [95 %]", "area under the curve", f"difference to {objectives[0]}"
+    )
+    for row in comparison.table():
+        difference = "" if row["difference"] is None else str(row["difference"])
+        table.add_row(row["objective"], str(row["final"]), str(row["area"]), difference)
+    Console().print(table)
+    if out is not None:
+        _write_comparison(out, comparison)
+
+
+def certify_command(objective: str) -> None:
+    """Check that an objective is a drift: the mirror-learning conditions on a dense grid.
+
+    Args:
+      objective: ppo, ppo-0.3, dpo, none, a zoo name, or path.npz.
+    """
+    loaded = load_objective(objective)
+    certificate = certify(loaded.drift, loaded.parameters)
+    print(f"{loaded.name} {certificate}")
+    if not certificate.holds:
+        sys.exit(1)
+
+
+def _write_comparison(out: Path, comparison: Comparison) -> None:
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(
+            f"cannot write to {out} ({error.strerror}): choose another --out."
+        ) from error
+    write_json(out / "comparison.json", {**comparison.as_dict(), "versions": package_versions()})
+    figures.save(figures.learning_curves(comparison.curves), out / "curves.png")

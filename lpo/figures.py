@@ -1,0 +1,572 @@
+"""Figures of a run: one style, a fixed look for every objective, and the uncertainty always drawn.
+
+Every function returns a `matplotlib.figure.Figure` of its own: pyplot and its global state stay
+out, so figures can be made in a library, a server or a test alike. Colours are those of Okabe and
+Ito (2008), which stay apart for colour-blind readers; line style and marker say the same again for
+a grey print.
+"""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import jax
+import jax.numpy as jnp
+import matplotlib.style
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import LinearSegmentedColormap, Normalize
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from matplotlib.ticker import EngFormatter, MaxNLocator, NullFormatter
+from numpy.typing import NDArray
+
+from scb.errors import UserError
+from scb.statistics import estimate, iqm
+
+if TYPE_CHECKING:
+    from lpo.generalization import LearningCurves
+    from lpo.objectives import Objective
+
+BLACK, ORANGE, SKY_BLUE, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"
+BLUE, VERMILLION, PURPLE = "#0072B2", "#D55E00", "#CC79A7"
+GREY = "#555555"
+
+WIDTH = 9.0  # inches; a page shows them at about 100 px an inch, so 10 pt are 14 px
+DPI = 200
+RATIOS = (0.4, 1.8)
+ADVANTAGES = (-3.0, 3.0)
+# Below this a penalty or a gradient is drawn as none: rounding of 32-bit floats, or a dead zone.
+NEGLIGIBLE = 1e-3
+
+_STYLE: dict[str, Any] = {
+    "axes.axisbelow": True,
+    "axes.grid": True,
+    "axes.spines.right": False,
+    "axes.spines.top": False,
+    "axes.titlelocation": "left",
+    "axes.titlesize": 11,
+    "axes.titleweight": "bold",
+    "figure.constrained_layout.use": True,
+    "figure.facecolor": "white",
+    "font.size": 10,
+    "grid.color": "#DDDDDD",
+    "grid.linewidth": 0.6,
+    "hatch.linewidth": 0.7,
+    "legend.frameon": False,
+    "legend.handlelength": 3.0,
+    "lines.linewidth": 1.8,
+    "lines.markersize": 5.0,
+    "savefig.dpi": DPI,
+}
+
+
+@dataclass(frozen=True)
+class Look:
+    """How an objective is drawn, in every figure."""
+
+    color: str
+    linestyle: Any
+    marker: str
+
+
+_LOOKS: dict[str, Look] = {
+    "ppo": Look(BLUE, "--", "s"),
+    "dpo": Look(GREEN, "-.", "^"),
+    "none": Look(GREY, ":", "X"),
+}
+# The learned objective, the reason for the figure, has the one solid line.
+_LEARNED = Look(VERMILLION, "-", "o")
+_FURTHER = (
+    Look(PURPLE, (0, (5, 1, 1, 1, 1, 1)), "D"),
+    Look(ORANGE, (0, (8, 2)), "v"),
+    Look(SKY_BLUE, (0, (1, 1)), "P"),
+    Look(BLACK, (0, (3, 1, 1, 1)), "*"),
+)
+
+
+def looks(names: Sequence[str]) -> dict[str, Look]:
+    """{objective: its look}, the same in every figure.
+
+    "ppo", "dpo" and "none" have their own, the first other name is taken for the learned one.
+    Further names ("ppo-0.3", a second learned objective) take the remaining colours in turn.
+    """
+    chosen = {name: _LOOKS[name] for name in names if name in _LOOKS}
+    others = [name for name in dict.fromkeys(names) if name not in _LOOKS]
+    # A clip by value is a variant of PPO, and must not take the learned objective's look.
+    learned = [name for name in others if not name.startswith("ppo-")]
+    if learned:
+        chosen[learned[0]] = _LEARNED
+    further = [name for name in others if name not in chosen]
+    return chosen | {name: _FURTHER[i % len(_FURTHER)] for i, name in enumerate(further)}
+
+
+def meta_training_curve(
+    metrics: list[dict[str, Any]],
+    environment: str,
+    fitness: str,
+    population_size: int | None = None,
+    mean_evaluations: int | None = None,
+) -> Figure:
+    """Fitness over the generations of an evolution.
+
+    Args:
+      metrics: one dict a generation, as `scb.evolution.evolve` logs them.
+      environment: where the inner loop trained.
+      fitness: "return", "area" or "transfer".
+      population_size, mean_evaluations: candidates a generation, and agents that judge the search
+        distribution's mean; stated in the figure where given.
+
+    Raises:
+      UserError: no generation was logged.
+    """
+    if not metrics:
+        raise UserError(
+            "the run has logged no generation: let it finish at least one before drawing it."
+        )
+    generations = np.array([row["generation"] for row in metrics])
+    mean, std, best = (_column(metrics, f"fitness/{k}") for k in ("mean", "std", "max"))
+    judged = [
+        (row["generation"], row["mean/fitness"])
+        for row in metrics
+        if row.get("mean/fitness") is not None
+    ]
+    if metrics[-1].get("final_mean/fitness") is not None:
+        # Judged after the last generation, and so where the next would be.
+        judged.append((metrics[-1]["generation"] + 1, metrics[-1]["final_mean/fitness"]))
+    with _style():
+        figure = Figure(figsize=(WIDTH, 4.2))
+        axes = figure.add_subplot()
+        axes.fill_between(
+            generations,
+            mean - std,
+            mean + std,
+            color=SKY_BLUE,
+            alpha=0.35,
+            linewidth=0,
+            label="population: ± standard deviation",
+        )
+        axes.plot(generations, mean, color=BLUE, label="population: mean", linestyle="--")
+        axes.plot(
+            generations, best, color=GREY, linewidth=1.0, linestyle=":", label="population: best"
+        )
+        if judged:
+            agents = "" if mean_evaluations is None else f" ({mean_evaluations} agents a point)"
+            axes.plot(
+                *zip(*judged, strict=True),
+                color=VERMILLION,
+                marker="o",
+                label=f"search distribution's mean{agents}",
+            )
+        axes.set_xlabel("generation")
+        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+        axes.set_ylabel(_fitness_label(environment, fitness))
+        axes.margins(x=0.02)
+        last = metrics[-1]
+        per_generation = last.get("steps/total", 0) / (last["generation"] + 1)
+        if per_generation > 0:
+            top = axes.secondary_xaxis(
+                "top", functions=(lambda g: g * per_generation, lambda s: s / per_generation)
+            )
+            top.xaxis.set_major_formatter(EngFormatter(sep=""))
+            top.set_xlabel("environment steps of the population (training + evaluation)")
+        size = "" if population_size is None else f", population of {population_size}"
+        _title(figure, f"Meta-training on {environment}{size}")
+        _legend_below(figure, axes.get_legend_handles_labels(), columns=2)
+    return figure
+
+
+def environment_steps(
+    bandit: Mapping[str, int],
+    environment: Mapping[str, int],
+    names: tuple[str, str] = ("on the bandit", "on the environment"),
+) -> Figure:
+    """What the bandit saves: environment steps of the same meta-training on either, counted apart.
+
+    Args:
+      bandit, environment: {"training", "evaluation", "total"} steps.
+      names: what the two are called.
+    """
+    rows = ("training", "evaluation", "total")
+    for name, steps in zip(names, (bandit, environment), strict=True):
+        missing = [row for row in rows if row not in steps]
+        if missing:
+            raise UserError(
+                f"the steps {name} lack {', '.join(missing)}: give training, evaluation and total."
+            )
+    with _style():
+        figure = Figure(figsize=(WIDTH, 3.0))
+        axes = figure.add_subplot()
+        axes.set_xscale("log")
+        height = 0.38
+        drawn = [steps[row] for steps in (bandit, environment) for row in rows if steps[row] > 0]
+        left = 10.0 ** np.floor(np.log10(min(drawn, default=1)) - 0.3)
+        for steps, offset, color, hatch, name in (
+            (bandit, -height / 2, VERMILLION, "", names[0]),
+            (environment, height / 2, BLUE, "///", names[1]),
+        ):
+            for position, row in enumerate(rows):
+                # A logarithmic axis has no zero: no steps are no bar.
+                axes.barh(
+                    position + offset,
+                    max(steps[row] - left, 0),
+                    height=height,
+                    left=left,
+                    color=color,
+                    hatch=hatch,
+                    edgecolor="white",
+                    linewidth=0,
+                    label=name if position == 0 else "_",
+                )
+                axes.annotate(
+                    _count(steps[row]),
+                    (max(steps[row], left), position + offset),
+                    xytext=(4, 0),
+                    textcoords="offset points",
+                    va="center",
+                    fontsize=9,
+                )
+        for position, row in enumerate(rows):
+            axes.text(
+                1.0,
+                position,
+                ratio_text(bandit[row], environment[row]),
+                transform=axes.get_yaxis_transform(),
+                ha="right",
+                va="center",
+                fontweight="bold",
+                color=VERMILLION,  # the bandit's: it is the one that takes fewer or more
+            )
+        # Room on the right for the ratios, which stand in one column.
+        axes.set_xlim(left, left * (max(drawn, default=10) / left) ** 1.42)
+        axes.set_yticks(range(len(rows)), rows)
+        axes.invert_yaxis()
+        axes.tick_params(axis="y", length=0)
+        axes.grid(axis="y", visible=False)
+        axes.xaxis.set_minor_formatter(NullFormatter())
+        axes.set_xlabel("environment steps of the whole meta-training (logarithmic)")
+        _title(figure, "Cost of meta-training in environment steps")
+        _legend_below(figure, axes.get_legend_handles_labels(), columns=2)
+    return figure
+
+
+def learning_curves(curves: "Sequence[LearningCurves]") -> Figure:
+    """Interquartile mean return over the training, and each seed's return at its end.
+
+    Bands and bars are 95 % bootstrap intervals over seeds; a single seed has none, and gets none.
+
+    Args:
+      curves: of one environment, one an objective.
+
+    Raises:
+      UserError: no curves, curves of different environments or evaluations, or a return that is
+        not finite.
+    """
+    if not curves:
+        raise UserError("there are no learning curves to draw: give at least one.")
+    first = curves[0]
+    for curve in curves:
+        if _protocol(curve) != _protocol(first):
+            raise UserError(
+                f"{curve.objective} was run as {_protocol(curve)}, {first.objective} as "
+                f"{_protocol(first)}: one figure compares objectives under one protocol, so draw "
+                "them apart."
+            )
+    style = looks([curve.objective for curve in curves])
+    counts = sorted({len(curve.seeds) for curve in curves})
+    with _style():
+        figure = Figure(figsize=(WIDTH, 4.4))
+        training, final = figure.subplots(1, 2, width_ratios=(2.4, 1))
+        for position, curve in enumerate(curves):
+            look = style[curve.objective]
+            _curve(training, curve, look)
+            _final(final, position, curve, look)
+        training.set_xlabel("environment steps")
+        training.xaxis.set_major_formatter(EngFormatter(sep=""))
+        training.set_ylabel("return (interquartile mean)")
+        training.set_title("During training: 95 % intervals as bands", fontsize=10, weight="normal")
+        training.margins(x=0.02)
+        final.set_xticks(range(len(curves)), [curve.objective for curve in curves])
+        if len(curves) > 3 or max(len(curve.objective) for curve in curves) > 10:
+            final.tick_params(axis="x", rotation=30)
+            for label in final.get_xticklabels():
+                label.set_horizontalalignment("right")
+                label.set_rotation_mode("anchor")
+        final.set_xlim(-0.6, len(curves) - 0.4)
+        final.grid(axis="x", visible=False)
+        final.set_ylabel("final return")
+        final.set_title("At the end: each seed a dot", fontsize=10, weight="normal")
+        seeds = "1 seed" if counts == [1] else f"n = {' and '.join(map(str, counts))} seeds"
+        _title(figure, f"{_protocol(first)}, {seeds}")
+        # Under its own panel, beside the names on the right; constrained layout keeps its room.
+        training.legend(loc="upper center", bbox_to_anchor=(0.5, -0.17), ncols=min(len(curves), 3))
+    return figure
+
+
+def drift_heatmaps(objectives: "Sequence[Objective]", progress: float = 0.5) -> Figure:
+    """What objectives charge for moving away, and where that makes an update stop or turn round.
+
+    First row: the drift f(r, A) over ratio and advantage. Second row: the gradient d/dr (r A - f)
+    of the whole objective; it has A's sign where the update goes on, is zero where it stops, and is
+    hatched where it turns against the advantage and moves the policy back. The panels of a row
+    share one colour scale.
+
+    Args:
+      objectives: side by side, in this order.
+      progress: fraction of training done, for drifts that depend on it.
+    """
+    if not objectives:
+        raise UserError("there are no objectives to draw: give at least one.")
+    ratios = np.linspace(*RATIOS, 281)
+    advantages = np.linspace(*ADVANTAGES, 241)
+    surfaces = [drift_surface(o, ratios, advantages, progress) for o in objectives]
+    drifts = [drift for drift, _ in surfaces]
+    gradients = [gradient for _, gradient in surfaces]
+    with _style():
+        figure = Figure(figsize=(WIDTH, 6.4))
+        grid = figure.subplots(2, len(objectives), sharex=True, sharey=True, squeeze=False)
+        # The dark end of the map is cut off: contours would drown in it.
+        pale_is_none = LinearSegmentedColormap.from_list(
+            "drift", colormaps["magma_r"](np.linspace(0.0, 0.85, 256))
+        )
+        penalty = _Scale(pale_is_none, Normalize(0.0, _largest(drifts)))
+        largest = _largest([np.abs(g) for g in gradients])
+        direction = _Scale(colormaps["RdBu_r"], Normalize(-largest, largest))
+        levels = [t for t in MaxNLocator(7).tick_values(0.0, penalty.norm.vmax or 1.0) if t > 0]
+        turns_back = False
+        for column, (objective, drift, gradient) in enumerate(
+            zip(objectives, drifts, gradients, strict=True)
+        ):
+            top, bottom = grid[0, column], grid[1, column]
+            penalty.draw(top, ratios, advantages, drift)
+            if drift.max() > NEGLIGIBLE:
+                top.contour(
+                    ratios,
+                    advantages,
+                    drift,
+                    [NEGLIGIBLE],
+                    colors="black",
+                    linewidths=1.0,
+                    linestyles="--",
+                )
+                top.contour(ratios, advantages, drift, levels, colors="black", linewidths=0.6)
+            direction.draw(bottom, ratios, advantages, gradient)
+            back = gradient * np.sign(advantages)[:, None]
+            if back.min() < -NEGLIGIBLE:
+                bottom.contourf(
+                    ratios,
+                    advantages,
+                    back,
+                    [-np.inf, -NEGLIGIBLE],
+                    colors="none",
+                    hatches=["////"],
+                )
+                bottom.contour(
+                    ratios,
+                    advantages,
+                    back,
+                    [-NEGLIGIBLE],
+                    colors="black",
+                    linewidths=0.8,
+                    linestyles="-",  # matplotlib's default for negative levels is dashed
+                )
+                turns_back = True
+            top.set_title(objective.name, loc="center")
+            bottom.set_xlabel(r"ratio $r = \pi(a|s)\,/\,\pi_{\mathrm{old}}(a|s)$")
+            for axes in (top, bottom):
+                axes.axvline(1.0, color=GREY, linewidth=0.9)
+                axes.grid(visible=False)
+        for row, scale, label in (
+            (0, penalty, "drift f (penalty)"),
+            (1, direction, "gradient d/dr (r A − f)"),
+        ):
+            grid[row, 0].set_ylabel("advantage A\n(standard deviations)")
+            bar = figure.colorbar(
+                ScalarMappable(scale.norm, scale.map),
+                ax=list(grid[row]),
+                extend="neither" if scale.covers else ("max" if row == 0 else "both"),
+                aspect=16,
+                pad=0.02,
+            )
+            bar.set_label(label)
+            if row == 0:
+                for level in levels:
+                    bar.ax.axhline(level, color="black", linewidth=0.6)
+        handles: list[Artist] = [
+            Line2D([], [], color="black", linewidth=1.0, linestyle="--"),
+            Line2D([], [], color="black", linewidth=0.6),
+        ]
+        names = [f"penalty begins (f = {NEGLIGIBLE:g})", "levels of f, as in the colour bar"]
+        if turns_back:
+            handles.append(Patch(facecolor="white", edgecolor="black", hatch="////", linewidth=0.8))
+            names.append("update moves the policy back")
+        _title(figure, "Drift (top) and the direction in which it lets the policy move (bottom)")
+        _legend_below(figure, (handles, names), columns=3)
+    return figure
+
+
+def drift_surface(
+    objective: "Objective",
+    ratios: NDArray[np.floating],
+    advantages: NDArray[np.floating],
+    progress: float = 0.5,
+) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
+    """Drift and gradient of the whole objective on a grid.
+
+    Args:
+      ratios: [R], > 0.
+      advantages: [A].
+      progress: fraction of training done.
+
+    Returns:
+      [A, R] drift f, and [A, R] d/dr (r A - f).
+    """
+
+    def drift(ratio: jax.Array, advantage: jax.Array) -> jax.Array:
+        fraction = jnp.full((1,), progress, jnp.float32)
+        return objective.drift(
+            objective.parameters, jnp.log(ratio)[None], advantage[None], fraction
+        )[0]
+
+    def over_grid(function: Callable[..., Any]) -> Callable[..., Any]:
+        return jax.jit(jax.vmap(jax.vmap(function, in_axes=(0, None)), in_axes=(None, 0)))
+
+    value, slope = over_grid(jax.value_and_grad(drift))(
+        jnp.asarray(ratios, jnp.float32), jnp.asarray(advantages, jnp.float32)
+    )
+    return np.asarray(value), np.asarray(advantages)[:, None] - np.asarray(slope)
+
+
+def save(figure: Figure, path: str | Path) -> Path:
+    """Writes a PNG whose bytes depend on the figure alone: no date, no version in its metadata."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with _style():
+        figure.savefig(path, format="png", dpi=DPI, metadata={"Software": None})
+    return path
+
+
+def ratio_text(bandit: float, environment: float) -> str:
+    """How a bandit's steps compare with an environment's, in words: "120 times fewer"."""
+    if bandit <= 0 or environment <= 0:
+        return ""
+    if bandit == environment:
+        return "the same"
+    ratio = max(bandit, environment) / min(bandit, environment)
+    number = f"{ratio:,.0f}" if ratio >= 10 else f"{ratio:.2g}"
+    return f"{number} times {'fewer' if bandit < environment else 'more'}"
+
+
+@contextmanager
+def _style() -> Iterator[None]:
+    # "default" first: a reader's own matplotlibrc must not change the figures of a run.
+    with matplotlib.style.context(["default", _STYLE]):
+        yield
+
+
+class _Scale:
+    """A colour scale that all panels of a row share."""
+
+    def __init__(self, colors: Any, norm: Normalize) -> None:
+        self.map, self.norm, self.covers = colors, norm, True
+
+    def draw(
+        self,
+        axes: Axes,
+        x: NDArray[np.floating],
+        y: NDArray[np.floating],
+        values: NDArray[np.floating],
+    ) -> None:
+        axes.pcolormesh(
+            x, y, values, cmap=self.map, norm=self.norm, shading="gouraud", rasterized=True
+        )
+        self.covers &= bool(np.abs(values).max() <= (self.norm.vmax or 0.0))
+
+
+def _largest(surfaces: list[NDArray[np.floating]]) -> float:
+    # One extreme corner of one objective must not make the others look flat; the pointed end of the
+    # colour bar says that there is more.
+    values = np.concatenate([s.ravel() for s in surfaces])
+    largest, usual = float(values.max()), float(np.quantile(values, 0.99))
+    bound = largest if largest <= 1.5 * usual else usual
+    return bound if bound > 0 else 1.0
+
+
+def _curve(axes: Axes, curve: "LearningCurves", look: Look) -> None:
+    axes.plot(
+        curve.steps,
+        iqm(curve.returns, axis=0),
+        color=look.color,
+        linestyle=look.linestyle,
+        marker=look.marker,
+        label=curve.objective,
+    )
+    if len(curve.seeds) > 1:
+        points = [estimate(column) for column in curve.returns.T]
+        axes.fill_between(
+            curve.steps,
+            [p.value if p.low is None else p.low for p in points],
+            [p.value if p.high is None else p.high for p in points],
+            color=look.color,
+            alpha=0.18,
+            linewidth=0,
+        )
+
+
+def _final(axes: Axes, position: int, curve: "LearningCurves", look: Look) -> None:
+    end = estimate(curve.final)
+    # Seeds beside the estimate, spread evenly and in their order: the same picture every time.
+    spread = np.linspace(0.2, 0.42, len(curve.seeds)) if len(curve.seeds) > 1 else [0.3]
+    axes.plot(
+        position + np.asarray(spread),
+        curve.final,
+        color=look.color,
+        marker=".",
+        markersize=4.5,
+        alpha=0.55,
+        linestyle="",
+        markeredgewidth=0,
+    )
+    if end.low is not None and end.high is not None:
+        axes.vlines(position, end.low, end.high, color=look.color, linewidth=2.2)
+    axes.plot(position, end.value, color=look.color, marker=look.marker, markersize=6, linestyle="")
+
+
+def _protocol(curve: "LearningCurves") -> str:
+    physics = "" if curve.backend is None else f" ({curve.backend} physics)"
+    actions = "mode" if curve.mode_actions else "sampled"
+    return f"{curve.environment}{physics}: {actions} actions, {curve.episodes} episodes"
+
+
+def _fitness_label(environment: str, fitness: str) -> str:
+    elsewhere = environment.removeprefix("Synthetic-")
+    labels = {
+        "return": f"fitness: mean return\nin {environment}",
+        "area": f"fitness: mean return during training\nin {environment}",
+        "transfer": f"fitness: mean return\nin {elsewhere}",
+    }
+    return labels.get(fitness, f"fitness: {fitness}")
+
+
+def _column(metrics: list[dict[str, Any]], name: str) -> NDArray[np.floating]:
+    # A log line holds None where a number was not finite.
+    return np.array([np.nan if row.get(name) is None else row[name] for row in metrics], float)
+
+
+def _count(steps: float) -> str:
+    return EngFormatter(places=None if steps < 1000 else 1, sep="\N{THIN SPACE}")(steps)
+
+
+def _title(figure: Figure, text: str) -> None:
+    figure.suptitle(text, x=0.01, ha="left", fontsize=11, fontweight="bold")
+
+
+def _legend_below(figure: Figure, entries: tuple[list[Any], list[Any]], columns: int) -> None:
+    # Outside the axes, where it can cover no data.
+    figure.legend(*entries, loc="outside lower center", ncols=columns, columnspacing=1.5)

@@ -1,0 +1,187 @@
+"""Does an objective carry over? Train PPO with several objectives on the same seeds and compare.
+
+Every objective meets the same seeds: the same initial networks, start states and evaluation episodes, so that differences
+are paired. Final scores are interquartile means with bootstrap intervals.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import jax
+import numpy as np
+
+from lpo.objectives import Objective
+from scb.agents.hyperparameters import Setting, environment_setting
+from scb.agents.ppo import PPO, PPOConfig
+from scb.environments.registry import make
+from scb.errors import UserError
+from scb.evolution import map_population
+from scb.statistics import Estimate, estimate, paired_difference
+
+
+@dataclass(frozen=True)
+class LearningCurves:
+    """Returns of agents over their training.
+
+    Attributes:
+      environment, backend: where; the backend is None outside Brax.
+      objective: with which.
+      steps: [P] environment steps at each evaluation, the first 0.
+      returns: [S, P] mean return of `episodes` episodes, per seed.
+      mode_actions: whether evaluation took the most likely actions or sampled ones.
+    """
+
+    environment: str
+    backend: str | None
+    objective: str
+    steps: np.ndarray
+    returns: np.ndarray
+    seeds: list[int]
+    episodes: int
+    mode_actions: bool
+
+    @property
+    def final(self) -> np.ndarray:
+        """[S] return at the end of training."""
+        return self.returns[:, -1]
+
+    @property
+    def area(self) -> np.ndarray:
+        """[S] mean return over the training, the untrained agent left out."""
+        return self.returns[:, 1:].mean(axis=1)
+
+    def as_dict(self) -> dict[str, Any]:
+        return {
+            "environment": self.environment,
+            "backend": self.backend,
+            "objective": self.objective,
+            "steps": self.steps.tolist(),
+            "returns": np.round(self.returns, 3).tolist(),
+            "seeds": self.seeds,
+            "episodes": self.episodes,
+            "mode_actions": self.mode_actions,
+            "final_iqm": estimate(self.final).as_dict(),
+            "area_iqm": estimate(self.area).as_dict(),
+        }
+
+
+def evaluation_interval(num_iterations: int, points: int) -> int:
+    """The number of iterations between evaluations that divides the training and gives about `points` of them."""
+    divisors = [n for n in range(1, num_iterations + 1) if num_iterations % n == 0]
+    return min(divisors, key=lambda n: abs(num_iterations / n - points))
+
+
+def training_setting(environment: str, total_steps: int | None = None) -> Setting:
+    """The environment's PPO setting, for another number of steps where one is given."""
+    setting = environment_setting(environment)
+    if total_steps is None:
+        return setting
+    if total_steps < 1:
+        raise UserError(f"steps is {total_steps}: it must be at least 1.")
+    return replace(setting, config=replace(setting.config, total_steps=total_steps))
+
+
+def _rounded_to_points(config: PPOConfig, points: int) -> PPOConfig:
+    # A prime number of iterations has no divisors to evaluate at: round up to a multiple of the points.
+    iterations = -(-config.num_iterations // points) * points
+    return replace(config, total_steps=iterations * config.batch_size)
+
+
+def learning_curves(
+    environment: str,
+    objective: Objective,
+    seeds: Sequence[int],
+    setting: Setting | None = None,
+    backend: str | None = None,
+    points: int = 15,
+    episodes: int = 20,
+    mode_actions: bool = True,
+) -> LearningCurves:
+    """Trains one PPO agent a seed with the objective, evaluating along the way.
+
+    Args:
+      environment: a name that `scb.make` takes.
+      objective: what replaces PPO's surrogate.
+      seeds: one agent each; the same seeds pair agents of different objectives.
+      setting: PPO's; the environment's own where None. Its steps are rounded up to a multiple of `points` batches.
+      backend: Brax physics ("generalized", "positional", "spring"); only for Brax environments.
+      points: evaluations along the training, the untrained agent not counted.
+      episodes: of each evaluation.
+      mode_actions: evaluate the most likely actions rather than sampled ones.
+    """
+    if not seeds:
+        raise UserError("no seeds: give at least one.")
+    if any(seed < 0 for seed in seeds):
+        raise UserError(f"seeds are {list(seeds)}: each must be 0 or larger.")
+    env, env_params = make(environment, **({} if backend is None else {"backend": backend}))
+    setting = setting or environment_setting(environment)
+    config = _rounded_to_points(setting.config, min(points, setting.config.num_iterations))
+    agent = PPO(env, config, objective.drift)
+    hyperparameters = setting.hyperparameters.replace(drift=objective.parameters)
+    every = evaluation_interval(config.num_iterations, points)
+
+    def train(seed: jax.Array) -> jax.Array:
+        key = jax.random.key(seed)
+
+        def judge(state: Any, key: jax.Array) -> jax.Array:
+            return agent.evaluate(
+                state, key, episodes, env_params=env_params, mode=mode_actions
+            ).returns.mean()
+
+        _, returns = agent.train_with_evaluations(key, hyperparameters, env_params, judge, every)
+        return returns
+
+    returns = map_population(train, len(seeds), (0,))(np.asarray(seeds, np.uint32))
+    steps = np.arange(returns.shape[1]) * every * config.batch_size
+    return LearningCurves(
+        environment,
+        getattr(env, "backend", None),
+        objective.name,
+        steps,
+        np.asarray(returns),
+        list(seeds),
+        episodes,
+        mode_actions,
+    )
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Learning curves of several objectives on one environment, the first of them the reference."""
+
+    curves: list[LearningCurves]
+
+    def differences(self) -> dict[str, Estimate]:
+        """{objective: paired difference of final IQM to the reference}, positive where it is better."""
+        reference = self.curves[0]
+        return {c.objective: paired_difference(c.final, reference.final) for c in self.curves[1:]}
+
+    def table(self) -> list[dict[str, Any]]:
+        """One row an objective: final and area IQM with intervals, difference to the reference."""
+        differences = self.differences()
+        return [
+            {
+                "objective": c.objective,
+                "final": estimate(c.final),
+                "area": estimate(c.area),
+                "difference": differences.get(c.objective),
+            }
+            for c in self.curves
+        ]
+
+    def as_dict(self) -> dict[str, Any]:
+        return {
+            "curves": [c.as_dict() for c in self.curves],
+            "reference": self.curves[0].objective,
+            "paired_differences": {k: v.as_dict() for k, v in self.differences().items()},
+        }
+
+
+def compare(
+    environment: str, objectives: Sequence[Objective], seeds: Sequence[int], **arguments: Any
+) -> Comparison:
+    """`learning_curves` of each objective on the same seeds."""
+    return Comparison(
+        [learning_curves(environment, objective, seeds, **arguments) for objective in objectives]
+    )

@@ -1,0 +1,261 @@
+"""The whole path, as `lpo run` does it: learn an objective on a bandit, train PPO with it, judge it, write it down.
+
+Every stage leaves a file in the run folder; a resumed run does what is missing.
+"""
+
+import json
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+
+from lpo import figures, report
+from lpo.certificate import certify
+from lpo.generalization import Comparison, LearningCurves, learning_curves, training_setting
+from lpo.meta_training import MetaTraining, MetaTrainingConfig
+from lpo.objectives import Objective, load_objective, save_objective
+from scb.artefacts import machine_description, package_versions
+from scb.evolution import EvolutionConfig, Outcome, evolve
+from scb.runs import Run, Stopwatch, write_json
+
+# The seeds that judge are never those that learn or choose.
+FIRST_REPORTING_SEED = 10_000
+
+PRESETS: dict[str, dict[str, Any]] = {
+    "tiny": {
+        "population_size": 4,
+        "generations": 2,
+        "agents_per_candidate": 1,
+        "evaluations": [
+            {"environment": "Pendulum-v1", "backend": None, "seeds": 2, "steps": 10_000},
+        ],
+    },
+    "quick": {
+        "population_size": 32,
+        "generations": 40,
+        "agents_per_candidate": 2,
+        "evaluations": [
+            {"environment": "Pendulum-v1", "backend": None, "seeds": 10, "steps": 150_000},
+            {"environment": "hopper", "backend": "spring", "seeds": 4, "steps": 500_000},
+        ],
+    },
+    "paper": {
+        "population_size": 64,
+        "generations": 512,
+        "agents_per_candidate": 2,
+        "evaluations": [
+            {"environment": "Pendulum-v1", "backend": None, "seeds": 20, "steps": 150_000},
+            {
+                "environment": "hopper",
+                "backend": "generalized",
+                "seeds": 10,
+                "steps": 5 * 2**20,
+            },
+        ],
+    },
+}
+
+
+def run_pipeline(run: Run, settings: Mapping[str, Any], command: str) -> Path:
+    """Runs every stage that the folder lacks.
+
+    Args:
+      run: the open run folder.
+      settings: a preset's values, "seed", "preset" and "objective".
+      command: as it was typed, for the report.
+
+    Returns:
+      The path of report.html.
+    """
+    console = Console(stderr=True)
+    watch = Stopwatch()
+    folder = run.folder
+    config = pipeline_config(settings)
+    problem = MetaTraining(config)
+    meta: dict[str, Any] = {}
+    if settings["objective"] is None:
+        console.print(
+            f"[1/3] learning an objective on {config.environment}: {config.evolution.num_generations} generations of "
+            f"{config.evolution.population_size}"
+        )
+        objective, meta = _learn(run, problem, settings, command)
+    else:
+        objective = load_objective(settings["objective"])
+    certificate = certify(objective.drift, objective.parameters)
+    objectives = [load_objective("ppo"), load_objective("dpo"), objective]
+
+    comparisons: dict[str, Comparison] = {}
+    for evaluation in settings["evaluations"]:
+        console.print(
+            f"[2/3] training PPO with {len(objectives)} objectives on {evaluation['environment']}"
+        )
+        comparisons[evaluation["environment"]] = _compare(
+            folder, objectives, evaluation, settings["seed"]
+        )
+
+    console.print("[3/3] figures and report")
+    paths = _figures(folder, problem, objective, objectives, comparisons, meta)
+    results = {
+        "schema_version": 1,
+        "preset": settings["preset"],
+        "command": command,
+        "versions": package_versions(),
+        "machine": machine_description(),
+        "objective": {"name": objective.name, "certificate": certificate.as_dict()},
+        "meta_training": {k: v for k, v in meta.items() if k != "metrics"},
+        "comparisons": {name: c.as_dict() for name, c in comparisons.items()},
+        "seconds": round(watch.lap(), 1),
+    }
+    write_json(folder / "results.json", results)
+    return report.write_report(folder, results, paths)
+
+
+def pipeline_config(settings: Mapping[str, Any]) -> MetaTrainingConfig:
+    """The meta-training of a preset."""
+    default = MetaTrainingConfig()
+    evolution = replace(
+        default.evolution,
+        population_size=settings["population_size"],
+        num_generations=settings["generations"],
+        seed=settings["seed"],
+    )
+    return replace(
+        default, evolution=evolution, agents_per_candidate=settings["agents_per_candidate"]
+    )
+
+
+def _learn(
+    run: Run, problem: MetaTraining, settings: Mapping[str, Any], command: str
+) -> tuple[Objective, dict[str, Any]]:
+    config = problem.config
+    outcome = evolve(problem, config.evolution, run)
+    run.close()
+    path, _ = save_objective(
+        run.folder / "lpo.npz",
+        config.drift,
+        outcome.mean,
+        meta_training_artefact(problem, outcome, dict(settings), command),
+    )
+    evaluations = config.evolution.num_generations * config.evolution.population_size
+    steps = problem.steps()
+    on_environment = environment_problem(config).steps()
+    meta = {
+        "environment": config.environment,
+        "fitness": config.fitness,
+        "config": dict(settings),
+        "seconds": round(outcome.seconds, 1),
+        "generations": config.evolution.num_generations,
+        "steps": {
+            name: evaluations * getattr(steps, name) for name in ("training", "evaluation", "total")
+        },
+        "environment_steps": {
+            name: evaluations * getattr(on_environment, name)
+            for name in ("training", "evaluation", "total")
+        },
+        "metrics": outcome.metrics,
+    }
+    return load_objective(path), meta
+
+
+def environment_problem(config: MetaTrainingConfig) -> MetaTraining:
+    """The same meta-training on the bandit's evaluation environment itself."""
+    name = config.environment.removeprefix("Synthetic-")
+    return MetaTraining(replace(config, environment=name, fitness="return", agent=None))
+
+
+def meta_training_artefact(
+    problem: MetaTraining, outcome: Outcome, settings: Mapping[str, Any], command: str
+) -> dict[str, Any]:
+    """What a learned objective's .json says of its meta-training."""
+    evolution: EvolutionConfig = problem.config.evolution
+    evaluations = evolution.num_generations * evolution.population_size
+    steps = problem.steps()
+    judged = [
+        {"generation": line["generation"], "fitness": value}
+        for line in outcome.metrics
+        for key, value in line.items()
+        if key in ("mean/fitness", "final_mean/fitness")
+    ]
+    return {
+        "config": {"meta_training": _plain(problem.config), "settings": dict(settings)},
+        "seeds": {"meta_training": evolution.seed},
+        "results": {"mean_fitness": judged},
+        "cost": {
+            "environment_steps_training": evaluations * steps.training,
+            "environment_steps_evaluation": evaluations * steps.evaluation,
+            "seconds": round(outcome.seconds, 1),
+            "machine": machine_description(),
+        },
+        "command": command,
+    }
+
+
+def _plain(config: Any) -> Any:
+    from dataclasses import asdict
+
+    return json.loads(json.dumps(asdict(config)))
+
+
+def _compare(
+    folder: Path, objectives: list[Objective], evaluation: Mapping[str, Any], seed: int
+) -> Comparison:
+    first = FIRST_REPORTING_SEED + 1000 * seed
+    seeds = list(range(first, first + evaluation["seeds"]))
+    (folder / "curves").mkdir(exist_ok=True)
+    curves = []
+    for objective in objectives:
+        path = folder / "curves" / f"{evaluation['environment']}_{objective.name}.json"
+        if path.exists():
+            curves.append(_stored_curves(path))
+            continue
+        result = learning_curves(
+            evaluation["environment"],
+            objective,
+            seeds,
+            setting=training_setting(evaluation["environment"], evaluation["steps"]),
+            backend=evaluation["backend"],
+        )
+        write_json(path, result.as_dict())
+        curves.append(result)
+    return Comparison(curves)
+
+
+def _stored_curves(path: Path) -> LearningCurves:
+    stored = json.loads(path.read_text())
+    fields = {
+        name: stored[name]
+        for name in ("environment", "backend", "objective", "seeds", "episodes", "mode_actions")
+    }
+    return LearningCurves(
+        steps=np.asarray(stored["steps"]), returns=np.asarray(stored["returns"]), **fields
+    )
+
+
+def _figures(
+    folder: Path,
+    problem: MetaTraining,
+    objective: Objective,
+    objectives: list[Objective],
+    comparisons: Mapping[str, Comparison],
+    meta: Mapping[str, Any],
+) -> dict[str, Path]:
+    drawn = {}
+    if meta:
+        drawn["meta_training"] = figures.meta_training_curve(
+            meta["metrics"], problem.config.environment, problem.config.fitness
+        )
+        drawn["environment_steps"] = figures.environment_steps(
+            meta["steps"], meta["environment_steps"]
+        )
+    for name, comparison in comparisons.items():
+        drawn[f"learning_{name}"] = figures.learning_curves(comparison.curves)
+    drawn["drift"] = figures.drift_heatmaps(objectives)
+    paths = {}
+    for name, figure in drawn.items():
+        paths[name] = folder / "figures" / f"{name}.png"
+        paths[name].parent.mkdir(exist_ok=True)
+        figures.save(figure, paths[name])
+    return paths

@@ -1,0 +1,1 @@
+"""Agents: static configuration apart from traced hyperparameters, pure functions of keys."""

@@ -1,0 +1,64 @@
+"""Policy and value networks: separate multilayer perceptrons, as in the paper's tables."""
+
+from collections.abc import Callable
+
+import distrax
+import jax
+import jax.numpy as jnp
+from flax import linen as nn
+
+ACTIVATIONS: dict[str, Callable[[jax.Array], jax.Array]] = {
+    "tanh": jnp.tanh,
+    "relu": jax.nn.relu,
+    "swish": jax.nn.swish,
+}
+
+
+class MLP(nn.Module):
+    hidden_sizes: tuple[int, ...]
+    output_size: int
+    activation: str
+
+    @nn.compact
+    def __call__(self, inputs: jax.Array) -> jax.Array:
+        for size in self.hidden_sizes:
+            inputs = ACTIVATIONS[self.activation](nn.Dense(size)(inputs))
+        return nn.Dense(self.output_size)(inputs)
+
+
+class CategoricalPolicy(nn.Module):
+    num_actions: int
+    hidden_sizes: tuple[int, ...]
+    activation: str
+
+    @nn.compact
+    def __call__(self, observation: jax.Array) -> distrax.Distribution:
+        """[..., O] -> distribution over [...] integer actions."""
+        return distrax.Categorical(
+            logits=MLP(self.hidden_sizes, self.num_actions, self.activation)(observation)
+        )
+
+
+class GaussianPolicy(nn.Module):
+    """Diagonal Gaussian whose standard deviation is a parameter, not a function of the state; it starts at 1."""
+
+    action_size: int
+    hidden_sizes: tuple[int, ...]
+    activation: str
+
+    @nn.compact
+    def __call__(self, observation: jax.Array) -> distrax.Distribution:
+        """[..., O] -> distribution over [..., A] unbounded actions."""
+        mean = MLP(self.hidden_sizes, self.action_size, self.activation)(observation)
+        log_std = self.param("log_std", nn.initializers.zeros, (self.action_size,))
+        return distrax.MultivariateNormalDiag(mean, jnp.broadcast_to(jnp.exp(log_std), mean.shape))
+
+
+class ValueNetwork(nn.Module):
+    hidden_sizes: tuple[int, ...]
+    activation: str
+
+    @nn.compact
+    def __call__(self, observation: jax.Array) -> jax.Array:
+        """[..., O] -> [...] value."""
+        return MLP(self.hidden_sizes, 1, self.activation)(observation)[..., 0]

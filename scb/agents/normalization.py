@@ -1,0 +1,38 @@
+"""Running mean and variance of observations (Chan et al., 1979: merging two samples' moments)."""
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+
+@struct.dataclass
+class RunningStatistics:
+    count: jax.Array  # [] observations seen
+    mean: jax.Array  # [O]
+    squares: jax.Array  # [O] sum of squared deviations from the mean
+
+    @classmethod
+    def start(cls, size: int) -> "RunningStatistics":
+        return cls(count=jnp.float32(0.0), mean=jnp.zeros(size), squares=jnp.zeros(size))
+
+
+def update_statistics(statistics: RunningStatistics, batch: jax.Array) -> RunningStatistics:
+    """Adds a [B, O] batch of observations."""
+    size = batch.shape[0]
+    batch_mean = batch.mean(axis=0)
+    batch_squares = jnp.sum((batch - batch_mean) ** 2, axis=0)
+    delta = batch_mean - statistics.mean
+    count = statistics.count + size
+    return RunningStatistics(
+        count=count,
+        mean=statistics.mean + delta * size / count,
+        squares=statistics.squares + batch_squares + delta**2 * statistics.count * size / count,
+    )
+
+
+def normalize(statistics: RunningStatistics, observation: jax.Array) -> jax.Array:
+    """[..., O] -> [..., O] with mean 0 and variance 1, clipped to ten deviations; as it is before any observation."""
+    variance = jnp.where(
+        statistics.count > 0, statistics.squares / jnp.maximum(statistics.count, 1.0), 1.0
+    )
+    return jnp.clip((observation - statistics.mean) / jnp.sqrt(variance + 1e-8), -10.0, 10.0)

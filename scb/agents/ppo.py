@@ -1,0 +1,531 @@
+"""Proximal policy optimisation (Schulman et al., 2017) whose surrogate is an argument.
+
+The update maximises `mean(ratio * A - drift(ratio, A))`. With PPO's own drift, `relu((r - clip(r)) A)`, that is exactly
+`mean(min(r A, clip(r) A))`; a learned drift takes its place without touching the agent (Lu et al., 2022, "Discovered
+Policy Optimisation"). Everything is a pure function of typed keys and traced numbers: one compiled program trains a
+population with different seeds, hyperparameters, bandits or drifts.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NamedTuple, TypeAlias
+
+import chex
+import distrax
+import jax
+import jax.numpy as jnp
+import optax
+from flax import linen as nn
+from flax import struct
+from gymnax.environments import environment, spaces
+from jax.typing import ArrayLike
+
+from scb.agents import networks
+from scb.agents.normalization import RunningStatistics, normalize, update_statistics
+from scb.errors import UserError, unknown_name
+from scb.evaluation import Episodes, evaluate
+
+DriftFunction: TypeAlias = Callable[[Any, jax.Array, jax.Array, jax.Array], jax.Array]
+
+# exp(20) squared still fits into float32; beyond it a learned drift would meet infinities that PPO's never does.
+MAX_LOG_RATIO = 20.0
+
+
+def clipped_surrogate_drift(
+    clip: ArrayLike, log_ratio: jax.Array, advantage: jax.Array, progress: jax.Array
+) -> jax.Array:
+    """PPO's clip written as a drift (Lu et al., 2022, eq. 4).
+
+    Args:
+      clip: the half-width of the trust interval, > 0.
+      log_ratio: [B] log pi(a|s) - log pi_behaviour(a|s), in nats.
+      advantage: [B] normalised advantage.
+      progress: [B] fraction of training done; unused here.
+
+    Returns:
+      [B] non-negative penalty; ratio * advantage - drift equals PPO's minimum.
+    """
+    chex.assert_equal_shape([log_ratio, advantage, progress])
+    ratio = jnp.exp(log_ratio)
+    return jax.nn.relu((ratio - jnp.clip(ratio, 1.0 - clip, 1.0 + clip)) * advantage)
+
+
+@dataclass(frozen=True)
+class PPOConfig:
+    """What decides shapes and program: a change recompiles. Defaults are the paper's inner loop.
+
+    Attributes:
+      num_envs, num_steps: a batch is num_envs * num_steps transitions (on a bandit: that many contexts at once).
+      num_epochs, num_minibatches: passes over a batch, and equal parts that it is cut into.
+      total_steps: environment steps of the whole training, rounded up to whole batches.
+      hidden_sizes, activation: of policy and value network, which share nothing.
+      normalize_observations: by running mean and variance, frozen with the agent for evaluation.
+      anneal_learning_rate: linearly to zero over the training.
+      one_batch_contexts: on one-step environments, draw a batch of contexts at once instead of scanning steps. The same
+        distribution (contexts are independent), several times faster.
+    """
+
+    num_envs: int = 5
+    num_steps: int = 100
+    num_epochs: int = 10
+    num_minibatches: int = 10
+    total_steps: int = 10_000
+    hidden_sizes: tuple[int, ...] = (64, 64)
+    activation: str = "tanh"
+    normalize_observations: bool = False
+    anneal_learning_rate: bool = False
+    one_batch_contexts: bool = True
+
+    def __post_init__(self) -> None:
+        for field in ("num_envs", "num_steps", "num_epochs", "num_minibatches", "total_steps"):
+            value = getattr(self, field)
+            if value < 1:
+                raise UserError(f"{field} is {value}: it must be at least 1.")
+        if self.batch_size % self.num_minibatches:
+            raise UserError(
+                f"num_minibatches is {self.num_minibatches}, which does not divide a batch of {self.batch_size} "
+                f"({self.num_envs} environments x {self.num_steps} steps): choose a divisor of {self.batch_size}."
+            )
+        if self.activation not in networks.ACTIVATIONS:
+            raise unknown_name("activation", self.activation, networks.ACTIVATIONS)
+
+    @property
+    def batch_size(self) -> int:
+        return self.num_envs * self.num_steps
+
+    @property
+    def num_iterations(self) -> int:
+        return -(-self.total_steps // self.batch_size)
+
+
+@struct.dataclass
+class PPOHyperparameters:
+    """What is only a number: traced, and so vmapped over a population. Defaults are the paper's underlined values.
+
+    `drift` holds the drift's parameters, whatever pytree it takes; for PPO itself the clip epsilon.
+    """
+
+    learning_rate: ArrayLike = 5e-3
+    discount: ArrayLike = 0.99
+    gae_lambda: ArrayLike = 0.95
+    entropy_coefficient: ArrayLike = 0.01
+    value_coefficient: ArrayLike = 0.5
+    max_grad_norm: ArrayLike = 10.0
+    drift: Any = 0.2
+
+
+@struct.dataclass
+class PPOState:
+    """An agent: networks, optimiser, normaliser, and where its environments stand."""
+
+    params: dict[str, Any]  # {"policy": ..., "value": ...}
+    optimizer: dict[str, optax.OptState]
+    statistics: RunningStatistics
+    environment: Any  # [N] states and [N, O] observations, or None on the one-batch path
+    iteration: jax.Array
+    key: jax.Array
+
+
+class Batch(NamedTuple):
+    """A batch of transitions, [B] each but for observation [B, O] and continuous action [B, A]."""
+
+    observation: jax.Array
+    action: jax.Array
+    log_prob: jax.Array
+    advantage: jax.Array
+    target: jax.Array
+
+
+def generalized_advantages(
+    reward: jax.Array,
+    value: jax.Array,
+    next_value: jax.Array,
+    terminated: jax.Array,
+    truncated: jax.Array,
+    discount: ArrayLike,
+    gae_lambda: ArrayLike,
+) -> jax.Array:
+    """Generalised advantage estimation (Schulman et al., 2016), with truncation told from termination.
+
+    Args:
+      reward, value, terminated, truncated: [T, N]; value is V(s_t).
+      next_value: [T, N] V of the observation that the step led to, *before* any automatic reset: at a truncation that is
+        the final observation's value, not the next episode's first.
+      discount, gae_lambda: traced numbers.
+
+    Returns:
+      [T, N] advantages. Termination stops bootstrapping and the trace; truncation stops only the trace.
+    """
+    chex.assert_equal_shape([reward, value, next_value, terminated, truncated])
+    delta = reward + discount * jnp.where(terminated, 0.0, next_value) - value
+    carry_on = jnp.where(terminated | truncated, 0.0, discount * gae_lambda)
+
+    def backward(advantage: jax.Array, inputs: tuple[jax.Array, jax.Array]) -> Any:
+        delta, carry_on = inputs
+        advantage = delta + carry_on * advantage
+        return advantage, advantage
+
+    _, advantages = jax.lax.scan(
+        backward, jnp.zeros_like(delta[0]), (delta, carry_on), reverse=True
+    )
+    return advantages
+
+
+@dataclass(frozen=True, eq=False)
+class PPO:
+    """PPO in one environment with one drift; every method is pure, and to be jitted and vmapped by the caller.
+
+    Args:
+      env: a gymnax 1.x environment.
+      config: static configuration.
+      drift: (parameters, log_ratio [B], advantage [B], progress [B]) -> penalty [B].
+    """
+
+    env: environment.Environment[Any, Any]
+    config: PPOConfig
+    drift: DriftFunction = clipped_surrogate_drift
+
+    @property
+    def one_step(self) -> bool:
+        return self.config.one_batch_contexts and getattr(self.env, "one_step", False)
+
+    def _networks(self, env_params: Any) -> tuple[nn.Module, nn.Module]:
+        space = self.env.action_space(env_params)
+        sizes, activation = self.config.hidden_sizes, self.config.activation
+        policy: nn.Module
+        if isinstance(space, spaces.Discrete):
+            policy = networks.CategoricalPolicy(space.n, sizes, activation)
+        else:
+            size = int(jnp.zeros(space.shape).size)
+            policy = networks.GaussianPolicy(size, sizes, activation)
+        return policy, networks.ValueNetwork(sizes, activation)
+
+    def init(
+        self, key: jax.Array, hyperparameters: PPOHyperparameters, env_params: Any
+    ) -> PPOState:
+        """A fresh agent, its environments at their first observation."""
+        key_policy, key_value, key_reset, key_train = jax.random.split(key, 4)
+        policy, value = self._networks(env_params)
+        size = 1
+        for dimension in self.env.observation_space(env_params).shape:
+            size *= dimension
+        params = {
+            "policy": policy.init(key_policy, jnp.zeros(size)),
+            "value": value.init(key_value, jnp.zeros(size)),
+        }
+        standing = None
+        if not self.one_step:
+            observation, env_state = jax.vmap(self.env.reset, in_axes=(0, None))(
+                jax.random.split(key_reset, self.config.num_envs), env_params
+            )
+            standing = (env_state, observation)
+        return PPOState(
+            params=params,
+            optimizer={name: _optimizer(hyperparameters).init(p) for name, p in params.items()},
+            statistics=RunningStatistics.start(size),
+            environment=standing,
+            iteration=jnp.int32(0),
+            key=key_train,
+        )
+
+    def train(
+        self, key: jax.Array, hyperparameters: PPOHyperparameters, env_params: Any
+    ) -> PPOState:
+        """Initialises and trains for `config.num_iterations`."""
+        state = self.init(key, hyperparameters, env_params)
+        return self.train_iterations(state, hyperparameters, env_params, self.config.num_iterations)
+
+    def train_iterations(
+        self,
+        state: PPOState,
+        hyperparameters: PPOHyperparameters,
+        env_params: Any,
+        num_iterations: int,
+    ) -> PPOState:
+        """`num_iterations` times: collect a batch, update on it. A segment of a longer training."""
+
+        def iteration(state: PPOState, _: None) -> tuple[PPOState, None]:
+            return self._iteration(state, hyperparameters, env_params), None
+
+        state, _ = jax.lax.scan(iteration, state, None, num_iterations)
+        return state
+
+    def train_with_evaluations(
+        self,
+        key: jax.Array,
+        hyperparameters: PPOHyperparameters,
+        env_params: Any,
+        evaluation: Callable[[PPOState, jax.Array], Any],
+        every: int,
+    ) -> tuple[PPOState, Any]:
+        """Trains, and evaluates before the first and after every `every`-th iteration.
+
+        Args:
+          evaluation: (state, key) -> pytree of what is wanted of the agent at that point.
+          every: iterations between evaluations; must divide `config.num_iterations`.
+
+        Returns:
+          The trained agent, and the evaluations stacked along a new first axis of num_iterations / every + 1 entries.
+        """
+        if every < 1 or self.config.num_iterations % every:
+            raise UserError(
+                f"evaluation every {every} iterations does not divide {self.config.num_iterations} iterations: "
+                "choose a divisor."
+            )
+        key_train, key_evaluate = jax.random.split(key)
+        state = self.init(key_train, hyperparameters, env_params)
+
+        def segment(state: PPOState, key: jax.Array) -> tuple[PPOState, Any]:
+            outcome = evaluation(state, key)
+            return self.train_iterations(state, hyperparameters, env_params, every), outcome
+
+        keys = jax.random.split(key_evaluate, self.config.num_iterations // every + 1)
+        state, outcomes = jax.lax.scan(segment, state, keys[:-1])
+        last = evaluation(state, keys[-1])
+        return state, jax.tree.map(lambda a, b: jnp.concatenate([a, b[None]]), outcomes, last)
+
+    def act(
+        self,
+        state: PPOState,
+        observation: jax.Array,
+        key: jax.Array,
+        env_params: Any = None,
+        mode: bool = False,
+    ) -> jax.Array:
+        """The agent's action for one observation, within the action space's bounds.
+
+        Args:
+          mode: the most likely action instead of a sampled one.
+        """
+        env_params = self.env.default_params if env_params is None else env_params
+        distribution = self._policy(state, jnp.ravel(observation), env_params)
+        action = distribution.mode() if mode else distribution.sample(seed=key)
+        return self._to_environment(action, env_params)
+
+    def evaluate(
+        self,
+        state: PPOState,
+        key: jax.Array,
+        num_episodes: int,
+        env: environment.Environment[Any, Any] | None = None,
+        env_params: Any = None,
+        mode: bool = False,
+        horizon: ArrayLike | None = None,
+    ) -> Episodes:
+        """Episodes of the frozen agent, in its own environment or in another of the same shapes."""
+        env = self.env if env is None else env
+        env_params = env.default_params if env_params is None else env_params
+        policy_module, _ = self._networks(env_params)
+
+        def policy(observation: jax.Array, key: jax.Array) -> jax.Array:
+            inputs = self._inputs(state, jnp.ravel(observation))
+            distribution = policy_module.apply(state.params["policy"], inputs)
+            action = distribution.mode() if mode else distribution.sample(seed=key)
+            return _clip_to_space(action, env.action_space(env_params))
+
+        return evaluate(env, env_params, policy, key, num_episodes, horizon)
+
+    # -- inside an iteration ------------------------------------------------------------------------------------
+
+    def _inputs(self, state: PPOState, observation: jax.Array) -> jax.Array:
+        if self.config.normalize_observations:
+            return normalize(state.statistics, observation)
+        return observation
+
+    def _policy(
+        self, state: PPOState, observation: jax.Array, env_params: Any
+    ) -> distrax.Distribution:
+        policy, _ = self._networks(env_params)
+        return policy.apply(state.params["policy"], self._inputs(state, observation))
+
+    def _value(self, state: PPOState, observation: jax.Array, env_params: Any) -> jax.Array:
+        _, value = self._networks(env_params)
+        return value.apply(state.params["value"], self._inputs(state, observation))
+
+    def _to_environment(self, action: jax.Array, env_params: Any) -> jax.Array:
+        return _clip_to_space(action, self.env.action_space(env_params))
+
+    def _iteration(
+        self, state: PPOState, hyperparameters: PPOHyperparameters, env_params: Any
+    ) -> PPOState:
+        key, key_collect, key_update = jax.random.split(state.key, 3)
+        state = state.replace(key=key)
+        if self.one_step:
+            batch = self._collect_contexts(state, key_collect, env_params)
+        else:
+            state, batch = self._collect_steps(state, key_collect, hyperparameters, env_params)
+        state = self._update(state, key_update, hyperparameters, env_params, batch)
+        if self.config.normalize_observations:
+            # After the update: the old log-probabilities were taken under the old statistics.
+            statistics = update_statistics(state.statistics, batch.observation)
+            state = state.replace(statistics=statistics)
+        return state.replace(iteration=state.iteration + 1)
+
+    def _collect_contexts(self, state: PPOState, key: jax.Array, env_params: Any) -> Batch:
+        """One batch of independent one-step episodes: nothing to bootstrap, A = r - V(s)."""
+        size = self.config.batch_size
+        key_reset, key_act, key_step = jax.random.split(key, 3)
+        observation, env_state = jax.vmap(self.env.reset_env, in_axes=(0, None))(
+            jax.random.split(key_reset, size), env_params
+        )
+        observation = jnp.reshape(observation, (size, -1))
+        distribution = self._policy(state, observation, env_params)
+        action, log_prob = distribution.sample_and_log_prob(seed=key_act)
+        _, _, reward, _, _ = jax.vmap(self.env.step_env, in_axes=(0, 0, 0, None))(
+            jax.random.split(key_step, size),
+            env_state,
+            jax.vmap(lambda a: self._to_environment(a, env_params))(action),
+            env_params,
+        )
+        advantage = reward - self._value(state, observation, env_params)
+        return Batch(observation, action, log_prob, advantage, reward)
+
+    def _collect_steps(
+        self,
+        state: PPOState,
+        key: jax.Array,
+        hyperparameters: PPOHyperparameters,
+        env_params: Any,
+    ) -> tuple[PPOState, Batch]:
+        num_envs, num_steps = self.config.num_envs, self.config.num_steps
+
+        def flat(observation: jax.Array) -> jax.Array:
+            return jnp.reshape(observation, (num_envs, -1))
+
+        def step(carry: Any, key: jax.Array) -> Any:
+            env_state, observation = carry
+            key_act, key_step = jax.random.split(key)
+            distribution = self._policy(state, flat(observation), env_params)
+            action, log_prob = distribution.sample_and_log_prob(seed=key_act)
+            next_observation, env_state, reward, terminated, truncated, info = jax.vmap(
+                self.env.step, in_axes=(0, 0, 0, None)
+            )(
+                jax.random.split(key_step, num_envs),
+                env_state,
+                jax.vmap(lambda a: self._to_environment(a, env_params))(action),
+                env_params,
+            )
+            transition = {
+                "observation": flat(observation),
+                "action": action,
+                "log_prob": log_prob,
+                "reward": jnp.reshape(reward, (num_envs,)),
+                "terminated": terminated,
+                "truncated": truncated,
+                "final_observation": flat(info["final_observation"]),
+            }
+            return (env_state, next_observation), transition
+
+        standing, steps = jax.lax.scan(step, state.environment, jax.random.split(key, num_steps))
+        value = self._value(state, steps["observation"], env_params)
+        advantage = generalized_advantages(
+            steps["reward"],
+            value,
+            self._value(state, steps["final_observation"], env_params),
+            steps["terminated"],
+            steps["truncated"],
+            hyperparameters.discount,
+            hyperparameters.gae_lambda,
+        )
+        batch = Batch(
+            steps["observation"], steps["action"], steps["log_prob"], advantage, advantage + value
+        )
+        batch = jax.tree.map(lambda x: jnp.reshape(x, (-1, *x.shape[2:])), batch)
+        return state.replace(environment=standing), batch
+
+    def _update(
+        self,
+        state: PPOState,
+        key: jax.Array,
+        hyperparameters: PPOHyperparameters,
+        env_params: Any,
+        batch: Batch,
+    ) -> PPOState:
+        config = self.config
+        policy, value = self._networks(env_params)
+        batch = batch._replace(observation=self._inputs(state, batch.observation))
+        progress = state.iteration / config.num_iterations
+        fraction_left = 1.0 - progress if config.anneal_learning_rate else 1.0
+        optimizer = _optimizer(hyperparameters)
+
+        def loss(params: dict[str, Any], minibatch: Batch) -> jax.Array:
+            distribution = policy.apply(params["policy"], minibatch.observation)
+            log_ratio = jnp.clip(
+                distribution.log_prob(minibatch.action) - minibatch.log_prob,
+                -MAX_LOG_RATIO,
+                MAX_LOG_RATIO,
+            )
+            advantage = minibatch.advantage
+            advantage = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
+            penalty = self.drift(
+                hyperparameters.drift, log_ratio, advantage, jnp.full_like(advantage, progress)
+            )
+            # [B, 1] against [B] would broadcast to [B, B] and train something else.
+            chex.assert_equal_shape([penalty, log_ratio, advantage])
+            surrogate = jnp.mean(jnp.exp(log_ratio) * advantage - penalty)
+            entropy = jnp.mean(distribution.entropy())
+            error = value.apply(params["value"], minibatch.observation) - minibatch.target
+            value_loss = 0.5 * jnp.mean(error**2)
+            return (
+                -surrogate
+                - hyperparameters.entropy_coefficient * entropy
+                + hyperparameters.value_coefficient * value_loss
+            )
+
+        def update(carry: Any, minibatch: Batch) -> Any:
+            params, optimizer_state = carry
+            gradients = jax.grad(loss)(params, minibatch)
+            new_params, new_optimizer_state = {}, {}
+            # Clipped per network: the value error on raw returns would otherwise drown the policy's gradient.
+            for name, gradient in gradients.items():
+                updates, new_optimizer_state[name] = optimizer.update(
+                    gradient, optimizer_state[name]
+                )
+                updates = jax.tree.map(lambda u: u * fraction_left, updates)
+                new_params[name] = optax.apply_updates(params[name], updates)
+            return (new_params, new_optimizer_state), None
+
+        def epoch(carry: Any, key: jax.Array) -> Any:
+            order = random_order(key, config.batch_size)
+            minibatches = jax.tree.map(
+                lambda x: jnp.reshape(
+                    x[order],
+                    (config.num_minibatches, config.batch_size // config.num_minibatches)
+                    + x.shape[1:],
+                ),
+                batch,
+            )
+            return jax.lax.scan(update, carry, minibatches)
+
+        (params, optimizer_state), _ = jax.lax.scan(
+            epoch, (state.params, state.optimizer), jax.random.split(key, config.num_epochs)
+        )
+        return state.replace(params=params, optimizer=optimizer_state)
+
+
+def random_order(key: jax.Array, size: int) -> jax.Array:
+    """[size] a random permutation of 0 ... size - 1.
+
+    `jax.random.permutation` sorts pairs, which on a CPU takes a fifth of an inner loop's time. Sorting single words, random
+    bits above the index, is four times faster; words that tie in their random bits keep their order, at these sizes a
+    few pairs in a thousand.
+    """
+    index_bits = max(1, (size - 1).bit_length())
+    if index_bits > 16:
+        return jax.random.permutation(key, size)
+    mask = jnp.uint32((1 << index_bits) - 1)
+    words = (jax.random.bits(key, (size,), jnp.uint32) & ~mask) | jnp.arange(size, dtype=jnp.uint32)
+    return (jnp.sort(words) & mask).astype(jnp.int32)
+
+
+def _optimizer(hyperparameters: PPOHyperparameters) -> optax.GradientTransformation:
+    return optax.chain(
+        optax.clip_by_global_norm(hyperparameters.max_grad_norm),
+        optax.adam(hyperparameters.learning_rate, eps=1e-5),
+    )
+
+
+def _clip_to_space(action: jax.Array, space: spaces.Box | spaces.Discrete) -> jax.Array:
+    if isinstance(space, spaces.Discrete):
+        return action
+    return jnp.reshape(jnp.clip(action, space.low, space.high), space.shape)

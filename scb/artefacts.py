@@ -1,0 +1,420 @@
+"""Artefacts: what was discovered, as two files that can be checked and need no trust.
+
+NAME.npz holds the weights and is read without pickle, so that opening one runs no code. NAME.json
+beside it says what they are and where they came from: schema version, kind, name, config, seeds,
+package versions, measured results, cost, the command, and the SHA-256 of the .npz. Equal input
+gives equal bytes.
+"""
+
+import dataclasses
+import hashlib
+import io
+import json
+import os
+import platform
+import struct
+import subprocess
+import sys
+import zipfile
+import zlib
+from collections.abc import Mapping, Sequence
+from importlib import metadata as distributions
+from pathlib import Path
+from typing import Any, NoReturn, TypeAlias
+
+import jax
+import numpy as np
+
+from scb.errors import UserError, unknown_name
+
+SCHEMA_VERSION = 1
+KINDS = ("bandit", "drift")
+
+# numpy.ndarray leaves under any depth of dictionaries: {"reward": {"Dense_0": {"kernel": ...}}}.
+ArrayTree: TypeAlias = "dict[str, np.ndarray | ArrayTree]"
+
+# What every NAME.json holds, in this order, and as what; `results` maps names to numbers with their
+# intervals, `cost` says environment steps and wall-clock time.
+_FIELDS: dict[str, tuple[type, ...]] = {
+    "schema_version": (int,),
+    "kind": (str,),
+    "name": (str,),
+    "config": (dict,),
+    "seeds": (dict, list, int),
+    "versions": (dict,),
+    "results": (dict,),
+    "cost": (dict,),
+    "command": (str,),
+    "sha256": (str,),
+}
+# `save` fills in these itself.
+_OWN_FIELDS = ("schema_version", "name", "versions", "sha256")
+
+_PACKAGES = ("jax", "jaxlib", "flax", "optax", "evosax", "gymnax", "brax", "numpy", "lpo")
+
+# All that a damaged .npz was seen to raise inside zipfile and NumPy.
+_DAMAGE = (
+    EOFError,
+    KeyError,
+    MemoryError,
+    NotImplementedError,
+    OSError,
+    OverflowError,
+    RuntimeError,
+    SyntaxError,
+    TypeError,
+    ValueError,
+    struct.error,
+    zipfile.BadZipFile,
+    zlib.error,
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class Artefact:
+    """A checked artefact: its name, its weights as nested dictionaries, and all of NAME.json."""
+
+    name: str
+    arrays: ArrayTree
+    metadata: dict[str, Any]
+
+
+def save(path: str | Path, arrays: Mapping[str, Any], metadata: Mapping[str, Any]) -> Path:
+    """Writes NAME.npz, then NAME.json, each all at once.
+
+    A reader never sees half a file. If the process dies between the two, the pair does not match
+    and `load` says so.
+
+    Args:
+      path: NAME or NAME.npz in any folder, which is made if it is missing.
+      arrays: finite arrays of numbers, in dictionaries nested to any depth.
+      metadata: `kind`, `config`, `seeds`, `results`, `cost` and `command`, and whatever else
+        belongs; JSON types, NumPy numbers and arrays, and dataclasses. The schema version, the
+        name, the package versions and the checksum are filled in.
+
+    Returns:
+      The path of NAME.npz.
+
+    Raises:
+      UserError: metadata is missing or not finite, or an array could not be loaded again.
+    """
+    npz_path, json_path = _paths(path)
+    flat = flatten(arrays)
+    for name, array in flat.items():
+        problem = _problem(array)
+        if problem:
+            raise UserError(f"{npz_path} was not written, since array {name!r} {problem}.")
+    data = _npz_bytes(flat)
+
+    written = {
+        **metadata,
+        "schema_version": SCHEMA_VERSION,
+        "name": npz_path.name.removesuffix(".npz"),
+        "versions": package_versions(),
+        "sha256": hashlib.sha256(data).hexdigest(),
+    }
+    written = {key: written[key] for key in (*_FIELDS, *written) if key in written}
+    try:
+        text = json.dumps(written, indent=2, ensure_ascii=False, allow_nan=False, default=_as_json)
+    except (TypeError, ValueError, RecursionError) as error:
+        raise UserError(
+            f"the metadata of {npz_path} cannot be written as JSON ({error}): give finite numbers "
+            "(None where one is unknown), text, lists and dictionaries."
+        ) from error
+    # As a reader will see it: a mapping or tuple of the caller's is a plain dict or list by now.
+    _check_metadata(json_path, json.loads(text))
+
+    npz_path.parent.mkdir(parents=True, exist_ok=True)
+    _replace(npz_path, data)
+    _replace(json_path, (text + "\n").encode())
+    return npz_path
+
+
+def load(path: str | Path, kind: str) -> Artefact:
+    """Reads and checks an artefact.
+
+    Args:
+      path: NAME, NAME.npz or NAME.json.
+      kind: "bandit" or "drift", what the caller can use.
+
+    Raises:
+      UserError: one sentence that says which file is missing, damaged, changed since it was saved,
+        of another kind or a newer schema, or holds something other than finite numbers.
+    """
+    if kind not in KINDS:
+        raise unknown_name("kind of artefact", kind, KINDS)
+    npz_path, json_path = _paths(path)
+    # The bytes that are checked are the bytes that are used: each file is read once.
+    data, text = _read(npz_path), _read(json_path)
+    metadata = _parse_metadata(json_path, text)
+    _check_metadata(json_path, metadata)
+    if metadata["kind"] != kind:
+        raise UserError(f"{npz_path} is a {metadata['kind']}: give a {kind} here.")
+    if hashlib.sha256(data).hexdigest() != metadata["sha256"]:
+        raise UserError(
+            f"{npz_path} is not the file that {json_path.name} describes (its SHA-256 differs): it "
+            "was changed, or saving it was interrupted; fetch or save both again."
+        )
+    return Artefact(metadata["name"], unflatten(npz_path, _parse_npz(npz_path, data)), metadata)
+
+
+def expect_shapes(artefact: Artefact, shapes: Mapping[str, Sequence[int]]) -> None:
+    """Checks that the artefact holds exactly these arrays.
+
+    Args:
+      artefact: what was loaded.
+      shapes: shape by flat name, {"reward/Dense_0/kernel": (4, 32)}.
+
+    Raises:
+      UserError: names the first array that is missing, of another shape, or not expected.
+    """
+    flat = flatten(artefact.arrays)
+    title = f"{artefact.metadata['kind']} {artefact.name!r}"
+    for name, shape in shapes.items():
+        expected = tuple(shape)
+        if name not in flat:
+            raise UserError(
+                f"{title} has no array {name!r}, which should have shape {expected}: it was made "
+                "for another architecture than its config says."
+            )
+        if flat[name].shape != expected:
+            raise UserError(
+                f"array {name!r} of {title} has shape {flat[name].shape} where {expected} is "
+                "expected: it was made for another architecture or another environment."
+            )
+    for name, array in flat.items():
+        if name not in shapes:
+            raise UserError(
+                f"{title} has an array {name!r} of shape {array.shape} where none is expected: it "
+                "was made for another architecture than its config says."
+            )
+
+
+def flatten(arrays: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    """{"a": {"b": x}} as {"a/b": x}, in the order of the names.
+
+    Raises:
+      UserError: a name is empty, is no text or holds a "/", or a dictionary is empty: none of
+        these would come back from a file.
+    """
+    flat: dict[str, np.ndarray] = {}
+    _flatten_into(flat, "", arrays)
+    return dict(sorted(flat.items()))
+
+
+def unflatten(path: Path, flat: Mapping[str, np.ndarray]) -> ArrayTree:
+    """The inverse of `flatten`.
+
+    Raises:
+      UserError: a name is both an array and the dictionary of others; `path` is for the message.
+    """
+    tree: ArrayTree = {}
+    for name, array in flat.items():
+        *folders, leaf = name.split("/")
+        inner = tree
+        for folder in folders:
+            child = inner.setdefault(folder, {})
+            if not isinstance(child, dict):
+                raise _damaged(path, f"array {name!r} lies inside another array")
+            inner = child
+        if leaf in inner:
+            raise _damaged(path, f"{name!r} is both an array and a group of arrays")
+        inner[leaf] = array
+    return tree
+
+
+def package_versions() -> dict[str, str]:
+    """Versions of Python, of what decides the numbers, and of this project ("lpo")."""
+    versions = {"python": platform.python_version()}
+    for package in _PACKAGES:
+        try:
+            versions[package] = distributions.version(package)
+        except distributions.PackageNotFoundError:
+            versions[package] = "not installed"
+    return versions
+
+
+def machine_description() -> dict[str, str | int]:
+    """What timings depend on: processor, cores, accelerator, platform; no host name and no path."""
+    devices = jax.devices()
+    return {
+        "processor": _processor(),
+        "cores": _usable_cores(),
+        "accelerator": devices[0].device_kind if devices[0].platform != "cpu" else "none",
+        "jax_platform": devices[0].platform,
+        "jax_devices": len(devices),
+        "platform": f"{platform.system()} {platform.machine()}",
+    }
+
+
+def _paths(path: str | Path) -> tuple[Path, Path]:
+    path = Path(path)
+    # Not with_suffix: it would take the ".5" of "hopper-0.5" for a suffix.
+    name = path.name.removesuffix(".npz").removesuffix(".json")
+    if not name:
+        raise UserError(f"{str(path)!r} names no artefact: give NAME or NAME.npz.")
+    return path.with_name(f"{name}.npz"), path.with_name(f"{name}.json")
+
+
+def _read(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except FileNotFoundError as error:
+        raise UserError(
+            f"{path} does not exist: an artefact is a .npz file with a .json file of the same name "
+            "beside it."
+        ) from error
+    except (OSError, ValueError) as error:
+        raise UserError(f"{path} cannot be read: {error}.") from error
+
+
+def _replace(path: Path, data: bytes) -> None:
+    # In the same folder, since a rename is atomic within one file system only.
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        with open(temporary, "wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _npz_bytes(flat: Mapping[str, np.ndarray]) -> bytes:
+    # numpy.savez stamps the time into the archive; compression differs between zlib versions.
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_STORED) as archive:
+        for name, array in flat.items():
+            entry = zipfile.ZipInfo(f"{name}.npy", date_time=(1980, 1, 1, 0, 0, 0))
+            entry.create_system = 3  # Unix, on every system
+            entry.external_attr = 0o644 << 16
+            content = io.BytesIO()
+            np.lib.format.write_array(content, np.asarray(array, order="C"), allow_pickle=False)
+            archive.writestr(entry, content.getvalue())
+    return buffer.getvalue()
+
+
+def _parse_npz(path: Path, data: bytes) -> dict[str, np.ndarray]:
+    try:
+        if not zipfile.is_zipfile(io.BytesIO(data)):
+            raise zipfile.BadZipFile("no zip archive")
+        with np.load(io.BytesIO(data), allow_pickle=False) as archive:
+            flat = {name: archive[name] for name in archive.files}
+    except _DAMAGE as error:
+        raise _damaged(path, f"{error or type(error).__name__}") from error
+    if not flat:
+        raise _damaged(path, "it holds no arrays")
+    for name, array in flat.items():
+        problem = _problem(array)
+        if problem:
+            raise UserError(f"{path} cannot be used, since array {name!r} {problem}.")
+    return flat
+
+
+def _problem(array: np.ndarray | bytes) -> str | None:
+    # A member that does not start like a .npy comes out of np.load as bytes.
+    if not isinstance(array, np.ndarray):
+        return "is in no format that NumPy writes"
+    if array.dtype.kind not in "biuf":
+        return f"is of type {array.dtype}, where only NumPy's integers, floats and booleans fit"
+    number_bad = array.size - int(np.isfinite(array).sum())
+    if number_bad:
+        return f"has {number_bad} NaN or infinite among its {array.size} numbers"
+    return None
+
+
+def _damaged(path: Path, what: str) -> UserError:
+    return UserError(f"{path} is not a usable .npz ({what}): fetch or save it again.")
+
+
+def _parse_metadata(path: Path, text: bytes) -> dict[str, Any]:
+    def refuse(constant: str) -> NoReturn:
+        raise ValueError(f"{constant} is not JSON")
+
+    try:
+        metadata = json.loads(text, parse_constant=refuse)
+    except (ValueError, RecursionError) as error:
+        raise UserError(f"{path} is not valid JSON ({error}): fetch or save it again.") from error
+    if not isinstance(metadata, dict):
+        raise UserError(f"{path} holds a {type(metadata).__name__}: a JSON object is expected.")
+    return metadata
+
+
+def _check_metadata(path: Path, metadata: Mapping[str, Any]) -> None:
+    # The version first: another version may well have other keys.
+    version = metadata.get("schema_version", SCHEMA_VERSION)
+    if version != SCHEMA_VERSION or isinstance(version, bool):
+        raise UserError(
+            f"{path} has schema version {version!r} and this installation reads {SCHEMA_VERSION}: "
+            "install a version of lpo that matches it."
+        )
+    missing = [key for key in _FIELDS if key not in metadata]
+    if missing:
+        raise UserError(
+            f"{path} lacks {', '.join(missing)}: an artefact says all of {', '.join(_FIELDS)}."
+        )
+    for key, types in _FIELDS.items():
+        if not isinstance(metadata[key], types):
+            names = " or ".join({"dict": "object"}.get(t.__name__, t.__name__) for t in types)
+            raise UserError(
+                f"{path} has a {type(metadata[key]).__name__} for {key}: expected is {names}."
+            )
+    if metadata["kind"] not in KINDS:
+        raise UserError(f"{path} is of kind {metadata['kind']!r}: known are {', '.join(KINDS)}.")
+
+
+def _as_json(value: object) -> object:
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, np.ndarray | jax.Array):
+        return np.asarray(value).tolist()
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        # Not asdict, which copies what it cannot convert: json comes back here for every field.
+        return {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
+    if isinstance(value, Mapping):
+        return dict(value)
+    raise TypeError(f"a {type(value).__name__} is no JSON")
+
+
+def _flatten_into(flat: dict[str, np.ndarray], prefix: str, tree: Mapping[str, Any]) -> None:
+    if not tree:
+        raise UserError(f"the group {prefix!r} holds no arrays: leave it out.")
+    for name, value in tree.items():
+        if not isinstance(name, str) or not name or "/" in name:
+            raise UserError(
+                f"{name!r} cannot name an array: use text that is not empty and has no '/'."
+            )
+        if isinstance(value, Mapping):
+            _flatten_into(flat, f"{prefix}{name}/", value)
+        else:
+            flat[f"{prefix}{name}"] = np.asarray(value)
+
+
+def _processor() -> str:
+    if sys.platform.startswith("linux"):
+        try:
+            lines = Path("/proc/cpuinfo").read_text().splitlines()
+        except OSError:
+            lines = []
+        for line in lines:
+            key, _, value = line.partition(":")
+            if key.strip().lower() in ("model name", "hardware"):
+                return value.strip()
+    if sys.platform == "darwin":
+        answer = subprocess.run(
+            ["/usr/sbin/sysctl", "-n", "machdep.cpu.brand_string"],
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        if answer.returncode == 0:
+            return answer.stdout.strip()
+    return platform.processor() or platform.machine() or "unknown"
+
+
+def _usable_cores() -> int:
+    # A container or a batch system may allow fewer cores than the machine has.
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1

@@ -1,0 +1,35 @@
+"""Environments by name: synthetic bandits, gymnax's and Brax's, all behind gymnax 1.x's interface."""
+
+from typing import Any
+
+import gymnax
+from gymnax.environments import environment
+
+from scb.environments.brax import BRAX_NAMES, BraxEnvironment
+from scb.errors import UserError, unknown_name
+
+
+def environment_names() -> list[str]:
+    """Every name that `make` takes."""
+    return [*gymnax.registered_envs, *BRAX_NAMES]
+
+
+def make(name: str, **arguments: Any) -> tuple[environment.Environment[Any, Any], Any]:
+    """An environment and its default parameters.
+
+    Args:
+      name: "Synthetic-Pendulum-v1", "CartPole-v1", "hopper", ...
+      arguments: for the environment's constructor; Brax takes `backend="generalized" | "positional" | "spring"`.
+
+    Raises:
+      UserError: unknown name (with near matches), or arguments that the environment doesn't take.
+    """
+    try:
+        if name in BRAX_NAMES:
+            env = BraxEnvironment(name, **arguments)
+            return env, env.default_params
+        if name in gymnax.registered_envs:
+            return gymnax.make(name, **arguments)
+    except TypeError as error:
+        raise UserError(f"environment {name!r} does not take {arguments}: {error}.") from error
+    raise unknown_name("environment", name, environment_names())

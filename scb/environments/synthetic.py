@@ -1,0 +1,228 @@
+"""Synthetic contextual bandits: one-step environments whose weights are evolved.
+
+Liesen et al. (2024), "Discovering Minimal Reinforcement Learning Environments". A context is a learned function of a
+latent, `obs = initial_state(latent)`; the reward is a learned function of context and action; the episode ends there.
+All weights live in the environment's parameters, so a population of bandits is `vmap` over `params` in one program.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, Literal, TypeAlias
+
+import distrax
+import jax
+import jax.numpy as jnp
+from flax import linen as nn
+from flax import struct
+from gymnax.environments import environment, spaces
+from jax.typing import ArrayLike
+
+from scb.errors import UserError, unknown_name
+
+Latent: TypeAlias = Literal["normal", "uniform", "categorical", "softmax_categorical"]
+Weights: TypeAlias = dict[str, dict[str, dict[str, jax.Array]]]
+
+ACTIVATIONS: dict[str, Callable[[jax.Array], jax.Array]] = {"tanh": jnp.tanh, "relu": jax.nn.relu}
+
+
+def _one_hot_latent(logits: jax.Array, key: jax.Array) -> jax.Array:
+    return jax.nn.one_hot(distrax.Categorical(logits=logits).sample(seed=key), logits.shape[0])
+
+
+LATENTS: dict[str, Callable[[jax.Array, int], jax.Array]] = {
+    "normal": lambda key, size: distrax.Normal(jnp.zeros(size), jnp.ones(size)).sample(seed=key),
+    "uniform": lambda key, size: distrax.Uniform(jnp.zeros(size), jnp.ones(size)).sample(seed=key),
+    "categorical": lambda key, size: _one_hot_latent(jnp.zeros(size), key),
+    # The paper's second categorical: probabilities softmax(1, 2, ..., n).
+    "softmax_categorical": lambda key, size: _one_hot_latent(jnp.arange(1.0, size + 1.0), key),
+}
+
+
+@struct.dataclass
+class BanditState(environment.EnvState):
+    context: jax.Array  # [O]
+
+
+@struct.dataclass
+class BanditParams(environment.EnvParams):
+    """What a step may read: all traced, so bandits and noise levels vmap.
+
+    Attributes:
+      weights: {"initial_state": {...}, "reward": {...}}, two Dense layers each.
+      reward_noise: standard deviation of Gaussian noise on the reward, in the reward's own units. Zero for training an
+        agent; larger than the reward's own spread for learning objectives, whose advantages must be as uncertain as a
+        real environment's.
+      max_steps_in_episode: 1; a bandit has no second step.
+    """
+
+    weights: Weights = struct.field(default_factory=dict)
+    reward_noise: ArrayLike = 0.0
+    max_steps_in_episode: int = 1
+
+
+class _TwoLayers(nn.Module):
+    hidden_size: int
+    output_size: int
+    activation: str
+
+    @nn.compact
+    def __call__(self, inputs: jax.Array) -> jax.Array:
+        hidden = ACTIVATIONS[self.activation](nn.Dense(self.hidden_size)(inputs))
+        return nn.Dense(self.output_size)(hidden)
+
+
+@dataclass(frozen=True)
+class BanditConfig:
+    """What decides a bandit's shapes and program (the paper's Table "Hyperparameters for the synthetic environment")."""
+
+    hidden_size: int = 32
+    activation: str = "tanh"
+    latent: str = "normal"
+    latent_size: int | None = None  # None: the observation's size, as in the paper
+
+    def __post_init__(self) -> None:
+        if self.activation not in ACTIVATIONS:
+            raise unknown_name("bandit activation", self.activation, ACTIVATIONS)
+        if self.latent not in LATENTS:
+            raise unknown_name("latent distribution", self.latent, LATENTS)
+        for field, value in (("hidden_size", self.hidden_size), ("latent_size", self.latent_size)):
+            if value is not None and value < 1:
+                raise UserError(f"{field} is {value}: it must be at least 1.")
+
+
+class SyntheticBandit(environment.Environment[BanditState, BanditParams]):
+    """A contextual bandit with learned contexts and rewards, as a gymnax 1.x environment.
+
+    Args:
+      observation_size: O, the flattened observation size of the evaluation environment.
+      action_space: the evaluation environment's action space. A discrete action enters the reward network one-hot, a
+        continuous one clipped to the bounds.
+      config: layer size, activation, latent distribution.
+      weights: what `default_params` holds; None for a bandit that is only ever given explicit `params`.
+      name: as registered, e.g. "Synthetic-Pendulum-v1".
+    """
+
+    one_step = True
+
+    def __init__(
+        self,
+        observation_size: int,
+        action_space: spaces.Box | spaces.Discrete,
+        config: BanditConfig | None = None,
+        weights: Weights | None = None,
+        name: str = "SyntheticBandit",
+    ) -> None:
+        self.config = config or BanditConfig()
+        self.observation_size = observation_size
+        self._action_space = action_space
+        self._name = name
+        self.discrete = isinstance(action_space, spaces.Discrete)
+        self._action_size = action_space.n if self.discrete else max(1, _size(action_space.shape))
+        self.latent_size = self.config.latent_size or observation_size
+        network = partial(
+            _TwoLayers, hidden_size=self.config.hidden_size, activation=self.config.activation
+        )
+        self._initial_state = network(output_size=observation_size)
+        self._reward = network(output_size=1)
+        self._weights = weights
+
+    @property
+    def name(self) -> str:
+        return self._name
+
+    @property
+    def num_actions(self) -> int:
+        return self._action_size
+
+    @property
+    def default_params(self) -> BanditParams:
+        if self._weights is None:
+            raise UserError(
+                f"bandit {self.name!r} has no weights of its own: pass params=BanditParams(weights=...)."
+            )
+        return BanditParams(weights=self._weights)
+
+    def init_weights(self, key: jax.Array) -> Weights:
+        """Random weights (Flax's default initialisation), the start of the paper's evolution."""
+        key_state, key_reward = jax.random.split(key)
+        inputs = jnp.zeros(self.observation_size + self._action_size)
+        return {
+            "initial_state": self._initial_state.init(key_state, jnp.zeros(self.latent_size))[
+                "params"
+            ],
+            "reward": self._reward.init(key_reward, inputs)["params"],
+        }
+
+    def weight_shapes(self) -> dict[str, tuple[int, ...]]:
+        """{"reward/Dense_0/kernel": (O + A, hidden), ...}: what an artefact of this bandit must hold."""
+        shapes = jax.eval_shape(self.init_weights, jax.random.key(0))
+        flat = jax.tree_util.tree_flatten_with_path(shapes)[0]
+        return {"/".join(str(part.key) for part in path): leaf.shape for path, leaf in flat}
+
+    def context(self, latent: jax.Array, params: BanditParams) -> jax.Array:
+        """[L] latent -> [O] observation."""
+        return self._initial_state.apply({"params": params.weights["initial_state"]}, latent)
+
+    def mean_reward(self, context: jax.Array, action: ArrayLike, params: BanditParams) -> jax.Array:
+        """[O] context, action -> [] reward without noise: the bandit's Q-function."""
+        if self.discrete:
+            encoded = jax.nn.one_hot(action, self._action_size)
+        else:
+            clipped = jnp.clip(jnp.asarray(action), self._action_space.low, self._action_space.high)
+            encoded = jnp.reshape(clipped, (self._action_size,))
+        inputs = jnp.concatenate([context, encoded])
+        return self._reward.apply({"params": params.weights["reward"]}, inputs)[0]
+
+    def reset_env(self, key: jax.Array, params: BanditParams) -> tuple[jax.Array, BanditState]:
+        latent = LATENTS[self.config.latent](key, self.latent_size)
+        context = self.context(latent, params)
+        return context, BanditState(time=jnp.int32(0), context=context)
+
+    def step_env(
+        self, key: jax.Array, state: BanditState, action: ArrayLike, params: BanditParams
+    ) -> tuple[jax.Array, BanditState, jax.Array, jax.Array, dict[str, Any]]:
+        reward = self.mean_reward(state.context, action, params)
+        reward = reward + params.reward_noise * jax.random.normal(key)
+        state = state.replace(time=state.time + 1)
+        return state.context, state, reward, jnp.bool_(True), {"discount": jnp.float32(0.0)}
+
+    def is_terminated(self, state: BanditState, params: BanditParams) -> jax.Array:
+        return state.time >= 1
+
+    def is_truncated(self, state: BanditState, params: BanditParams) -> jax.Array:
+        # The one step ends the episode by itself; calling it truncated too would invite bootstrapping.
+        return jnp.bool_(False)
+
+    def action_space(self, params: BanditParams | None = None) -> spaces.Box | spaces.Discrete:
+        return self._action_space
+
+    def observation_space(self, params: BanditParams | None = None) -> spaces.Box:
+        return spaces.Box(-jnp.inf, jnp.inf, (self.observation_size,), jnp.float32)
+
+    def reward_scale(
+        self, params: BanditParams, key: jax.Array, num_samples: int = 4096
+    ) -> jax.Array:
+        """[] standard deviation of the noiseless reward over random contexts and uniformly random actions."""
+
+        def sample(key: jax.Array) -> jax.Array:
+            key_context, key_action = jax.random.split(key)
+            context, _ = self.reset_env(key_context, params)
+            return self.mean_reward(context, self._action_space.sample(key_action), params)
+
+        return jnp.std(jax.vmap(sample)(jax.random.split(key, num_samples)))
+
+
+def _size(shape: tuple[int, ...]) -> int:
+    size = 1
+    for dimension in shape:
+        size *= dimension
+    return size
+
+
+def bandit_for(
+    env: environment.Environment[Any, Any], env_params: Any, config: BanditConfig, name: str
+) -> SyntheticBandit:
+    """An untrained bandit with the (flattened) observation and action shapes of an evaluation environment."""
+    observation_size = _size(env.observation_space(env_params).shape)
+    return SyntheticBandit(observation_size, env.action_space(env_params), config, name=name)

@@ -1,0 +1,121 @@
+"""Bandits as files, and the ones that ship with the library.
+
+A bandit is NAME.npz (its weights) with NAME.json (its shapes, how it was found, what it is worth). Those in `scb/zoo` are
+registered with gymnax when `scb` is imported, and read when one is made.
+"""
+
+from collections.abc import Mapping
+from functools import partial
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import gymnax
+import jax
+import jax.numpy as jnp
+import numpy as np
+from gymnax.environments import spaces
+
+from scb import artefacts
+from scb.environments.synthetic import BanditConfig, SyntheticBandit, Weights
+from scb.errors import UserError, unknown_name
+
+KIND = "bandit"
+PREFIX = "Synthetic-"
+
+
+def zoo_names() -> list[str]:
+    """Names of the bandits that ship with the library, as registered with gymnax."""
+    folder = resources.files("scb") / "zoo"
+    return sorted(p.name.removesuffix(".npz") for p in folder.iterdir() if p.name.endswith(".npz"))
+
+
+def register_zoo() -> None:
+    """Registers every bandit of the zoo, so that `gymnax.make("Synthetic-Pendulum-v1")` works."""
+    for name in zoo_names():
+        if name not in gymnax.registered_envs:
+            gymnax.register(name, partial(_make_zoo_bandit, name))
+
+
+def _make_zoo_bandit(name: str) -> SyntheticBandit:
+    with resources.as_file(resources.files("scb") / "zoo") as folder:
+        return load_bandit(folder / f"{name}.npz")
+
+
+def zoo_metadata(name: str) -> Mapping[str, Any]:
+    """What a zoo bandit's .json says: config, seeds, results, cost."""
+    with resources.as_file(resources.files("scb") / "zoo") as folder:
+        return artefacts.load(folder / f"{name}.npz", KIND).metadata
+
+
+def load_bandit(path: str | Path) -> SyntheticBandit:
+    """A bandit from its file; a UserError says what is wrong with it."""
+    artefact = artefacts.load(path, KIND)
+    config = artefact.metadata["config"]
+    try:
+        bandit = SyntheticBandit(
+            observation_size=config["observation_size"],
+            action_space=_space(config["action_space"]),
+            config=BanditConfig(**config["bandit"]),
+            weights=jax.tree.map(jnp.asarray, dict(artefact.arrays)),
+            name=artefact.name,
+        )
+    except (KeyError, TypeError) as error:
+        raise UserError(
+            f"{path} does not describe a bandit: its .json lacks or garbles config entry {error}."
+        ) from error
+    artefacts.expect_shapes(artefact, bandit.weight_shapes())
+    return bandit
+
+
+def open_bandit(name: str) -> SyntheticBandit:
+    """A bandit by zoo name or file."""
+    if name.endswith(".npz"):
+        return load_bandit(name)
+    if name not in zoo_names():
+        raise unknown_name("bandit", name, [*zoo_names(), "path/to/bandit.npz"])
+    return _make_zoo_bandit(name)
+
+
+def save_bandit(
+    path: str | Path, bandit: SyntheticBandit, weights: Weights, metadata: Mapping[str, Any]
+) -> Path:
+    """Writes a bandit.
+
+    Args:
+      path: NAME.npz; NAME.json is written beside it, and NAME is the bandit's name.
+      bandit: whose shapes are stored.
+      weights: as in `BanditParams.weights`.
+      metadata: config (of the discovery), seeds, results, cost, command.
+    """
+    config = {
+        **metadata.get("config", {}),
+        "observation_size": bandit.observation_size,
+        "action_space": space_description(bandit.action_space()),
+        "bandit": {
+            "hidden_size": bandit.config.hidden_size,
+            "activation": bandit.config.activation,
+            "latent": bandit.config.latent,
+            "latent_size": bandit.latent_size,
+        },
+    }
+    full = {**metadata, "kind": KIND, "config": config}
+    return artefacts.save(path, jax.device_get(weights), full)
+
+
+def space_description(space: spaces.Box | spaces.Discrete) -> dict[str, Any]:
+    """An action space as JSON."""
+    if isinstance(space, spaces.Discrete):
+        return {"type": "discrete", "n": int(space.n)}
+    low, high = (
+        np.broadcast_to(np.asarray(x, np.float32), space.shape).tolist()
+        for x in (space.low, space.high)
+    )
+    return {"type": "box", "shape": list(space.shape), "low": low, "high": high}
+
+
+def _space(description: Mapping[str, Any]) -> spaces.Box | spaces.Discrete:
+    if description["type"] == "discrete":
+        return spaces.Discrete(description["n"])
+    low, high = (jnp.asarray(description[x], jnp.float32) for x in ("low", "high"))
+    return spaces.Box(low, high, tuple(description["shape"]), jnp.float32)

@@ -1,0 +1,75 @@
+"""Roll a frozen policy out and return what it earned."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from gymnax.environments import environment
+from jax.typing import ArrayLike
+
+Policy = Callable[
+    [jax.Array, jax.Array], jax.Array
+]  # (observation, key) -> action, for one environment
+
+
+class Episodes(NamedTuple):
+    returns: jax.Array  # [E] undiscounted sum of rewards
+    lengths: jax.Array  # [E] steps
+
+
+def evaluate(
+    env: environment.Environment[Any, Any],
+    env_params: Any,
+    policy: Policy,
+    key: jax.Array,
+    num_episodes: int,
+    horizon: ArrayLike | None = None,
+) -> Episodes:
+    """Runs `num_episodes` episodes side by side, until the last has ended.
+
+    Args:
+      env: any gymnax 1.x environment.
+      env_params: its parameters.
+      policy: (observation, key) -> action, for one environment.
+      key: decides start states, transitions and the policy's randomness.
+      num_episodes: E, static.
+      horizon: steps after which an episode is cut even if the environment would go on; traced, so a curriculum does not
+        recompile. None: the environment's own limit.
+
+    Returns:
+      Episodes of shape [E].
+    """
+    limit = env_params.max_steps_in_episode if horizon is None else horizon
+    key_reset, key_loop = jax.random.split(key)
+    observation, state = jax.vmap(env.reset_env, in_axes=(0, None))(
+        jax.random.split(key_reset, num_episodes), env_params
+    )
+
+    def step(carry: Any) -> Any:
+        time, observation, state, active, returns, lengths = carry
+        key_act, key_step = jax.random.split(jax.random.fold_in(key_loop, time))
+        action = jax.vmap(policy)(observation, jax.random.split(key_act, num_episodes))
+        # step_env, not step: a finished episode needs no reset, and its later rewards are masked.
+        observation, state, reward, terminated, _ = jax.vmap(env.step_env, in_axes=(0, 0, 0, None))(
+            jax.random.split(key_step, num_episodes), state, action, env_params
+        )
+        truncated = jax.vmap(env.is_truncated, in_axes=(0, None))(state, env_params)
+        returns = returns + jnp.where(active, jnp.reshape(reward, (num_episodes,)), 0.0)
+        lengths = lengths + active
+        active = active & ~(terminated | truncated)
+        return time + 1, observation, state, active, returns, lengths
+
+    start = (
+        jnp.int32(0),
+        observation,
+        state,
+        jnp.ones(num_episodes, bool),
+        jnp.zeros(num_episodes),
+        jnp.zeros(num_episodes, jnp.int32),
+    )
+    start = jax.tree.map(lambda x: jnp.asarray(x), start)
+    *_, returns, lengths = jax.lax.while_loop(
+        lambda carry: (carry[0] < limit) & jnp.any(carry[3]), step, start
+    )
+    return Episodes(returns, lengths)

@@ -1,0 +1,439 @@
+"""The outer loop of both discoveries: evolve a pytree of weights by what it is worth after an inner training.
+
+Bandit discovery and objective discovery differ only in what a candidate is. This module owns what they share: the
+strategy (any of evosax's by name), common random numbers across a population, what a failed candidate gets, the sign,
+sharding over devices, the evaluation of the search distribution's mean, checkpoints, resume, and logs.
+"""
+
+import sys
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from typing import Any, Protocol
+
+import evosax.algorithms
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jax.experimental import multihost_utils
+from jax.sharding import NamedSharding, PartitionSpec
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from scb.errors import UserError, unknown_name
+from scb.runs import Checkpoints, Run, Stopwatch
+
+# These take constructor arguments of their own that no common configuration can supply.
+_UNSUPPORTED = {"RandomSearch", "SV_CMA_ES", "SV_Open_ES"}
+# These estimate a gradient and hand it to an optimiser; the others' update rules set their own step.
+_GRADIENT_ESTIMATING = {
+    "ARS",
+    "ASEBO",
+    "ESMC",
+    "GuidedES",
+    "NoiseReuseES",
+    "Open_ES",
+    "PersistentES",
+    "PGPE",
+}
+STRATEGIES: dict[str, Any] = {
+    name: algorithm
+    for name, algorithm in evosax.algorithms.algorithms.items()
+    if name not in _UNSUPPORTED
+}
+
+
+@dataclass(frozen=True)
+class EvolutionConfig:
+    """The outer loop's configuration.
+
+    Attributes:
+      strategy: name of an evosax strategy; "SNES" and "Open_ES" are the usual ones.
+      population_size: candidates a generation.
+      num_generations: how many of them.
+      sigma, sigma_decay, sigma_limit: initial standard deviation of the search distribution; for strategies with a schedule
+        (Open_ES) it decays by that factor a generation down to the limit.
+      learning_rate, learning_rate_decay, learning_rate_limit: of Adam, for Open_ES and its relatives; SNES steps by its own rule.
+      mean_evaluations: agents that judge the mean of the search distribution.
+      evaluate_mean_every: generations between those judgements (and one after the last generation).
+      checkpoint_every: generations between checkpoints.
+      seed: decides everything else.
+    """
+
+    strategy: str = "SNES"
+    population_size: int = 64
+    num_generations: int = 100
+    sigma: float = 0.05
+    sigma_decay: float = 1.0
+    sigma_limit: float = 0.0
+    learning_rate: float = 0.01
+    learning_rate_decay: float = 1.0
+    learning_rate_limit: float = 0.0
+    mean_evaluations: int = 64
+    evaluate_mean_every: int = 10
+    checkpoint_every: int = 10
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.strategy not in STRATEGIES:
+            raise unknown_name("evolution strategy", self.strategy, STRATEGIES)
+        if self.population_size < 2:
+            raise UserError(
+                f"population_size is {self.population_size}: evolution compares candidates, so it needs at least 2."
+            )
+        if self.strategy == "Open_ES" and self.population_size % 2:
+            raise UserError(
+                f"population_size is {self.population_size}: Open_ES samples antithetic pairs, so it must be even."
+            )
+        for field in (
+            "num_generations",
+            "mean_evaluations",
+            "evaluate_mean_every",
+            "checkpoint_every",
+        ):
+            if getattr(self, field) < 1:
+                raise UserError(f"{field} is {getattr(self, field)}: it must be at least 1.")
+        if self.seed < 0:
+            raise UserError(f"seed is {self.seed}: it must be 0 or larger.")
+        for field in ("sigma", "learning_rate", "sigma_decay", "learning_rate_decay"):
+            if not getattr(self, field) > 0:
+                raise UserError(f"{field} is {getattr(self, field)}: it must be positive.")
+
+
+@dataclass(frozen=True)
+class EnvironmentSteps:
+    """Steps that one evaluation of one candidate takes, counted apart."""
+
+    training: int
+    evaluation: int
+
+    @property
+    def total(self) -> int:
+        return self.training + self.evaluation
+
+
+class Problem(Protocol):
+    """What is evolved."""
+
+    def initial_solution(self, key: jax.Array) -> Any:
+        """The mean that the search starts from: a pytree of float arrays."""
+
+    def evaluate(
+        self, candidate: Any, key: jax.Array, generation: jax.Array
+    ) -> dict[str, jax.Array]:
+        """{"fitness": [], ...}: what a candidate is worth, to be maximised; other entries are logged."""
+
+    def evaluate_mean(self, candidate: Any, key: jax.Array) -> dict[str, jax.Array]:
+        """{"fitness": [], ...} of one agent, in the setting that the result is judged by."""
+
+    def steps(self) -> EnvironmentSteps:
+        """Environment steps of one `evaluate`."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What an evolution ends with.
+
+    Attributes:
+      mean: the mean of the final search distribution.
+      best_mean: the mean at that generation whose evaluation (`evaluate_mean`) was best. Chosen under noise: report it on
+        fresh seeds only.
+      best_mean_generation: which one that was.
+      metrics: the run's log.
+      seconds: wall-clock of all generations.
+    """
+
+    mean: Any
+    best_mean: Any
+    best_mean_generation: int
+    metrics: list[dict[str, Any]]
+    seconds: float
+
+
+def rank_failed_last(fitness: np.ndarray) -> tuple[np.ndarray, int]:
+    """Replaces NaN and infinite fitness by a value below the worst finite one.
+
+    One NaN under a strategy that standardises would poison the mean for ever.
+
+    Returns:
+      ([N] finite fitness, number of failed candidates); all zeros where every candidate failed.
+    """
+    finite = np.isfinite(fitness)
+    failed = int(np.sum(~finite))
+    if failed == len(fitness):
+        return np.zeros_like(fitness), failed
+    best, worst = fitness[finite].max(), fitness[finite].min()
+    below = worst - max((best - worst) / len(fitness), 1e-6 * max(1.0, abs(worst)))
+    return np.where(finite, fitness, below), failed
+
+
+def map_population(
+    function: Callable[..., Any], size: int, in_axes: tuple[int | None, ...]
+) -> Callable[..., Any]:
+    """`jit(vmap(function))` whose mapped axis is spread over all devices, with results as numpy arrays on every host.
+
+    Each device runs its part alone: no collective inside, so a device that is late holds nobody up, and a vmapped
+    `while_loop` ends when the device's own part has ended. A size that the devices don't divide is padded by repeating
+    entries, whose results are dropped.
+
+    Args:
+      function: of one population member.
+      size: length of the mapped axes, which are all first axes.
+      in_axes: 0 for arguments with one entry a member, None for those that all share.
+    """
+    devices = jax.devices()[: max(size, jax.process_count())]
+    mesh = jax.sharding.Mesh(np.array(devices), ("population",))
+    padded = np.arange(-(-size // len(devices)) * len(devices)) % size
+    specs = tuple(
+        PartitionSpec() if axis is None else PartitionSpec("population") for axis in in_axes
+    )
+    mapped = jax.jit(
+        jax.shard_map(
+            jax.vmap(function, in_axes=in_axes),
+            mesh=mesh,
+            in_specs=specs,
+            out_specs=PartitionSpec("population"),
+            check_vma=False,  # carries initialised inside a training loop are not marked as varying
+        )
+    )
+
+    def place(argument: Any, axis: int | None, spec: PartitionSpec) -> Any:
+        if axis is not None and len(padded) != size:
+            argument = jax.tree.map(lambda x: x[padded], argument)
+        return jax.device_put(argument, NamedSharding(mesh, spec))
+
+    def call(*arguments: Any) -> Any:
+        results = mapped(*map(place, arguments, in_axes, specs))
+        if jax.process_count() > 1:
+            results = multihost_utils.process_allgather(results, tiled=True)
+        return jax.tree.map(lambda x: x[:size], jax.device_get(results))
+
+    return call
+
+
+class _Strategy:
+    """An evosax strategy behind one interface. Runs on one device; fitness comes and goes through the host."""
+
+    def __init__(self, config: EvolutionConfig, solution: Any) -> None:
+        algorithm = STRATEGIES[config.strategy]
+        self.has_mean = config.strategy in evosax.algorithms.distribution_based_algorithms
+        arguments: dict[str, Any] = {}
+        accepted = algorithm.__init__.__annotations__
+        scheduled = "std_schedule" in accepted
+        if scheduled:
+            arguments["std_schedule"] = lambda generation: jnp.maximum(
+                config.sigma * config.sigma_decay**generation, config.sigma_limit
+            )
+        if config.strategy in _GRADIENT_ESTIMATING:
+            arguments["optimizer"] = optax.adam(
+                lambda count: jnp.maximum(
+                    config.learning_rate * config.learning_rate_decay**count,
+                    config.learning_rate_limit,
+                )
+            )
+        self._algorithm = algorithm(config.population_size, solution, **arguments)
+        self._params = self._algorithm.default_params
+        if hasattr(self._params, "std_init"):
+            # evosax starts SNES at a standard deviation of 1; the paper's is 0.05.
+            self._params = self._params.replace(std_init=config.sigma)
+        self._sigma = config.sigma
+        self._size = config.population_size
+
+    def start(self, key: jax.Array, solution: Any) -> Any:
+        if self.has_mean:
+            return self._algorithm.init(key, solution, self._params)
+        key_population, key_init = jax.random.split(key)
+        flat, unravel = jax.flatten_util.ravel_pytree(solution)
+        noise = jax.random.normal(key_population, (self._size, flat.size))
+        population = jax.vmap(unravel)(flat + self._sigma * noise.at[0].set(0.0))
+        unknown = jnp.full(self._size, jnp.inf)
+        return self._algorithm.init(key_init, population, unknown, self._params)
+
+    def ask(self, key: jax.Array, state: Any) -> tuple[Any, Any]:
+        return self._algorithm.ask(key, state, self._params)
+
+    def tell(self, key: jax.Array, population: Any, fitness: np.ndarray, state: Any) -> Any:
+        # The one negation of the project: fitness is maximised everywhere, evosax minimises.
+        state, _ = self._algorithm.tell(key, population, -jnp.asarray(fitness), state, self._params)
+        return state
+
+    def mean(self, state: Any) -> Any:
+        """The search distribution's mean; for strategies that keep a population, the best solution told so far."""
+        if self.has_mean:
+            return self._algorithm.get_mean(state)
+        return self._algorithm._unravel_solution(state.best_solution)
+
+
+def evolve(
+    problem: Problem, config: EvolutionConfig, run: Run | None = None, quiet: bool = False
+) -> Outcome:
+    """Runs, or resumes, an evolution.
+
+    Every generation is a function of (config, generation, strategy state), so a run that was killed and resumed ends with
+    the same bytes as one that was not, on the same machine, devices and versions.
+
+    Args:
+      problem: what is evolved.
+      config: how.
+      run: where to log and checkpoint; None keeps everything in memory. A resumed run continues after its newest
+        intact checkpoint.
+      quiet: no progress on the terminal.
+
+    Returns:
+      The Outcome.
+    """
+    root = jax.random.key(config.seed)
+    key_solution, key_strategy, key_generations, key_mean = jax.random.split(root, 4)
+    solution = problem.initial_solution(key_solution)
+    strategy = _Strategy(config, solution)
+    state = {
+        "strategy": strategy.start(key_strategy, solution),
+        "best_mean": solution,
+        "best_mean_fitness": jnp.float32(-jnp.inf),
+        "best_mean_generation": jnp.int32(-1),
+    }
+    console = Console(file=sys.stderr, quiet=quiet)
+    checkpoints = Checkpoints(run.folder) if run else None
+    first = 0
+    if run and checkpoints and run.resumed:
+        restored = checkpoints.restore(state)
+        if restored is not None:
+            first, state, damaged = restored
+        for step in [] if restored is None else damaged:
+            console.print(
+                f"checkpoint {step} is damaged: resuming from checkpoint {first} before it."
+            )
+        if restored is None:
+            console.print("no checkpoint could be read: starting again at generation 0.")
+        run.rewind(first)
+
+    evaluate = map_population(problem.evaluate, config.population_size, (0, None, None))
+    evaluate_mean = map_population(problem.evaluate_mean, config.mean_evaluations, (None, 0))
+    steps = problem.steps()
+    history: list[dict[str, Any]] = [] if run is None else run.metrics()
+    total_seconds = 0.0
+    watch = Stopwatch()
+
+    def judge_mean(generation: int) -> dict[str, float]:
+        mean = strategy.mean(state["strategy"])
+        keys = jax.random.split(jax.random.fold_in(key_mean, generation), config.mean_evaluations)
+        outcome = {name: float(np.mean(v)) for name, v in evaluate_mean(mean, keys).items()}
+        if outcome["fitness"] > float(state["best_mean_fitness"]):
+            state["best_mean"] = mean
+            state["best_mean_fitness"] = jnp.float32(outcome["fitness"])
+            state["best_mean_generation"] = jnp.int32(generation)
+        return {f"mean/{name}": value for name, value in outcome.items()}
+
+    with _progress(console, config.num_generations, first) as advance:
+        for generation in range(first, config.num_generations):
+            key_ask, key_evaluate, key_tell = jax.random.split(
+                jax.random.fold_in(key_generations, generation), 3
+            )
+            metrics: dict[str, Any] = {}
+            if generation % config.evaluate_mean_every == 0 and strategy_is_ready(
+                strategy, generation
+            ):
+                metrics |= judge_mean(generation)
+            population, state["strategy"] = strategy.ask(key_ask, state["strategy"])
+            # One key for all: candidates are compared on the same seeds, hyperparameters and start states.
+            results = evaluate(population, key_evaluate, jnp.int32(generation))
+            fitness, failed = rank_failed_last(np.asarray(results.pop("fitness"), np.float32))
+            if failed < len(fitness):
+                state["strategy"] = strategy.tell(key_tell, population, fitness, state["strategy"])
+            done = (generation + 1) * config.population_size
+            metrics |= {
+                "fitness/mean": fitness.mean(),
+                "fitness/std": fitness.std(),
+                "fitness/max": fitness.max(),
+                "fitness/min": fitness.min(),
+                "failed": failed,
+                "steps/training": done * steps.training,
+                "steps/evaluation": done * steps.evaluation,
+                "steps/total": done * steps.total,
+                **{f"candidates/{name}": np.nanmean(value) for name, value in results.items()},
+            }
+            last = generation + 1 == config.num_generations
+            if last:
+                metrics |= {f"final_{k}": v for k, v in judge_mean(generation + 1).items()}
+            seconds = watch.lap()
+            total_seconds += seconds
+            if run:
+                run.log(generation, metrics, seconds)
+            history.append({"generation": generation, **metrics})
+            if checkpoints and (last or (generation + 1) % config.checkpoint_every == 0):
+                checkpoints.save(generation + 1, state)
+            advance(metrics, seconds)
+    if checkpoints:
+        checkpoints.close()
+    return Outcome(
+        mean=jax.device_get(strategy.mean(state["strategy"])),
+        best_mean=jax.device_get(state["best_mean"]),
+        best_mean_generation=int(state["best_mean_generation"]),
+        metrics=run.metrics() if run else history,
+        seconds=run.seconds() if run else total_seconds,
+    )
+
+
+def strategy_is_ready(strategy: _Strategy, generation: int) -> bool:
+    """Whether the strategy has a solution to judge: those that keep a population have none before the first tell."""
+    return strategy.has_mean or generation > 0
+
+
+class _progress:
+    """A bar with fitness and time left on a terminal; a line now and then elsewhere (a log file, CI)."""
+
+    def __init__(self, console: Console, total: int, first: int) -> None:
+        self._console, self._total, self._done = console, total, first
+        self._seconds: list[float] = []
+        self._bar = Progress(
+            TextColumn("generation {task.completed}/{task.total}"),
+            BarColumn(),
+            TextColumn("{task.fields[fitness]}"),
+            TimeElapsedColumn(),
+            TimeRemainingColumn(),
+            console=console,
+            disable=console.quiet or not console.is_terminal,
+        )
+
+    def __enter__(self) -> Callable[[dict[str, Any], float], None]:
+        self._bar.start()
+        self._task = self._bar.add_task("", total=self._total, completed=self._done, fitness="")
+        return self._advance
+
+    def _advance(self, metrics: dict[str, Any], seconds: float) -> None:
+        self._done += 1
+        self._seconds = [*self._seconds, seconds][-20:]
+        judged = [v for k, v in metrics.items() if k.endswith("mean/fitness")]
+        text = f"fitness {metrics['fitness/mean']:.4g}" + (
+            f", mean {judged[-1]:.4g}" if judged else ""
+        )
+        if metrics["failed"]:
+            text += f", {metrics['failed']} failed"
+        self._bar.update(self._task, advance=1, fitness=text)
+        milestone = judged or self._done in (1, self._total)
+        if not self._console.is_terminal and milestone:
+            left = float(np.median(self._seconds)) * (self._total - self._done)
+            self._console.print(
+                f"generation {self._done}/{self._total}: {text}, {left / 60:.1f} min left"
+            )
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.stop()
+
+
+def config_dict(config: Any) -> dict[str, Any]:
+    """A dataclass configuration as plain JSON types."""
+    return dict(asdict(config))
+
+
+__all__ = [
+    "STRATEGIES",
+    "EnvironmentSteps",
+    "EvolutionConfig",
+    "Outcome",
+    "Problem",
+    "config_dict",
+    "evolve",
+    "map_population",
+    "rank_failed_last",
+]

@@ -1,0 +1,293 @@
+"""Run folders: what a long computation writes, so that it can be watched, killed and resumed.
+
+runs/NAME/config.json       what was asked for; --resume refuses another
+runs/NAME/metrics.jsonl     one line a generation, free of clocks: a resumed run ends with the same bytes
+runs/NAME/timing.jsonl      seconds per generation
+runs/NAME/tensorboard/      the same numbers for TensorBoard
+runs/NAME/checkpoints/      orbax
+"""
+
+import hashlib
+import json
+import os
+import shutil
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import orbax.checkpoint as ocp
+from tensorboardX import SummaryWriter
+
+from scb.errors import UserError, unknown_name
+
+
+class Run:
+    """A run folder that is open for writing. Make one with `Run.open`."""
+
+    def __init__(self, folder: Path, resumed: bool, wandb_project: str | None = None) -> None:
+        self.folder = folder
+        self.resumed = resumed
+        self._writer: SummaryWriter | None = None
+        self._wandb = _start_wandb(folder, wandb_project) if wandb_project else None
+
+    @classmethod
+    def open(
+        cls,
+        folder: str | Path,
+        config: Mapping[str, Any],
+        resume: bool = False,
+        wandb_project: str | None = None,
+    ) -> "Run":
+        """Creates a run folder, or opens one to resume.
+
+        Args:
+          folder: where; must not exist or be empty, unless `resume`.
+          config: JSON-serialisable; decides the run together with the code's version.
+          resume: continue the run that is there. Its config must equal `config`.
+          wandb_project: also log to this Weights & Biases project (extra `wandb`).
+
+        Raises:
+          UserError: the folder can't be written, holds something already, isn't a run, or its config differs.
+        """
+        folder = Path(folder)
+        config = json.loads(json.dumps(config))
+        stored_config = folder / "config.json"
+        if resume:
+            stored = read_config(folder)
+            difference = _first_difference(stored, config)
+            if difference:
+                raise UserError(
+                    f"cannot resume {folder}: its config differs at {difference}; resume with the config it was "
+                    "started with, or start a new folder."
+                )
+            return cls(folder, resumed=True, wandb_project=wandb_project)
+        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+            raise UserError(
+                f"{folder} already exists and is not empty: choose another --out, or continue it with --resume."
+            )
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            stored_config.write_text(json.dumps(config, indent=2) + "\n")
+        except OSError as error:
+            raise UserError(
+                f"cannot write to {folder} ({error.strerror}): choose an --out folder that you may write to."
+            ) from error
+        return cls(folder, resumed=False, wandb_project=wandb_project)
+
+    def rewind(self, step: int) -> None:
+        """Drops log lines of generations after `step`, which a killed run wrote but did not checkpoint."""
+        for name in ("metrics.jsonl", "timing.jsonl"):
+            path = self.folder / name
+            if not path.exists():
+                continue
+            kept = []
+            for line in path.read_text().splitlines():
+                try:
+                    generation = json.loads(line)["generation"]
+                except (json.JSONDecodeError, KeyError):
+                    break  # the half line that a kill left at the end
+                if generation < step:
+                    kept.append(line + "\n")
+            temporary = path.with_suffix(".tmp")
+            temporary.write_text("".join(kept))
+            os.replace(temporary, path)
+
+    def log(self, generation: int, metrics: Mapping[str, float], seconds: float) -> None:
+        """Appends one generation to every log."""
+        line = {"generation": generation, **{k: _plain(v) for k, v in metrics.items()}}
+        with (self.folder / "metrics.jsonl").open("a") as file:
+            file.write(json.dumps(line) + "\n")
+        with (self.folder / "timing.jsonl").open("a") as file:
+            file.write(json.dumps({"generation": generation, "seconds": round(seconds, 4)}) + "\n")
+        if self._writer is None:
+            self._writer = SummaryWriter(
+                str(self.folder / "tensorboard"),
+                purge_step=generation if self.resumed else None,
+            )
+        for name, value in metrics.items():
+            self._writer.add_scalar(name, float(value), generation)
+        if self._wandb is not None:
+            self._wandb.log(dict(metrics), step=generation)
+
+    def metrics(self) -> list[dict[str, Any]]:
+        """All logged generations, oldest first."""
+        path = self.folder / "metrics.jsonl"
+        return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+
+    def seconds(self) -> float:
+        """Wall-clock seconds of all logged generations, over every resumption."""
+        path = self.folder / "timing.jsonl"
+        lines = path.read_text().splitlines() if path.exists() else []
+        return float(sum(json.loads(line)["seconds"] for line in lines))
+
+    def close(self) -> None:
+        if self._writer is not None:
+            self._writer.close()
+        if self._wandb is not None:
+            self._wandb.finish()
+
+
+def read_config(folder: str | Path) -> dict[str, Any]:
+    """The config that a run was started with; a UserError if the folder isn't a run."""
+    path = Path(folder) / "config.json"
+    try:
+        return dict(json.loads(path.read_text()))
+    except (OSError, ValueError) as error:
+        raise UserError(
+            f"{folder} is not a run (no readable config.json): give the folder of a run that was started with --out."
+        ) from error
+
+
+def write_json(path: Path, content: Mapping[str, Any]) -> None:
+    """Writes JSON so that a kill leaves the old file or the new one, never half of one."""
+    temporary = path.with_name(path.name + ".tmp")
+    temporary.write_text(json.dumps(content, indent=2) + "\n")
+    os.replace(temporary, path)
+
+
+def settle(
+    flags: Mapping[str, Any],
+    presets: Mapping[str, Mapping[str, Any]],
+    preset: str | None,
+    resume: Path | None,
+) -> dict[str, Any]:
+    """The settings of a run: the flags that were given, over the preset, over nothing.
+
+    With `resume`, the stored run's settings; a flag that says otherwise is an error, found by `Run.open`.
+    """
+    given = {name: value for name, value in flags.items() if value is not None}
+    if resume is not None:
+        stored = read_config(resume)
+        if preset is not None:
+            given["preset"] = preset
+        return {**stored, **given}
+    chosen = preset or "quick"
+    if chosen not in presets:
+        raise unknown_name("preset", chosen, presets)
+    return {**flags, "preset": chosen, **presets[chosen], **given}
+
+
+class Checkpoints:
+    """Orbax checkpoints of a pytree of arrays, each with a digest, restored newest first.
+
+    A checkpoint that cannot be read, or whose digest does not fit (cut in half, altered), is passed over for the one
+    before it, and the caller is told.
+    """
+
+    def __init__(self, folder: Path, keep: int = 3) -> None:
+        self.folder = (folder / "checkpoints").resolve()
+        self._keep = keep
+        self._manager = self._open()
+
+    def _open(self) -> ocp.CheckpointManager:
+        return ocp.CheckpointManager(
+            self.folder, options=ocp.CheckpointManagerOptions(max_to_keep=self._keep)
+        )
+
+    def save(self, step: int, state: Any) -> None:
+        """Writes `state` and waits until it is on disk."""
+        leaves = _leaves(state)
+        self._manager.save(
+            step,
+            args=ocp.args.Composite(
+                state=ocp.args.StandardSave(leaves),
+                digest=ocp.args.JsonSave({"sha256": _digest(leaves)}),
+            ),
+        )
+        self._manager.wait_until_finished()
+
+    def restore(self, template: Any) -> tuple[int, Any, list[int]] | None:
+        """(step, state, steps of unreadable newer checkpoints), or None where no checkpoint can be read."""
+        expected = _leaves(template)
+        damaged = []
+        for step in sorted(self._manager.all_steps(), reverse=True):
+            try:
+                restored = self._manager.restore(
+                    step,
+                    args=ocp.args.Composite(
+                        state=ocp.args.StandardRestore(expected), digest=ocp.args.JsonRestore()
+                    ),
+                )
+                intact = _digest(restored["state"]) == restored["digest"]["sha256"]
+            except (
+                Exception
+            ):  # orbax and tensorstore raise many kinds for a file that is cut or altered
+                intact = False
+            if intact:
+                self._discard(damaged)
+                return step, _from_leaves(template, restored["state"]), damaged
+            damaged.append(step)
+        self._discard(damaged)
+        return None
+
+    def _discard(self, steps: list[int]) -> None:
+        # Orbax refuses to save a step that exists, so a damaged one must make room for its repetition.
+        for step in steps:
+            shutil.rmtree(self.folder / str(step), ignore_errors=True)
+        if steps:
+            self._manager.close()
+            self._manager = self._open()
+
+    def close(self) -> None:
+        self._manager.close()
+
+
+class Stopwatch:
+    """Seconds since it was last read."""
+
+    def __init__(self) -> None:
+        self._last = time.perf_counter()
+
+    def lap(self) -> float:
+        now = time.perf_counter()
+        seconds, self._last = now - self._last, now
+        return seconds
+
+
+def _leaves(tree: Any) -> dict[str, np.ndarray]:
+    leaves = jax.tree.leaves(jax.device_get(tree))
+    return {f"leaf_{index:04d}": np.asarray(leaf) for index, leaf in enumerate(leaves)}
+
+
+def _from_leaves(template: Any, leaves: Mapping[str, Any]) -> Any:
+    treedef = jax.tree.structure(template)
+    return jax.tree.unflatten(treedef, [jax.numpy.asarray(leaves[name]) for name in sorted(leaves)])
+
+
+def _digest(leaves: Mapping[str, Any]) -> str:
+    digest = hashlib.sha256()
+    for name in sorted(leaves):
+        array = np.asarray(leaves[name])
+        digest.update(f"{name}:{array.dtype}:{array.shape}".encode())
+        digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()
+
+
+def _plain(value: Any) -> float | int | None:
+    number = float(value)
+    if not np.isfinite(number):
+        return None  # JSON has no NaN
+    return int(number) if isinstance(value, int | np.integer) else number
+
+
+def _first_difference(stored: Any, given: Any, path: str = "") -> str:
+    if isinstance(stored, dict) and isinstance(given, dict):
+        for key in sorted(stored.keys() | given.keys()):
+            difference = _first_difference(stored.get(key), given.get(key), f"{path}.{key}")
+            if difference:
+                return difference
+        return ""
+    return "" if stored == given else f"{path.lstrip('.')} ({stored!r} there, {given!r} now)"
+
+
+def _start_wandb(folder: Path, project: str) -> Any:
+    try:
+        import wandb
+    except ImportError as error:
+        raise UserError(
+            "logging to Weights & Biases needs the package wandb: install the extra `wandb`."
+        ) from error
+    return wandb.init(project=project, name=folder.name, dir=str(folder), resume="allow")

@@ -1,0 +1,264 @@
+"""Fit a bandit to an expert before evolving it.
+
+The paper's lemma: a bandit whose reward is the expert's Q-function, on contexts that cover the expert's states, has the
+expert's policy as its optimum. Regression finds such a bandit in seconds; what it cannot know is which of them *trains*
+well, and that is what evolution is for.
+"""
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from gymnax.environments import environment, spaces
+
+from scb.agents.hyperparameters import Setting
+from scb.agents.ppo import PPO, PPOState
+from scb.environments.synthetic import BanditParams, SyntheticBandit, Weights
+from scb.errors import UserError, unknown_name
+
+CONSTRUCTIONS = ("advantage", "q", "action_distance")
+
+
+@dataclass(frozen=True)
+class WarmStartConfig:
+    """How the expert is trained and the bandit is fitted.
+
+    Attributes:
+      construction: the reward's target. "advantage": (Q(s, a) - max_a Q(s, a)) / std; "q": (Q - mean) / std;
+        "action_distance": -||a - a*|| (discrete: 1 where a = a*), a* the expert's mode action.
+      num_experts: agents trained on the environment; the best of them is the expert.
+      expert_steps: environment steps of each; the environment's own setting where None.
+      discount: of the Q-function.
+      num_states, num_actions: states that the dataset holds, and actions tried in each.
+      horizon: steps after which a Monte-Carlo return is cut off.
+      fit_steps: Adam steps of each regression.
+    """
+
+    construction: str = "action_distance"
+    num_experts: int = 8
+    expert_steps: int | None = None
+    discount: float = 0.95
+    num_states: int = 4096
+    num_actions: int = 16
+    horizon: int = 100
+    fit_steps: int = 4000
+
+    def __post_init__(self) -> None:
+        if self.construction not in CONSTRUCTIONS:
+            raise unknown_name("warm-start construction", self.construction, CONSTRUCTIONS)
+        for field in ("num_experts", "num_states", "num_actions", "horizon", "fit_steps"):
+            if getattr(self, field) < 1:
+                raise UserError(f"{field} is {getattr(self, field)}: it must be at least 1.")
+
+
+class Expert(NamedTuple):
+    agent: PPO
+    state: PPOState
+    mean_return: float
+    environment_steps: int
+
+
+class ExpertDataset(NamedTuple):
+    """States that agents of mixed skill visit, with the expert's Q-values of random actions there."""
+
+    observation: jax.Array  # [S, O]
+    action: jax.Array  # [S, K, ...]
+    q: jax.Array  # [S, K]
+    expert_action: jax.Array  # [S, ...]
+
+
+def train_expert(
+    env: environment.Environment[Any, Any],
+    env_params: Any,
+    setting: Setting,
+    key: jax.Array,
+    num_experts: int,
+) -> Expert:
+    """The best of `num_experts` PPO agents trained on the environment itself, by 20 episodes of mode actions."""
+    agent = PPO(env, setting.config)
+
+    @jax.jit
+    def train(key: jax.Array) -> tuple[PPOState, jax.Array]:
+        key_train, key_evaluate = jax.random.split(key)
+        state = agent.train(key_train, setting.hyperparameters, env_params)
+        episodes = agent.evaluate(state, key_evaluate, 20, env_params=env_params, mode=True)
+        return state, episodes.returns.mean()
+
+    states, returns = jax.vmap(train)(jax.random.split(key, num_experts))
+    best = int(jnp.argmax(returns))
+    steps = setting.config.num_iterations * setting.config.batch_size * num_experts
+    return Expert(agent, jax.tree.map(lambda x: x[best], states), float(returns[best]), steps)
+
+
+def expert_dataset(
+    expert: Expert, env_params: Any, key: jax.Array, config: WarmStartConfig
+) -> tuple[ExpertDataset, int]:
+    """Q-values by simulation: from a stored state take an action once, then follow the expert.
+
+    States come from trajectories that mix expert and random actions, each with its own proportion, so that they cover what
+    an agent meets on its way to becoming an expert. All actions of a state share one key: their differences are exact
+    where the environment is deterministic.
+
+    Returns:
+      (the dataset, environment steps it took).
+    """
+    env = expert.agent.env
+    space = env.action_space(env_params)
+    key_roll, key_pick, key_action, key_q = jax.random.split(key, 4)
+
+    def expert_policy(observation: jax.Array) -> jax.Array:
+        return expert.agent.act(expert.state, observation, key, env_params, mode=True)
+
+    num_envs = 256
+    num_steps = min(200, int(env_params.max_steps_in_episode))
+
+    def step(carry: Any, key: jax.Array) -> Any:
+        env_state, observation, skill = carry
+        key_random, key_mix, key_step = jax.random.split(key, 3)
+        random_action = space.sample(key_random)
+        action = jnp.where(
+            jax.random.uniform(key_mix) < skill, expert_policy(observation), random_action
+        )
+        next_observation, next_state, *_ = env.step(key_step, env_state, action, env_params)
+        return (next_state, next_observation, skill), (env_state, observation)
+
+    def roll(key: jax.Array) -> Any:
+        key_reset, key_skill, key_steps = jax.random.split(key, 3)
+        observation, env_state = env.reset(key_reset, env_params)
+        start = (env_state, observation, jax.random.uniform(key_skill))
+        return jax.lax.scan(step, start, jax.random.split(key_steps, num_steps))[1]
+
+    visited = jax.jit(jax.vmap(roll))(jax.random.split(key_roll, num_envs))
+    picked = jax.random.choice(
+        key_pick,
+        num_envs * num_steps,
+        (config.num_states,),
+        replace=config.num_states > num_envs * num_steps,
+    )
+    env_states, observations = jax.tree.map(
+        lambda x: jnp.reshape(x, (-1, *x.shape[2:]))[picked], visited
+    )
+
+    def q_value(env_state: Any, action: jax.Array, key: jax.Array) -> jax.Array:
+        def follow(carry: Any, key: jax.Array) -> Any:
+            env_state, action, weight = carry
+            observation, env_state, reward, terminated, _ = env.step_env(
+                key, env_state, action, env_params
+            )
+            reward = jnp.reshape(reward, ()) * weight
+            weight = weight * config.discount * (1.0 - terminated)
+            return (env_state, expert_policy(observation), weight), reward
+
+        start = (env_state, action, jnp.float32(1.0))
+        return jax.lax.scan(follow, start, jax.random.split(key, config.horizon))[1].sum()
+
+    @jax.jit
+    @jax.vmap
+    def label(env_state: Any, observation: jax.Array, key: jax.Array) -> Any:
+        key_random, key_follow = jax.random.split(key)
+        best = jnp.reshape(expert_policy(observation), space.shape)
+        if isinstance(space, spaces.Discrete):
+            actions = jnp.arange(space.n)
+        else:
+            random = jax.vmap(space.sample)(jax.random.split(key_random, config.num_actions - 1))
+            actions = jnp.concatenate([best[None], random])
+        q = jax.vmap(q_value, in_axes=(None, 0, None))(env_state, actions, key_follow)
+        return actions, q, best
+
+    actions, q, best = label(env_states, observations, jax.random.split(key_q, config.num_states))
+    del key_action
+    dataset = ExpertDataset(jnp.reshape(observations, (config.num_states, -1)), actions, q, best)
+    steps = num_envs * num_steps + config.num_states * actions.shape[1] * config.horizon
+    return dataset, steps
+
+
+def reward_targets(dataset: ExpertDataset, construction: str, discrete: bool) -> jax.Array:
+    """[S, K] what the bandit's reward should be, of unit standard deviation."""
+    if construction == "action_distance":
+        best = jnp.expand_dims(dataset.expert_action, 1)
+        if discrete:
+            target = (dataset.action == best).astype(jnp.float32)
+        else:
+            difference = jnp.reshape(dataset.action - best, (*dataset.q.shape, -1))
+            target = -jnp.linalg.norm(difference, axis=-1)
+    elif construction == "q":
+        target = dataset.q - dataset.q.mean()
+    else:
+        target = dataset.q - dataset.q.max(axis=1, keepdims=True)
+    return target / (target.std() + 1e-8)
+
+
+def fit_bandit(
+    bandit: SyntheticBandit, dataset: ExpertDataset, key: jax.Array, config: WarmStartConfig
+) -> tuple[Weights, dict[str, float]]:
+    """Regresses the reward network, and matches the contexts' distribution to the dataset's states.
+
+    The reward by least squares; the contexts by the energy distance between generated and stored states, which is zero
+    only where the two distributions are equal.
+
+    Returns:
+      (weights, {"reward_r2": explained variance of the reward, "energy_distance": of the contexts}).
+    """
+    key_init, key_reward, key_context = jax.random.split(key, 3)
+    weights = bandit.init_weights(key_init)
+    target = reward_targets(dataset, config.construction, bandit.discrete)
+    optimizer = optax.adam(optax.cosine_decay_schedule(5e-3, config.fit_steps))
+    num_states = dataset.observation.shape[0]
+    scale = dataset.observation.std(axis=0) + 1e-6
+
+    def reward_loss(reward_weights: Any, index: jax.Array) -> jax.Array:
+        params = BanditParams(weights={"initial_state": {}, "reward": reward_weights})
+        predict = jax.vmap(
+            jax.vmap(bandit.mean_reward, in_axes=(None, 0, None)), in_axes=(0, 0, None)
+        )
+        predicted = predict(dataset.observation[index], dataset.action[index], params)
+        return jnp.mean((predicted - target[index]) ** 2)
+
+    def context_loss(state_weights: Any, index: jax.Array, key: jax.Array) -> jax.Array:
+        params = BanditParams(weights={"initial_state": state_weights, "reward": {}})
+        generated, _ = jax.vmap(bandit.reset_env, in_axes=(0, None))(
+            jax.random.split(key, index.shape[0]), params
+        )
+        return energy_distance(generated / scale, dataset.observation[index] / scale)
+
+    def fit(
+        loss: Any, start: Any, key: jax.Array, batch: int, keyed: bool
+    ) -> tuple[Any, jax.Array]:
+        def step(carry: Any, key: jax.Array) -> Any:
+            weights, state = carry
+            key_index, key_loss = jax.random.split(key)
+            index = jax.random.randint(key_index, (batch,), 0, num_states)
+            arguments = (index, key_loss) if keyed else (index,)
+            value, gradient = jax.value_and_grad(loss)(weights, *arguments)
+            updates, state = optimizer.update(gradient, state)
+            return (optax.apply_updates(weights, updates), state), value
+
+        carry = (start, optimizer.init(start))
+        (weights, _), losses = jax.lax.scan(step, carry, jax.random.split(key, config.fit_steps))
+        return weights, losses[-100:].mean()
+
+    fit_reward = jax.jit(lambda w, k: fit(reward_loss, w, k, batch=256, keyed=False))
+    fit_context = jax.jit(lambda w, k: fit(context_loss, w, k, batch=256, keyed=True))
+    reward, error = fit_reward(weights["reward"], key_reward)
+    context, distance = fit_context(weights["initial_state"], key_context)
+    report = {
+        "reward_r2": float(1.0 - error / jnp.var(target)),
+        "energy_distance": float(distance),
+    }
+    return jax.tree.map(np.asarray, {"initial_state": context, "reward": reward}), report
+
+
+def energy_distance(a: jax.Array, b: jax.Array) -> jax.Array:
+    """[] 2 E|a - b| - E|a - a'| - E|b - b'| of two [B, O] samples (Szekely and Rizzo, 2013)."""
+
+    def mean_distance(x: jax.Array, y: jax.Array, same: bool) -> jax.Array:
+        squared = jnp.sum((x[:, None] - y[None]) ** 2, axis=-1)
+        # The square root has no gradient at zero, which is where every point stands to itself.
+        distance = jnp.sqrt(squared + 1e-12)
+        size = x.shape[0]
+        return distance.sum() / (size * (size - 1) if same else size * size)
+
+    return 2 * mean_distance(a, b, False) - mean_distance(a, a, True) - mean_distance(b, b, True)

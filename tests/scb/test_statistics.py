@@ -1,0 +1,181 @@
+import json
+
+import numpy as np
+import pytest
+
+from scb.errors import UserError
+from scb.statistics import (
+    Estimate,
+    Interval,
+    bootstrap_interval,
+    estimate,
+    iqm,
+    normalized_score,
+    paired_difference,
+    spearman,
+)
+
+
+def test_iqm_drops_the_lowest_and_the_highest_quarter():
+    # Eight numbers: two go at either end. (3 + 4 + 5 + 6) / 4 = 4.5, whatever the outliers are.
+    assert iqm([1, 2, 3, 4, 5, 6, 7, 8]) == 4.5
+    assert iqm([-1e9, 2, 3, 4, 5, 6, 7, 1e9]) == 4.5
+
+
+def test_iqm_of_fewer_than_four_numbers_is_their_mean():
+    # floor(3 / 4) = 0: nothing is dropped. (0 + 0 + 6) / 3 = 2.
+    assert iqm([0, 0, 6]) == 2.0
+
+
+def test_iqm_reduces_the_axis_it_is_told():
+    x = np.array([[1.0, 2.0, 3.0, 100.0], [0.0, 10.0, 20.0, 30.0]])
+    # Rows: (2 + 3) / 2 and (10 + 20) / 2. Columns of two: plain means.
+    np.testing.assert_allclose(iqm(x, axis=1), [2.5, 15.0])
+    np.testing.assert_allclose(iqm(x, axis=0), [0.5, 6.0, 11.5, 65.0])
+
+
+def test_constant_runs_have_an_interval_of_width_zero():
+    assert bootstrap_interval([7.0] * 10) == Interval(7.0, 7.0)
+
+
+def test_a_single_run_has_a_value_but_no_interval():
+    assert bootstrap_interval([7.0]) == Interval(None, None)
+    assert estimate([7.0]) == Estimate(7.0, None, None, 1)
+
+
+def test_interval_of_two_runs_is_their_range():
+    # Resamples of {0, 1} have means 0, 1/2, 1 with probability 1/4, 1/2, 1/4: the outer 2.5 % on
+    # either side lie inside the quarters at 0 and at 1.
+    assert bootstrap_interval([0.0, 1.0]) == Interval(0.0, 1.0)
+
+
+def test_interval_of_a_mean_agrees_with_the_normal_approximation():
+    # The mean of 400 numbers with standard deviation s: +- 1.96 s / sqrt(400).
+    x = np.random.default_rng(0).normal(3.0, 2.0, 400)
+    half_width = 1.96 * x.std() / 20
+    interval = bootstrap_interval(x, statistic=np.mean)
+    np.testing.assert_allclose(interval, (x.mean() - half_width, x.mean() + half_width), atol=0.02)
+
+
+def test_higher_confidence_gives_a_wider_interval():
+    x = np.arange(20.0)
+    narrow, wide = bootstrap_interval(x, confidence=0.5), bootstrap_interval(x, confidence=0.99)
+    assert wide.low < narrow.low < iqm(x) < narrow.high < wide.high
+
+
+def test_the_same_seed_gives_the_same_interval():
+    x = np.random.default_rng(1).normal(size=10)
+    assert bootstrap_interval(x, seed=3) == bootstrap_interval(x, seed=3)
+    assert bootstrap_interval(x, seed=3) != bootstrap_interval(x, seed=4)
+
+
+def test_the_interval_does_not_depend_on_how_resamples_are_batched(monkeypatch):
+    x = np.random.default_rng(1).normal(size=10)
+    whole = bootstrap_interval(x)
+    monkeypatch.setattr("scb.statistics._NUMBERS_PER_BATCH", 70)
+    assert bootstrap_interval(x) == whole
+
+
+def test_paired_difference_is_the_difference_of_the_two_iqms():
+    a, b = np.array([0.0, 1.0, 2.0, 9.0]), np.array([3.0, 0.0, 1.0, 0.0])
+    # IQM(a) = (1 + 2) / 2 = 1.5, IQM(b) = (0 + 1) / 2 = 0.5. The IQM of a - b = [-3, 1, 1, 9]
+    # is (1 + 1) / 2 = 1 here too; with b reversed, [0, 0, 2, 6] has 1 and the IQMs stay.
+    difference = paired_difference(a, b)
+    assert difference.value == 1.0
+    assert difference.n == 4
+    b = np.array([9.0, 2.0, 0.0, 1.0])
+    # IQM(b) = (1 + 2) / 2 = 1.5: no difference, though the IQM of [-9, -1, 2, 8] is 0.5.
+    assert paired_difference(a, b).value == 0.0
+
+
+def test_what_a_seed_does_to_both_methods_cancels_in_a_paired_difference():
+    # One method is better by 1 on every seed: whichever seeds are drawn, the difference is 1 up to
+    # rounding, however far the seeds are apart.
+    a = np.array([-100.0, 0.0, 50.0, 1000.0, 3.0])
+    difference = paired_difference(a + 1.0, a)
+    np.testing.assert_allclose([difference.value, difference.low, difference.high], 1.0, rtol=1e-12)
+
+
+def test_paired_difference_wants_the_same_number_of_runs():
+    with pytest.raises(UserError, match="a has 3 runs and b has 2"):
+        paired_difference([1.0, 2.0, 3.0], [1.0, 2.0])
+
+
+def test_normalized_score_is_zero_for_random_and_one_for_the_expert():
+    # Pendulum: random -1200, expert -200. (-450 + 1200) / (-200 + 1200) = 0.75.
+    scores = normalized_score(np.array([-1200.0, -200.0, -450.0]), random=-1200.0, expert=-200.0)
+    np.testing.assert_allclose(scores, [0.0, 1.0, 0.75])
+
+
+def test_normalized_score_takes_one_random_and_expert_return_per_environment():
+    # [seeds, environments]: (5 - 0) / (10 - 0) and (-50 + 100) / (0 + 100).
+    scores = normalized_score([[5.0, -50.0]], random=[0.0, -100.0], expert=[10.0, 0.0])
+    np.testing.assert_allclose(scores, [[0.5, 0.5]])
+
+
+def test_normalized_score_refuses_an_expert_that_is_no_better_than_random():
+    with pytest.raises(UserError, match="nothing to normalise by"):
+        normalized_score([1.0], random=2.0, expert=2.0)
+
+
+def test_spearman_sees_order_only():
+    assert spearman([1.0, 2.0, 3.0], [1.0, 10.0, 1000.0]) == pytest.approx(1.0)
+    assert spearman([1.0, 2.0, 3.0], [5.0, 4.0, -3.0]) == pytest.approx(-1.0)
+    # Ranks (1, 2, 3, 4) and (2, 1, 4, 3): 1 - 6 * (1 + 1 + 1 + 1) / (4 * 15) = 0.6.
+    assert spearman([1.0, 2.0, 3.0, 4.0], [2.0, 1.0, 4.0, 3.0]) == pytest.approx(0.6)
+
+
+def test_spearman_of_a_constant_is_undefined():
+    assert spearman([1.0, 1.0, 1.0], [1.0, 2.0, 3.0]) is None
+    assert spearman([1.0], [2.0]) is None
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        iqm,
+        bootstrap_interval,
+        estimate,
+        lambda x: paired_difference([0.0, 0.0, 0.0], x),
+        lambda x: normalized_score(x, 0.0, 1.0),
+        lambda x: spearman(x, [1.0, 2.0, 3.0]),
+    ],
+)
+def test_nan_is_refused_with_its_count(call):
+    with pytest.raises(UserError, match="2 NaN and 0 infinite among 3 numbers"):
+        call([np.nan, 1.0, np.nan])
+    with pytest.raises(UserError, match="0 NaN and 1 infinite among 3 numbers"):
+        call([np.inf, 1.0, 2.0])
+
+
+def test_runs_must_be_a_vector_and_confidence_a_probability():
+    with pytest.raises(UserError, match=r"x has shape \(2, 3\): give a vector"):
+        estimate(np.zeros((2, 3)))
+    with pytest.raises(UserError, match="x is empty"):
+        estimate([])
+    with pytest.raises(UserError, match="confidence is 95"):
+        bootstrap_interval([1.0, 2.0], confidence=95)
+
+
+@pytest.mark.parametrize(
+    ("numbers", "text"),
+    [
+        ((-205.41, -230.12, -190.2, 20), "-205.4 [-230.1, -190.2] (n=20)"),
+        ((0.95, 0.9312, 0.97, 8), "0.9500 [0.9312, 0.9700] (n=8)"),
+        ((12345.6, 9999.9, 20000.0, 5), "12346 [10000, 20000] (n=5)"),
+        ((0.0, 0.0, 0.0, 3), "0.0 [0.0, 0.0] (n=3)"),
+        ((-205.41, None, None, 1), "-205.4 [no interval] (n=1)"),
+    ],
+)
+def test_an_estimate_prints_four_digits(numbers, text):
+    assert str(Estimate(*numbers)) == text
+
+
+def test_an_estimate_goes_into_json():
+    # allow_nan=False: the unknown interval of a single run must not be NaN.
+    assert json.loads(json.dumps(estimate([2.0]).as_dict(), allow_nan=False)) == {
+        "value": 2.0,
+        "low": None,
+        "high": None,
+        "n": 1,
+    }
