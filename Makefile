@@ -14,8 +14,8 @@ PYTEST := $(BIN)/python -m pytest -q --cov --cov-report=term --cov-fail-under=90
 help: ## list the commands
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-9s %s\n", $$1, $$2 }' Makefile
 
-run: $(INSTALLED) ## a small discovery, from nothing to its report, in runs/quick
-	@$(BIN)/lpo run --preset quick --out runs/quick
+run: $(INSTALLED) ## learn an objective, train PPO with it, judge it: runs/quick/report.html (15 minutes)
+	@$(BIN)/lpo run --preset quick $(if $(wildcard runs/quick/config.json),--resume,--out) runs/quick
 
 test: $(INSTALLED) ## the tests, without the slow ones, and their coverage
 	@$(PYTEST)
@@ -32,8 +32,15 @@ format: $(INSTALLED) ## put every file into the project's format
 	@$(BIN)/ruff check --fix-only
 	@$(BIN)/ruff format
 
-bench: $(INSTALLED) ## measure the speed of training and evolution
-	@$(BIN)/python -m experiments.benchmark
+bench: $(INSTALLED) .venv-rejax/.installed ## time PPO in the bandit beside rejax's
+	@$(BIN)/python -m experiments.benchmark --rejax-python .venv-rejax/bin/python
+
+# rejax needs a gymnax that this project doesn't run on, so it gets an environment of its own.
+.venv-rejax/.installed: $(INSTALLED)
+	@echo "Installing rejax into .venv-rejax ..."
+	@$(PYTHON) -m venv --clear .venv-rejax
+	@.venv-rejax/bin/python -m pip --disable-pip-version-check --quiet install rejax==0.1.3 gymnax==0.0.9
+	@touch $@
 
 clean: ## remove caches and build outputs; .venv and runs stay
 	@rm -rf build dist site htmlcov coverage.xml .coverage .coverage.* *.egg-info

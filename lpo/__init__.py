@@ -1,6 +1,7 @@
 """Learned policy optimisation: evolve the objective that PPO maximises, on bandits a hundred times cheaper.
 
-Names are imported when they are first used: the command line has to configure JAX before anything imports it for good.
+Names are imported when they are first used: the command line has to configure JAX before anything
+imports it for good.
 """
 
 from importlib import import_module

@@ -1,9 +1,11 @@
 """The command line of both packages: `lpo` and `scb`.
 
-This module configures JAX before anything else imports it for good: one host device a core, which on two cores trains a
-population 1.6 times faster, and the persistent compilation cache, since compiling costs more than a quick run.
+This module configures JAX before anything else imports it for good: one host device a core, which
+on two cores trains a population 1.6 times faster, and the persistent compilation cache, since
+compiling costs more than a quick run.
 """
 
+import contextlib
 import os
 import sys
 from collections.abc import Callable, Sequence
@@ -20,8 +22,10 @@ def configure_jax() -> None:
     ):
         # The cores that this process may use, which in a container are fewer than the machine's.
         cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-        jax.config.update("jax_num_cpu_devices", cores or 1)
-    if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
+        # A caller that has used JAX already keeps its devices: by then their number is settled.
+        with contextlib.suppress(RuntimeError):
+            jax.config.update("jax_num_cpu_devices", cores or 1)
+    if jax.config.values["jax_compilation_cache_dir"] is None:
         base = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"))
         jax.config.update("jax_compilation_cache_dir", str(base / "lpo" / "jax"))
 
@@ -80,7 +84,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """`lpo`: learn an objective on a bandit, train PPO with it, judge it."""
     return _run(
         "lpo",
-        "Learned policy optimisation: learn an objective on a bandit, train PPO with it, judge it on real environments.",
+        "Learned policy optimisation: learn an objective on a bandit, train PPO with it, judge it.",
         _lpo_commands,
         sys.argv[1:] if arguments is None else arguments,
     )

@@ -1,8 +1,10 @@
 """What the subcommands of `lpo` do. Their docstrings are the command line's help."""
 
+import os
 import shlex
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +15,17 @@ from rich.table import Table
 from lpo import figures
 from lpo.certificate import certify
 from lpo.drift import LearnedDrift
-from lpo.generalization import Comparison, compare, learning_curves, training_setting
+from lpo.generalization import (
+    Comparison,
+    check_names,
+    compare,
+    learning_curves,
+    training_setting,
+)
 from lpo.meta_training import MetaTraining, MetaTrainingConfig
-from lpo.objectives import load_objective, save_objective
+from lpo.objectives import Objective, load_objective, save_objective
 from lpo.pipeline import PRESETS as RUN_PRESETS
-from lpo.pipeline import meta_training_artefact, run_pipeline
+from lpo.pipeline import check_settings, meta_training_artefact, run_pipeline
 from scb.artefacts import package_versions
 from scb.errors import UserError
 from scb.evolution import EvolutionConfig, evolve
@@ -53,8 +61,9 @@ def run(
 ) -> None:
     """The whole path: learn an objective on the Pendulum bandit, train PPO with it, judge it.
 
-    Meta-trains a drift on the shipped bandit, then trains PPO with its own clip, with DPO and with the learned drift on
-    Pendulum and on Brax Hopper, on the same seeds, and writes report.html, figures and results.json.
+    Meta-trains a drift on the shipped bandit, then trains PPO with its own clip, with DPO and with
+    the learned drift on Pendulum and on Brax Hopper, on the same seeds, and writes report.html,
+    figures and results.json.
 
     Args:
       preset: quick (a quarter of an hour on two cores) or paper (the paper's sizes; hours).
@@ -66,9 +75,14 @@ def run(
     settings = settle(
         {"command": "run", "seed": seed, "objective": objective}, RUN_PRESETS, preset, resume
     )
-    settings["seed"] = settings["seed"] or 0
+    settings["seed"] = settings.get("seed") or 0
+    if resume is None:
+        check_settings(settings)  # a mistake must not leave a folder behind
     folder = Run.open(resume or out, settings, resume=resume is not None)
-    report = run_pipeline(folder, settings, command_line())
+    # Not as typed: resuming goes on with these settings, and this is what starts them afresh.
+    chosen = {name: settings[name] for name in ("preset", "seed", "objective")}
+    flags = [f"--{name}={value}" for name, value in chosen.items() if value is not None]
+    report = run_pipeline(folder, settings, shlex.join(["lpo", "run", *flags]))
     Console().print(f"report: {report}")
 
 
@@ -99,10 +113,12 @@ def meta_train_command(
       preset: quick (60 generations of 32) or paper (512 of 64); single flags override it.
       seed: decides everything.
       out: folder to write; must be new or empty.
-      resume: a run folder to continue; its settings apply, and a flag that contradicts them is an error.
-      fitness: transfer (return of the bandit-trained agent in the evaluation environment), return (in the bandit), or
-        area (mean of the return over training).
-      reward_noise: noise on the bandit's reward, in its standard deviations. Without it the drift overfits the bandit.
+      resume: a run folder to continue; its settings apply, and a flag that contradicts them is an
+        error.
+      fitness: transfer (return of the bandit-trained agent in the evaluation environment), return
+        (in the bandit), or area (mean of the return over training).
+      reward_noise: noise on the bandit's reward, in its standard deviations. Without it the drift
+        overfits the bandit.
       base: ppo (the network corrects PPO's clip) or none.
       strategy: any of evosax's, by name (Open_ES, SNES, CMA_ES, ...).
       population_size: candidates a generation.
@@ -149,7 +165,13 @@ def meta_train_command(
         meta_training_artefact(problem, outcome, settings, command_line()),
     )
     figures.save(
-        figures.meta_training_curve(outcome.metrics, config.environment, config.fitness),
+        figures.meta_training_curve(
+            outcome.metrics,
+            config.environment,
+            config.fitness,
+            config.evolution.population_size,
+            config.evolution.mean_evaluations,
+        ),
         folder.folder / "figures" / "meta_training.png",
     )
     console = Console()
@@ -223,8 +245,10 @@ def train(
       seed: the first of their seeds.
       backend: Brax physics: generalized, positional or spring.
       sampled_actions: evaluate sampled actions rather than the most likely ones.
-      out: folder for curves.json and curves.png.
+      out: folder for comparison.json and curves.png; must be new or empty.
     """
+    if out is not None:
+        _make_folder(out)
     curves = learning_curves(
         environment,
         load_objective(objective),
@@ -254,19 +278,23 @@ def evaluate(
 
     Args:
       environment: where to train.
-      objectives: any of ppo, ppo-0.3, dpo, none, zoo names, files; the first is the reference of the differences.
+      objectives: any of ppo, ppo-0.3, dpo, none, zoo names, files; the first is the reference of
+        the differences.
       steps: environment steps; the environment's own setting where left out.
       seeds: agents of each objective.
       seed: the first of their seeds.
       backend: Brax physics: generalized, positional or spring.
       sampled_actions: evaluate sampled actions rather than the most likely ones.
-      out: folder for comparison.json and curves.png.
+      out: folder for comparison.json and curves.png; must be new or empty.
     """
     if not objectives:
         raise UserError("no objectives: give at least one, such as --objectives ppo dpo.")
+    loaded = _named_apart(objectives)
+    if out is not None:
+        _make_folder(out)
     comparison = compare(
         environment,
-        [load_objective(name) for name in objectives],
+        loaded,
         seed_list(seeds, seed),
         setting=training_setting(environment, steps),
         backend=backend,
@@ -296,12 +324,33 @@ def certify_command(objective: str) -> None:
         sys.exit(1)
 
 
-def _write_comparison(out: Path, comparison: Comparison) -> None:
+def _named_apart(names: Sequence[str]) -> list[Objective]:
+    # Every `lpo meta-train` writes an objective.npz: files of one name go by what was typed.
+    loaded = [load_objective(name) for name in names]
+    known = [objective.name for objective in loaded]
+    loaded = [
+        replace(objective, name=typed) if known.count(objective.name) > 1 else objective
+        for objective, typed in zip(loaded, names, strict=True)
+    ]
+    check_names(loaded)
+    return loaded
+
+
+def _make_folder(out: Path) -> None:
+    # Before the training and not after it, which may take hours.
     try:
         out.mkdir(parents=True, exist_ok=True)
+        taken = any(out.iterdir())
     except OSError as error:
         raise UserError(
-            f"cannot write to {out} ({error.strerror}): choose another --out."
+            f"cannot write to {out} ({error.strerror}): choose an --out folder that you may write to."
         ) from error
+    if taken:
+        raise UserError(f"{out} already exists and is not empty: choose another --out.")
+    if not os.access(out, os.W_OK):
+        raise UserError(f"cannot write to {out}: choose an --out folder that you may write to.")
+
+
+def _write_comparison(out: Path, comparison: Comparison) -> None:
     write_json(out / "comparison.json", {**comparison.as_dict(), "versions": package_versions()})
     figures.save(figures.learning_curves(comparison.curves), out / "curves.png")

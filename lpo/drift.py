@@ -1,9 +1,9 @@
 """Drift functionals: what a policy update pays for moving away from the behaviour policy.
 
-A drift f(ratio, advantage) >= 0 with value and gradient zero at ratio = 1 keeps PPO-style updates inside the
-mirror-learning framework (Kuba et al., 2022), whose members all improve monotonically. PPO maximises
-`mean(ratio * advantage - f)`. PPO's clip, DPO's closed form and a learned network are members of one contract, so that a
-training loop cannot tell them apart.
+A drift f(ratio, advantage) >= 0 with value and gradient zero at ratio = 1 keeps PPO-style updates
+inside the mirror-learning framework (Kuba et al., 2022), whose members all improve monotonically.
+PPO maximises `mean(ratio * advantage - f)`. PPO's clip, DPO's closed form and a learned network are
+members of one contract, so that a training loop cannot tell them apart.
 """
 
 from dataclasses import dataclass
@@ -19,8 +19,8 @@ from scb.errors import UserError, unknown_name
 Base: TypeAlias = Literal["ppo", "none"]
 BASES: tuple[Base, ...] = ("ppo", "none")
 
-# The order of the learned drift's inputs, d = ratio - 1 side. Other code uses other orders and signs, so it is stored
-# with every artefact.
+# The order of the learned drift's inputs, d = ratio - 1 side. Other code uses other orders and
+# signs, so it is stored with every artefact.
 FEATURES = (
     "1-r",
     "(1-r)^2",
@@ -121,12 +121,14 @@ class NoDrift:
 class LearnedDrift:
     """A small network as a drift (Lu et al., 2022): relu(base + net(features) - xi).
 
-    The conditions of mirror learning hold whatever the weights: all features and the base vanish at ratio 1 together with
-    the base's gradient, no layer has a bias, and relu(. - xi) is flat around 0. What the construction does not bound is the
-    slope just outside that flat zone, which is why `certify` reports it.
+    The conditions of mirror learning hold whatever the weights: all features and the base vanish at
+    ratio 1 together with the base's gradient, no layer has a bias, and relu(. - xi) is flat around
+    0. What the construction does not bound is the slope just outside that flat zone, which is why
+    `certify` reports it.
 
     Attributes:
-      base: "ppo" adds PPO's clip drift, so that zero weights are PPO; "none" leaves the network alone.
+      base: "ppo" adds PPO's clip drift, so that zero weights are PPO; "none" leaves the network
+        alone.
       hidden_size: of the one tanh layer.
       clip: epsilon of the PPO base.
       xi: half-width of the dead zone, in units of the penalty; the original code has 1e-4.
@@ -151,8 +153,8 @@ class LearnedDrift:
     def init(self, key: jax.Array) -> dict[str, jax.Array]:
         """Flax's default initialisation, never zeros.
 
-        The network is odd in its weights, net(W1, W2) = net(-W1, -W2): from zeros, antithetic pairs of an evolution
-        strategy would tie exactly and the search would never leave.
+        The network is odd in its weights, net(W1, W2) = net(-W1, -W2): from zeros, antithetic pairs
+        of an evolution strategy would tie exactly and the search would never leave.
         """
         key_hidden, key_output = jax.random.split(key)
         initialize = jax.nn.initializers.lecun_normal()

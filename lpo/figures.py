@@ -242,6 +242,7 @@ def environment_steps(
                 va="center",
                 fontweight="bold",
                 color=VERMILLION,  # the bandit's: it is the one that takes fewer or more
+                bbox={"facecolor": "white", "edgecolor": "none", "pad": 1},
             )
         # Room on the right for the ratios, which stand in one column.
         axes.set_xlim(left, left * (max(drawn, default=10) / left) ** 1.42)
@@ -290,7 +291,8 @@ def learning_curves(curves: "Sequence[LearningCurves]") -> Figure:
         training.set_xlabel("environment steps")
         training.xaxis.set_major_formatter(EngFormatter(sep=""))
         training.set_ylabel("return (interquartile mean)")
-        training.set_title("During training: 95 % intervals as bands", fontsize=10, weight="normal")
+        during = "no interval from one seed" if counts == [1] else "95 % intervals as bands"
+        training.set_title(f"During training: {during}", fontsize=10, weight="normal")
         training.margins(x=0.02)
         final.set_xticks(range(len(curves)), [curve.objective for curve in curves])
         if len(curves) > 3 or max(len(curve.objective) for curve in curves) > 10:
@@ -459,8 +461,13 @@ def ratio_text(bandit: float, environment: float) -> str:
     if bandit == environment:
         return "the same"
     ratio = max(bandit, environment) / min(bandit, environment)
-    number = f"{ratio:,.0f}" if ratio >= 10 else f"{ratio:.2g}"
+    number = thousands(ratio) if ratio >= 10 else f"{ratio:.2g}"
     return f"{number} times {'fewer' if bandit < environment else 'more'}"
+
+
+def thousands(x: float) -> str:
+    """A count with its digits in groups of three, which no line break parts."""
+    return f"{x:,.0f}".replace(",", "\N{NARROW NO-BREAK SPACE}")
 
 
 @contextmanager

@@ -1,7 +1,8 @@
 """Does an objective carry over? Train PPO with several objectives on the same seeds and compare.
 
-Every objective meets the same seeds: the same initial networks, start states and evaluation episodes, so that differences
-are paired. Final scores are interquartile means with bootstrap intervals.
+Every objective meets the same seeds: the same initial networks, start states and evaluation
+episodes, so that differences are paired. Final scores are interquartile means with bootstrap
+intervals.
 """
 
 from collections.abc import Sequence
@@ -57,7 +58,7 @@ class LearningCurves:
             "backend": self.backend,
             "objective": self.objective,
             "steps": self.steps.tolist(),
-            "returns": np.round(self.returns, 3).tolist(),
+            "returns": self.returns.tolist(),
             "seeds": self.seeds,
             "episodes": self.episodes,
             "mode_actions": self.mode_actions,
@@ -83,9 +84,19 @@ def training_setting(environment: str, total_steps: int | None = None) -> Settin
 
 
 def _rounded_to_points(config: PPOConfig, points: int) -> PPOConfig:
-    # A prime number of iterations has no divisors to evaluate at: round up to a multiple of the points.
+    # A prime number of iterations has no divisors to evaluate at: round up to a multiple of the
+    # points.
     iterations = -(-config.num_iterations // points) * points
     return replace(config, total_steps=iterations * config.batch_size)
+
+
+def check_seeds(seeds: Sequence[int]) -> None:
+    """Raises a UserError where there are no seeds, or one is not a number of 32 bits."""
+    if not seeds:
+        raise UserError("no seeds: give at least one.")
+    for seed in seeds:
+        if not 0 <= seed < 2**32:
+            raise UserError(f"a seed is {seed}: each must be 0 or larger, and below 2^32.")
 
 
 def learning_curves(
@@ -104,21 +115,22 @@ def learning_curves(
       environment: a name that `scb.make` takes.
       objective: what replaces PPO's surrogate.
       seeds: one agent each; the same seeds pair agents of different objectives.
-      setting: PPO's; the environment's own where None. Its steps are rounded up to a multiple of `points` batches.
+      setting: PPO's; the environment's own where None. Its steps are rounded up to a multiple of
+        `points` batches.
       backend: Brax physics ("generalized", "positional", "spring"); only for Brax environments.
       points: evaluations along the training, the untrained agent not counted.
       episodes: of each evaluation.
       mode_actions: evaluate the most likely actions rather than sampled ones.
     """
-    if not seeds:
-        raise UserError("no seeds: give at least one.")
-    if any(seed < 0 for seed in seeds):
-        raise UserError(f"seeds are {list(seeds)}: each must be 0 or larger.")
+    check_seeds(seeds)
+    for name, value in (("points", points), ("episodes", episodes)):
+        if value < 1:
+            raise UserError(f"{name} is {value}: it must be at least 1.")
     env, env_params = make(environment, **({} if backend is None else {"backend": backend}))
     setting = setting or environment_setting(environment)
     config = _rounded_to_points(setting.config, min(points, setting.config.num_iterations))
     agent = PPO(env, config, objective.drift)
-    hyperparameters = setting.hyperparameters.replace(drift=objective.parameters)
+    hyperparameters = replace(setting.hyperparameters, drift=objective.parameters)
     every = evaluation_interval(config.num_iterations, points)
 
     def train(seed: jax.Array) -> jax.Array:
@@ -139,7 +151,8 @@ def learning_curves(
         getattr(env, "backend", None),
         objective.name,
         steps,
-        np.asarray(returns),
+        # In double precision, so that curves read back from JSON give the same estimates.
+        np.asarray(returns, np.float64),
         list(seeds),
         episodes,
         mode_actions,
@@ -178,10 +191,25 @@ class Comparison:
         }
 
 
+def check_names(objectives: Sequence[Objective]) -> None:
+    """Raises a UserError where two objectives bear one name."""
+    names = [objective.name for objective in objectives]
+    repeated = sorted({name for name in names if names.count(name) > 1})
+    if repeated:
+        raise UserError(
+            f"objective {repeated[0]!r} is there twice: give each once, and each a name of its own."
+        )
+
+
 def compare(
     environment: str, objectives: Sequence[Objective], seeds: Sequence[int], **arguments: Any
 ) -> Comparison:
-    """`learning_curves` of each objective on the same seeds."""
+    """`learning_curves` of each objective on the same seeds.
+
+    Raises:
+      UserError: two objectives bear one name, by which their results would be told apart.
+    """
+    check_names(objectives)
     return Comparison(
         [learning_curves(environment, objective, seeds, **arguments) for objective in objectives]
     )

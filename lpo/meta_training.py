@@ -1,13 +1,15 @@
 """Learn an objective: evolve a drift's weights so that agents trained with it end up good.
 
-Lu et al. (2022), "Discovered Policy Optimisation", with the inner loop on a synthetic contextual bandit instead of an
-environment (Liesen et al., 2024). The same code trains on either.
+Lu et al. (2022), "Discovered Policy Optimisation", with the inner loop on a synthetic contextual
+bandit instead of an environment (Liesen et al., 2024). The same code trains on either.
 
-A bandit's advantages are exact; a real environment's are mostly noise, and restraint is only worth learning under noise.
-A drift evolved on a noiseless bandit therefore wins there and ruins PPO elsewhere. Here the bandit's reward carries noise
-of several of its own standard deviations, which makes it rank objectives almost as the environment does.
+A bandit's advantages are exact; a real environment's are mostly noise, and restraint is only worth
+learning under noise. A drift evolved on a noiseless bandit therefore wins there and ruins PPO
+elsewhere. Here the bandit's reward carries noise of several of its own standard deviations, which
+makes it rank objectives almost as the environment does.
 """
 
+import math
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
@@ -32,20 +34,24 @@ class MetaTrainingConfig:
     """What to learn an objective on, and how.
 
     Attributes:
-      environment: where the inner loop trains: a bandit ("Synthetic-Pendulum-v1"), or any environment.
+      environment: where the inner loop trains: a bandit ("Synthetic-Pendulum-v1"), or any
+        environment.
       drift: the learned drift's family.
-      initial_scale: factor on the output layer's random start, so that the search begins near the base.
-      fitness: "return": of the trained agent where it was trained, without reward noise; "area": the mean of that over
-        the training; "transfer": in the bandit's evaluation environment.
+      initial_scale: factor on the output layer's random start, so that the search begins near the
+        base.
+      fitness: "return": of the trained agent where it was trained, without reward noise; "area":
+        the mean of that over the training; "transfer": in the bandit's evaluation environment.
       agent: PPO's static configuration; None takes `inner_loop(environment, contexts)`.
       contexts: size of a batch on a bandit.
       learning_rates, entropy_coefficients: values that an inner agent's are drawn from.
-      reward_noise: standard deviation of the noise on a bandit's reward, in standard deviations of that reward over random
-        contexts and actions. Real environments have noise of their own and take none.
+      reward_noise: standard deviation of the noise on a bandit's reward, in standard deviations of
+        that reward over random contexts and actions. Real environments have noise of their own and
+        take none.
       agents_per_candidate: inner agents whose mean is a candidate's fitness.
       evaluation_episodes: of each inner agent; on a bandit an episode is one step.
       mode_actions: evaluate the most likely actions rather than sampled ones.
-      backend: Brax physics, where the environment is Brax's.
+      backend: Brax physics, where the environment is Brax's (with "transfer": the evaluation
+        environment).
       evolution: the outer loop's.
     """
 
@@ -82,16 +88,18 @@ class MetaTrainingConfig:
         for name in ("learning_rates", "entropy_coefficients"):
             if not getattr(self, name):
                 raise UserError(f"{name} is empty: give at least one value.")
-        if self.reward_noise < 0:
-            raise UserError(f"reward_noise is {self.reward_noise}: it must be 0 or larger.")
+        if not 0 <= self.reward_noise < math.inf:
+            raise UserError(
+                f"reward_noise is {self.reward_noise}: it must be 0 or larger, and finite."
+            )
 
 
 def inner_loop(environment: str, contexts: int) -> PPOConfig:
     """The inner loop's static configuration: the evaluation environment's own setting, or its image on a bandit.
 
-    On a bandit the number of updates (iterations, epochs, minibatches) stays that of the environment's setting, so that the
-    objective meets the regime in which it will be used, while a batch holds a fraction of the transitions: contexts are
-    independent, consecutive steps are not.
+    On a bandit the number of updates (iterations, epochs, minibatches) stays that of the
+    environment's setting, so that the objective meets the regime in which it will be used, while a
+    batch holds a fraction of the transitions: contexts are independent, consecutive steps are not.
     """
     if not environment.startswith("Synthetic-"):
         return environment_setting(environment).config
@@ -110,14 +118,17 @@ class MetaTraining:
 
     def __init__(self, config: MetaTrainingConfig) -> None:
         self.config = config
-        arguments = {} if config.backend is None else {"backend": config.backend}
-        self.env, self.env_params = make(config.environment, **arguments)
+        physics = {} if config.backend is None else {"backend": config.backend}
+        if config.fitness == "transfer":
+            # The bandit has no physics; the environment that it stands for may.
+            self.env, self.env_params = make(config.environment)
+            evaluated = config.environment.removeprefix("Synthetic-")
+            self.evaluation_env, self.evaluation_params = make(evaluated, **physics)
+        else:
+            self.env, self.env_params = make(config.environment, **physics)
+            self.evaluation_env, self.evaluation_params = self.env, self.env_params
         self.agent_config = config.agent or inner_loop(config.environment, config.contexts)
         self.agent = PPO(self.env, self.agent_config, config.drift)
-        evaluated = config.environment
-        if config.fitness == "transfer":
-            evaluated = config.environment.removeprefix("Synthetic-")
-        self.evaluation_env, self.evaluation_params = make(evaluated, **arguments)
         self.training_params = self.env_params
         if isinstance(self.env, SyntheticBandit) and config.reward_noise:
             scale = self.env.reward_scale(self.env_params, jax.random.key(0))
@@ -136,7 +147,7 @@ class MetaTraining:
         fitness = jax.vmap(lambda k: self.train_one(candidate, k))(
             jax.random.split(key, self.config.agents_per_candidate)
         )
-        return {"fitness": fitness.mean()}
+        return {"fitness": fitness}
 
     def evaluate_mean(self, candidate: Any, key: jax.Array) -> dict[str, jax.Array]:
         return {"fitness": self.train_one(candidate, key)}
@@ -145,7 +156,8 @@ class MetaTraining:
         """[] fitness of one agent that was trained with these drift parameters."""
         config = self.config
         key_rate, key_entropy, key_train, key_evaluate = jax.random.split(key, 4)
-        hyperparameters = self.base_hyperparameters.replace(
+        hyperparameters = replace(
+            self.base_hyperparameters,
             learning_rate=jax.random.choice(key_rate, jnp.asarray(config.learning_rates)),
             entropy_coefficient=jax.random.choice(
                 key_entropy, jnp.asarray(config.entropy_coefficients)

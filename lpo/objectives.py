@@ -78,13 +78,9 @@ def _closed_form(name: str, drift: Drift) -> Objective:
 
 def _from_file(path: Path) -> Objective:
     artefact = artefacts.load(path, KIND)
-    family = artefact.metadata["config"].get("drift", {})
-    if tuple(family.get("features", ())) != FEATURES:
-        raise UserError(
-            f"{path} was learned on other features ({family.get('features')}) than this version computes "
-            f"({', '.join(FEATURES)}): use the version that made it."
-        )
     try:
+        family = artefact.metadata["config"]["drift"]
+        features = tuple(family["features"])
         drift = LearnedDrift(
             base=family["base"],
             hidden_size=family["hidden_size"],
@@ -93,8 +89,17 @@ def _from_file(path: Path) -> Objective:
         )
     except KeyError as error:
         raise UserError(
-            f"{path} does not say its drift's {error}: its .json is incomplete."
+            f"{path} does not describe a drift: its .json lacks config entry {error}."
         ) from error
+    except TypeError as error:
+        raise UserError(
+            f"{path} does not describe a drift: its .json garbles config entry 'drift' ({error})."
+        ) from error
+    if features != FEATURES:
+        raise UserError(
+            f"{path} was learned on other features ({', '.join(map(str, features))}) than this version computes "
+            f"({', '.join(FEATURES)}): use the version that made it."
+        )
     artefacts.expect_shapes(artefact, drift.weight_shapes())
     parameters = jax.tree.map(jnp.asarray, dict(artefact.arrays))
     return Objective(artefact.name, drift, parameters, artefact.metadata)

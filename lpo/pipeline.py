@@ -5,7 +5,7 @@ Every stage leaves a file in the run folder; a resumed run does what is missing.
 
 import json
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +14,18 @@ from rich.console import Console
 
 from lpo import figures, report
 from lpo.certificate import certify
-from lpo.generalization import Comparison, LearningCurves, learning_curves, training_setting
+from lpo.generalization import (
+    Comparison,
+    LearningCurves,
+    check_names,
+    check_seeds,
+    learning_curves,
+    training_setting,
+)
 from lpo.meta_training import MetaTraining, MetaTrainingConfig
 from lpo.objectives import Objective, load_objective, save_objective
 from scb.artefacts import machine_description, package_versions
+from scb.environments.registry import make
 from scb.evolution import EvolutionConfig, Outcome, evolve
 from scb.runs import Run, Stopwatch, write_json
 
@@ -74,18 +82,17 @@ def run_pipeline(run: Run, settings: Mapping[str, Any], command: str) -> Path:
     watch = Stopwatch()
     folder = run.folder
     config = pipeline_config(settings)
-    problem = MetaTraining(config)
     meta: dict[str, Any] = {}
     if settings["objective"] is None:
         console.print(
             f"[1/3] learning an objective on {config.environment}: {config.evolution.num_generations} generations of "
             f"{config.evolution.population_size}"
         )
-        objective, meta = _learn(run, problem, settings, command)
+        objective, meta = _learn(run, config, settings, command)
     else:
         objective = load_objective(settings["objective"])
     certificate = certify(objective.drift, objective.parameters)
-    objectives = [load_objective("ppo"), load_objective("dpo"), objective]
+    objectives = _with_references(objective)
 
     comparisons: dict[str, Comparison] = {}
     for evaluation in settings["evaluations"]:
@@ -97,7 +104,7 @@ def run_pipeline(run: Run, settings: Mapping[str, Any], command: str) -> Path:
         )
 
     console.print("[3/3] figures and report")
-    paths = _figures(folder, problem, objective, objectives, comparisons, meta)
+    paths = _figures(folder, config, objectives, comparisons, meta)
     results = {
         "schema_version": 1,
         "preset": settings["preset"],
@@ -111,6 +118,33 @@ def run_pipeline(run: Run, settings: Mapping[str, Any], command: str) -> Path:
     }
     write_json(folder / "results.json", results)
     return report.write_report(folder, results, paths)
+
+
+def check_settings(settings: Mapping[str, Any]) -> None:
+    """Raises the UserError that `run_pipeline` would, without doing anything.
+
+    Args:
+      settings: as for `run_pipeline`.
+    """
+    config = pipeline_config(settings)
+    for evaluation in settings["evaluations"]:
+        check_seeds(reporting_seeds(settings["seed"], evaluation["seeds"]))
+    if settings["objective"] is None:
+        make(config.environment)
+    else:
+        _with_references(load_objective(settings["objective"]))
+
+
+def reporting_seeds(seed: int, count: int) -> list[int]:
+    """The seeds that judge a run of this seed."""
+    first = FIRST_REPORTING_SEED + 1000 * seed
+    return list(range(first, first + count))
+
+
+def _with_references(objective: Objective) -> list[Objective]:
+    objectives = [load_objective("ppo"), load_objective("dpo"), objective]
+    check_names(objectives)
+    return objectives
 
 
 def pipeline_config(settings: Mapping[str, Any]) -> MetaTrainingConfig:
@@ -128,17 +162,19 @@ def pipeline_config(settings: Mapping[str, Any]) -> MetaTrainingConfig:
 
 
 def _learn(
-    run: Run, problem: MetaTraining, settings: Mapping[str, Any], command: str
+    run: Run, config: MetaTrainingConfig, settings: Mapping[str, Any], command: str
 ) -> tuple[Objective, dict[str, Any]]:
-    config = problem.config
-    outcome = evolve(problem, config.evolution, run)
-    run.close()
-    path, _ = save_objective(
-        run.folder / "lpo.npz",
-        config.drift,
-        outcome.mean,
-        meta_training_artefact(problem, outcome, dict(settings), command),
-    )
+    problem = MetaTraining(config)
+    path = run.folder / "lpo.npz"
+    if not path.with_suffix(".json").exists():  # it is written last
+        outcome = evolve(problem, config.evolution, run)
+        run.close()
+        save_objective(
+            path,
+            config.drift,
+            outcome.mean,
+            meta_training_artefact(problem, outcome, dict(settings), command),
+        )
     evaluations = config.evolution.num_generations * config.evolution.population_size
     steps = problem.steps()
     on_environment = environment_problem(config).steps()
@@ -146,7 +182,7 @@ def _learn(
         "environment": config.environment,
         "fitness": config.fitness,
         "config": dict(settings),
-        "seconds": round(outcome.seconds, 1),
+        "seconds": round(run.seconds(), 1),
         "generations": config.evolution.num_generations,
         "steps": {
             name: evaluations * getattr(steps, name) for name in ("training", "evaluation", "total")
@@ -155,7 +191,7 @@ def _learn(
             name: evaluations * getattr(on_environment, name)
             for name in ("training", "evaluation", "total")
         },
-        "metrics": outcome.metrics,
+        "metrics": run.metrics(),
     }
     return load_objective(path), meta
 
@@ -194,16 +230,13 @@ def meta_training_artefact(
 
 
 def _plain(config: Any) -> Any:
-    from dataclasses import asdict
-
     return json.loads(json.dumps(asdict(config)))
 
 
 def _compare(
     folder: Path, objectives: list[Objective], evaluation: Mapping[str, Any], seed: int
 ) -> Comparison:
-    first = FIRST_REPORTING_SEED + 1000 * seed
-    seeds = list(range(first, first + evaluation["seeds"]))
+    seeds = reporting_seeds(seed, evaluation["seeds"])
     (folder / "curves").mkdir(exist_ok=True)
     curves = []
     for objective in objectives:
@@ -236,8 +269,7 @@ def _stored_curves(path: Path) -> LearningCurves:
 
 def _figures(
     folder: Path,
-    problem: MetaTraining,
-    objective: Objective,
+    config: MetaTrainingConfig,
     objectives: list[Objective],
     comparisons: Mapping[str, Comparison],
     meta: Mapping[str, Any],
@@ -245,17 +277,17 @@ def _figures(
     drawn = {}
     if meta:
         drawn["meta_training"] = figures.meta_training_curve(
-            meta["metrics"], problem.config.environment, problem.config.fitness
+            meta["metrics"], config.environment, config.fitness
         )
         drawn["environment_steps"] = figures.environment_steps(
             meta["steps"], meta["environment_steps"]
         )
     for name, comparison in comparisons.items():
-        drawn[f"learning_{name}"] = figures.learning_curves(comparison.curves)
-    drawn["drift"] = figures.drift_heatmaps(objectives)
+        drawn[name] = figures.learning_curves(comparison.curves)
+    drawn["drift_heatmaps"] = figures.drift_heatmaps(objectives)
     paths = {}
     for name, figure in drawn.items():
-        paths[name] = folder / "figures" / f"{name}.png"
+        paths[name] = folder / "figures" / f"{name.replace('/', '-')}.png"
         paths[name].parent.mkdir(exist_ok=True)
         figures.save(figure, paths[name])
     return paths

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import jinja2
 
-from lpo.figures import ratio_text
+from lpo.figures import ratio_text, thousands
 from scb.errors import UserError
 
 if TYPE_CHECKING:
@@ -93,8 +93,8 @@ def write_report(folder: Path, results: Mapping[str, Any], figures: Mapping[str,
         seconds: wall-clock of the whole run.
         objective: {"name", "certificate": `Certificate.as_dict()`}; the certificate is optional.
         meta_training (optional): {"environment", "config" (nested), "seconds", "generations",
-          "steps": {"training", "evaluation", "total"}, "environment_steps": the same for
-          meta-training on the environment itself (optional)}.
+          "steps": {"training", "evaluation", "total"} of all candidates, "environment_steps":
+          the same for meta-training on the environment itself (optional)}.
         comparisons: {environment: `Comparison.as_dict()`}.
       figures: PNG files by the function that drew them ("meta_training" for the curve,
         "environment_steps", "drift_heatmaps"), and learning curves by their environment, as in
@@ -190,7 +190,7 @@ def _rows(comparison: Mapping[str, Any], learned: str | None) -> list[dict[str, 
 
 
 def _interval(estimate: Mapping[str, Any], signed: bool = False) -> str:
-    """ "−147 [−162, −126]": as many places as the interval's width gives meaning to."""
+    # -147 [-162, -126]: as many places as the width of the interval gives meaning to.
     value, low, high = estimate["value"], estimate["low"], estimate["high"]
     if low is None or high is None:
         return f"{_number(value, _places(abs(value), 4), signed)} [no interval]"
@@ -215,10 +215,6 @@ def _number(x: float, places: int, signed: bool = False) -> str:
     return text.replace("-", "−")
 
 
-def _count(x: float) -> str:
-    return f"{x:,.0f}".replace(",", "\N{NARROW NO-BREAK SPACE}")
-
-
 def _duration(seconds: float) -> str:
     if seconds < 60:
         return f"{seconds:.1f} s"
@@ -234,10 +230,13 @@ def _seeds(seeds: Sequence[int]) -> str:
 
 
 def _flatten(value: Any, name: str = "") -> Iterator[tuple[str, str]]:
-    """{"evolution": {"seed": 0}} -> ("evolution.seed", "0")."""
+    """{"evolution": {"seed": 0}} -> ("evolution.seed", "0"); things in a list are numbered."""
     if isinstance(value, Mapping) and value:
         for key, inner in value.items():
             yield from _flatten(inner, f"{name}.{key}" if name else str(key))
+    elif isinstance(value, list | tuple) and any(isinstance(item, Mapping) for item in value):
+        for index, item in enumerate(value, start=1):
+            yield from _flatten(item, f"{name}.{index}")
     elif isinstance(value, list | tuple):
         yield name, ", ".join(str(item) for item in value)
     else:
@@ -280,8 +279,8 @@ def _meta_training(meta: Mapping[str, Any]) -> dict[str, Any]:
     rows = [
         {
             "what": kind,
-            "here": _count(steps[kind]),
-            "there": _count(other[kind]) if other else "",
+            "here": thousands(steps[kind]),
+            "there": thousands(other[kind]) if other else "",
             "ratio": ratio_text(steps[kind], other[kind]) if other else "",
         }
         for kind in ("training", "evaluation", "total")
@@ -291,7 +290,7 @@ def _meta_training(meta: Mapping[str, Any]) -> dict[str, Any]:
         "home": meta["environment"].removeprefix("Synthetic-"),
         "generations": meta["generations"],
         "duration": _duration(meta["seconds"]),
-        "total": _count(steps["total"]),
+        "total": thousands(steps["total"]),
         "config": list(_flatten(meta["config"])),
         "rows": rows,
         "compared": other is not None,
@@ -305,7 +304,7 @@ def _comparison(name: str, comparison: Mapping[str, Any], learned: str) -> dict[
         "columns": _columns(comparison["reference"]),
         "rows": _rows(comparison, learned),
         "seeds": _seeds(curves[0]["seeds"]),
-        "steps": _count(max(curve["steps"][-1] for curve in curves)),
+        "steps": thousands(max(curve["steps"][-1] for curve in curves)),
         "few_seeds": min(len(curve["seeds"]) for curve in curves) < _FEW_SEEDS,
         "backend": curves[0]["backend"],
     }
@@ -518,7 +517,7 @@ Returns under {{ comparison.backend }} physics cannot be compared with those und
 {% if meta %}
 <h2 id="meta-training">Meta-training</h2>
 <p>The objective was learned on {{ meta.environment }} in {{ meta.generations }} generations,
-{{ meta.duration }} and {{ meta.total }} environment steps.</p>
+{{ meta.duration }} and {{ meta.total }} environment steps of its candidates.</p>
 {{ figure("meta_training", "Fitness over the generations: the population, and the mean of the "
   ~ "search distribution, which is the result.") }}
 <h3>Environment steps</h3>

@@ -22,7 +22,7 @@ from scb.discovery import (
 )
 from scb.environments.registry import make
 from scb.environments.synthetic import BanditConfig
-from scb.environments.zoo import PREFIX, open_bandit, save_bandit, zoo_metadata, zoo_names
+from scb.environments.zoo import PREFIX, bandit_metadata, open_bandit, save_bandit, zoo_names
 from scb.errors import UserError
 from scb.evolution import config_dict
 from scb.runs import Run, settle
@@ -31,7 +31,12 @@ from scb.warm_start import WarmStartConfig
 
 PRESETS: dict[str, dict[str, Any]] = {
     # Minutes to half an hour on two cores.
-    "quick": {"population_size": 32, "generations": 300, "agents_per_candidate": 2},
+    "quick": {
+        "population_size": 32,
+        "generations": 150,
+        "agents_per_candidate": 4,
+        "combine": "ranks",
+    },
     # Table "Hyperparameters for meta-training", Pendulum's column.
     "paper": {"population_size": 64, "generations": 1000, "agents_per_candidate": 8},
 }
@@ -52,6 +57,7 @@ def discover_command(
     population_size: int | None = None,
     generations: int | None = None,
     agents_per_candidate: int | None = None,
+    combine: str | None = None,
     evaluation_episodes: int | None = None,
     sigma: float | None = None,
     activation: str | None = None,
@@ -67,18 +73,21 @@ def discover_command(
       preset: quick (300 generations of 32) or paper (1000 of 64); single flags override it.
       seed: decides everything.
       out: folder to write; must be new or empty.
-      resume: a run folder to continue; its settings apply, and a flag that contradicts them is an error.
+      resume: a run folder to continue; its settings apply, and a flag that contradicts them is an
+        error.
       init: expert (fit the bandit to an expert first, in seconds) or random (as the paper).
       construction: of the expert fit: action_distance, advantage or q.
       strategy: any of evosax's, by name (SNES, Open_ES, ...).
       population_size: candidates a generation.
       generations: how many.
       agents_per_candidate: agents whose mean return is a candidate's fitness.
+      combine: its agents' returns by mean, or by ranks (the mean over agents of a candidate's rank).
       evaluation_episodes: of each agent in the evaluation environment.
       sigma: initial standard deviation of the search distribution.
       activation: the bandit's: tanh or relu.
       latent: normal, uniform, categorical or softmax_categorical.
-      fixed_hyperparameters: keep the inner agents' hyperparameters fixed instead of drawing them from the paper's lists.
+      fixed_hyperparameters: keep the inner agents' hyperparameters fixed instead of drawing them
+        from the paper's lists.
       from_bandit: start from this bandit (a zoo name or file.npz) instead.
       wandb: project to log to, with the extra `wandb`.
     """
@@ -92,6 +101,7 @@ def discover_command(
         "population_size": population_size,
         "generations": generations,
         "agents_per_candidate": agents_per_candidate,
+        "combine": combine,
         "evaluation_episodes": evaluation_episodes,
         "sigma": sigma,
         "activation": activation,
@@ -107,7 +117,7 @@ def discover_command(
     console = Console()
     results = {}
     for mode in (False, True):
-        returns = judge(problem.training, outcome.best_mean, FIRST_REPORTING_SEED, mode=mode)
+        returns = judge(problem.training, outcome.mean, FIRST_REPORTING_SEED, mode=mode)
         results["mode_actions" if mode else "sampled_actions"] = estimate(returns).as_dict()
         actions = "the most likely" if mode else "sampled"
         console.print(
@@ -118,12 +128,13 @@ def discover_command(
     path = save_bandit(
         folder.folder / f"{PREFIX}{config.environment}.npz",
         problem.bandit,
-        outcome.best_mean,
+        outcome.mean,
         {
             "config": {
                 "evaluation_environment": config.environment,
                 "discovery": config_dict(config),
                 "settings": settings,
+                "started_from": _origin(settings.get("from_bandit")),
             },
             "seeds": {"discovery": config.evolution.seed, "reporting": FIRST_REPORTING_SEED},
             "results": {
@@ -135,7 +146,6 @@ def discover_command(
                     else "fixed",
                     **results,
                 },
-                "selected_generation": outcome.best_mean_generation,
             },
             "cost": {
                 "environment_steps_training": evaluations * steps.training,
@@ -148,6 +158,18 @@ def discover_command(
         },
     )
     console.print(f"bandit: {path}")
+
+
+def _origin(bandit: str | None) -> dict[str, Any] | None:
+    if bandit is None:
+        return None
+    metadata = bandit_metadata(bandit)
+    return {
+        "command": metadata["command"],
+        "sha256": metadata["sha256"],
+        "cost": metadata["cost"],
+        "started_from": metadata["config"].get("started_from"),
+    }
 
 
 def discovery_config(settings: Mapping[str, Any]) -> DiscoveryConfig:
@@ -166,6 +188,7 @@ def discovery_config(settings: Mapping[str, Any]) -> DiscoveryConfig:
             population_size="population_size",
             num_generations="generations",
             sigma="sigma",
+            combine="combine",
             seed="seed",
         ),
     )
@@ -227,7 +250,7 @@ def list_command() -> None:
     """List the bandits that ship with the library, with what they are worth."""
     table = Table("bandit", "PPO in its environment: IQM [95 %]", "found with")
     for name in zoo_names():
-        metadata = zoo_metadata(name)
+        metadata = bandit_metadata(name)
         result = metadata["results"]["PPO"]["sampled_actions"]
         interval = f"{result['value']:.1f} [{result['low']:.1f}, {result['high']:.1f}]"
         table.add_row(name, interval, metadata["command"])

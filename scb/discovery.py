@@ -1,7 +1,8 @@
 """Discover a synthetic contextual bandit: evolve one so that agents trained in it do well in a real environment.
 
-Liesen et al. (2024). The inner loop trains PPO agents in the candidate, with hyperparameters drawn from the paper's lists
-so that the bandit suits any of them; the fitness is their return in the evaluation environment.
+Liesen et al. (2024). The inner loop trains PPO agents in the candidate, with hyperparameters drawn
+from the paper's lists so that the bandit suits any of them; the fitness is their return in the
+evaluation environment.
 """
 
 from collections.abc import Mapping, Sequence
@@ -10,7 +11,6 @@ from functools import cached_property
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from gymnax.environments import environment
 
@@ -47,7 +47,8 @@ class DiscoveryConfig:
       environment: the evaluation environment's name.
       bandit: the bandit's networks and latent.
       agent: PPO's static configuration in the inner loop; None takes the paper's table.
-      sampled_hyperparameters: draw PPO's from the paper's lists for each agent, or keep the underlined ones.
+      sampled_hyperparameters: draw PPO's from the paper's lists for each agent, or keep the
+        underlined ones.
       agents_per_candidate: agents whose mean return is a candidate's fitness.
       evaluation_episodes: episodes of each agent in the evaluation environment.
       mode_actions: evaluate the most likely actions rather than sampled ones.
@@ -98,15 +99,20 @@ class BanditTraining:
         self.agent = PPO(bandit, config)
         self.env, self.env_params, self.lists = env, env_params, lists
 
+    def hyperparameters(self, key: jax.Array, number: int) -> PPOHyperparameters:
+        """[N] hyperparameters for N agents."""
+        return sample_hyperparameters(key, self.lists or {}, number)
+
     def returns(
-        self, params: BanditParams, key: jax.Array, num_episodes: int, mode: bool
+        self,
+        params: BanditParams,
+        hyperparameters: PPOHyperparameters,
+        key: jax.Array,
+        num_episodes: int,
+        mode: bool,
     ) -> jax.Array:
         """[E] returns in the evaluation environment of one agent trained in the bandit."""
-        key_draw, key_train, key_evaluate = jax.random.split(key, 3)
-        if self.lists is None:
-            hyperparameters = PPOHyperparameters()
-        else:
-            hyperparameters = sample_hyperparameters(key_draw, self.lists)
+        key_train, key_evaluate = jax.random.split(key)
         state = self.agent.train(key_train, hyperparameters, params)
         return self.agent.evaluate(
             state, key_evaluate, num_episodes, self.env, self.env_params, mode=mode
@@ -166,17 +172,22 @@ class BanditDiscovery:
     ) -> dict[str, jax.Array]:
         config = self.config
         params = BanditParams(weights=candidate)
+        key_draw, key_agents = jax.random.split(key)
+        number = config.agents_per_candidate
         returns = jax.vmap(
-            lambda k: self.training.returns(
-                params, k, config.evaluation_episodes, config.mode_actions
+            lambda h, k: self.training.returns(
+                params, h, k, config.evaluation_episodes, config.mode_actions
             ).mean()
-        )(jax.random.split(key, config.agents_per_candidate))
-        return {"fitness": returns.mean(), "median_return": jnp.median(returns)}
+        )(self.training.hyperparameters(key_draw, number), jax.random.split(key_agents, number))
+        return {"fitness": returns}
 
     def evaluate_mean(self, candidate: Weights, key: jax.Array) -> dict[str, jax.Array]:
+        key_draw, key_agent = jax.random.split(key)
+        hyperparameters = jax.tree.map(lambda x: x[0], self.training.hyperparameters(key_draw, 1))
         returns = self.training.returns(
             BanditParams(weights=candidate),
-            key,
+            hyperparameters,
+            key_agent,
             self.config.evaluation_episodes,
             self.config.mode_actions,
         )
@@ -198,8 +209,9 @@ def expert_setting(name: str, steps: int | None) -> Setting:
     config = setting.config if steps is None else replace(setting.config, total_steps=steps)
     hyperparameters = setting.hyperparameters
     if name == "Pendulum-v1":
-        # Episodes without end and a reward at every step: a short horizon learns the swing-up several times faster.
-        hyperparameters = hyperparameters.replace(discount=0.95)
+        # Episodes without end and a reward at every step: a short horizon learns the swing-up
+        # several times faster.
+        hyperparameters = replace(hyperparameters, discount=0.95)
     return replace(setting, config=config, hyperparameters=hyperparameters)
 
 
@@ -238,10 +250,17 @@ def judge(
     num_episodes: int = 50,
     mode: bool = False,
 ) -> np.ndarray:
-    """[num_agents] mean returns in the evaluation environment of agents trained in the bandit, on seeds of their own."""
+    """[num_agents] mean returns in the evaluation environment of agents trained in the bandit."""
+    key_draw, key_agents = jax.random.split(jax.random.key(seed))
     returns = map_population(
-        lambda key: training.returns(BanditParams(weights=weights), key, num_episodes, mode).mean(),
+        lambda hyperparameters, key: training.returns(
+            BanditParams(weights=weights), hyperparameters, key, num_episodes, mode
+        ).mean(),
         num_agents,
-        (0,),
+        (0, 0),
     )
-    return np.asarray(returns(jax.random.split(jax.random.key(seed), num_agents)))
+    return np.asarray(
+        returns(
+            training.hyperparameters(key_draw, num_agents), jax.random.split(key_agents, num_agents)
+        )
+    )

@@ -34,8 +34,8 @@ def evaluate(
       policy: (observation, key) -> action, for one environment.
       key: decides start states, transitions and the policy's randomness.
       num_episodes: E, static.
-      horizon: steps after which an episode is cut even if the environment would go on; traced, so a curriculum does not
-        recompile. None: the environment's own limit.
+      horizon: steps after which an episode is cut even if the environment would go on; traced, so a
+        curriculum does not recompile. None: the environment's own limit.
 
     Returns:
       Episodes of shape [E].

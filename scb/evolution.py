@@ -1,8 +1,9 @@
 """The outer loop of both discoveries: evolve a pytree of weights by what it is worth after an inner training.
 
-Bandit discovery and objective discovery differ only in what a candidate is. This module owns what they share: the
-strategy (any of evosax's by name), common random numbers across a population, what a failed candidate gets, the sign,
-sharding over devices, the evaluation of the search distribution's mean, checkpoints, resume, and logs.
+Bandit discovery and objective discovery differ only in what a candidate is. This module owns what
+they share: the strategy (any of evosax's by name), common random numbers across a population, what
+a failed candidate gets, the sign, sharding over devices, the evaluation of the search
+distribution's mean, checkpoints, resume, and logs.
 """
 
 import sys
@@ -12,6 +13,7 @@ from typing import Any, Protocol
 
 import evosax.algorithms
 import jax
+import jax.flatten_util
 import jax.numpy as jnp
 import numpy as np
 import optax
@@ -19,13 +21,15 @@ from jax.experimental import multihost_utils
 from jax.sharding import NamedSharding, PartitionSpec
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from scipy.stats import rankdata
 
 from scb.errors import UserError, unknown_name
 from scb.runs import Checkpoints, Run, Stopwatch
 
 # These take constructor arguments of their own that no common configuration can supply.
 _UNSUPPORTED = {"RandomSearch", "SV_CMA_ES", "SV_Open_ES"}
-# These estimate a gradient and hand it to an optimiser; the others' update rules set their own step.
+# These estimate a gradient and hand it to an optimiser; the others' update rules set their own
+# step.
 _GRADIENT_ESTIMATING = {
     "ARS",
     "ASEBO",
@@ -43,6 +47,9 @@ STRATEGIES: dict[str, Any] = {
 }
 
 
+COMBINATIONS = ("mean", "ranks")
+
+
 @dataclass(frozen=True)
 class EvolutionConfig:
     """The outer loop's configuration.
@@ -51,9 +58,12 @@ class EvolutionConfig:
       strategy: name of an evosax strategy; "SNES" and "Open_ES" are the usual ones.
       population_size: candidates a generation.
       num_generations: how many of them.
-      sigma, sigma_decay, sigma_limit: initial standard deviation of the search distribution; for strategies with a schedule
-        (Open_ES) it decays by that factor a generation down to the limit.
-      learning_rate, learning_rate_decay, learning_rate_limit: of Adam, for Open_ES and its relatives; SNES steps by its own rule.
+      sigma, sigma_decay, sigma_limit: initial standard deviation of the search distribution; for
+        strategies with a schedule (Open_ES) it decays by that factor a generation down to the
+        limit.
+      learning_rate, learning_rate_decay, learning_rate_limit: of Adam, for Open_ES and its
+        relatives; SNES steps by its own rule.
+      combine: "mean" or "ranks", over the tasks of a candidate; see `combine_tasks`.
       mean_evaluations: agents that judge the mean of the search distribution.
       evaluate_mean_every: generations between those judgements (and one after the last generation).
       checkpoint_every: generations between checkpoints.
@@ -69,6 +79,7 @@ class EvolutionConfig:
     learning_rate: float = 0.01
     learning_rate_decay: float = 1.0
     learning_rate_limit: float = 0.0
+    combine: str = "mean"
     mean_evaluations: int = 64
     evaluate_mean_every: int = 10
     checkpoint_every: int = 10
@@ -77,6 +88,8 @@ class EvolutionConfig:
     def __post_init__(self) -> None:
         if self.strategy not in STRATEGIES:
             raise unknown_name("evolution strategy", self.strategy, STRATEGIES)
+        if self.combine not in COMBINATIONS:
+            raise unknown_name("combination of tasks", self.combine, COMBINATIONS)
         if self.population_size < 2:
             raise UserError(
                 f"population_size is {self.population_size}: evolution compares candidates, so it needs at least 2."
@@ -121,7 +134,10 @@ class Problem(Protocol):
     def evaluate(
         self, candidate: Any, key: jax.Array, generation: jax.Array
     ) -> dict[str, jax.Array]:
-        """{"fitness": [], ...}: what a candidate is worth, to be maximised; other entries are logged."""
+        """{"fitness": [] or [K], ...}: what a candidate is worth, to be maximised.
+
+        K numbers are K tasks, combined as the configuration says; other entries are logged.
+        """
 
     def evaluate_mean(self, candidate: Any, key: jax.Array) -> dict[str, jax.Array]:
         """{"fitness": [], ...} of one agent, in the setting that the result is judged by."""
@@ -136,8 +152,8 @@ class Outcome:
 
     Attributes:
       mean: the mean of the final search distribution.
-      best_mean: the mean at that generation whose evaluation (`evaluate_mean`) was best. Chosen under noise: report it on
-        fresh seeds only.
+      best_mean: the mean at that generation whose evaluation (`evaluate_mean`) was best. Chosen
+        under noise: report it on fresh seeds only.
       best_mean_generation: which one that was.
       metrics: the run's log.
       seconds: wall-clock of all generations.
@@ -148,6 +164,25 @@ class Outcome:
     best_mean_generation: int
     metrics: list[dict[str, Any]]
     seconds: float
+
+
+def combine_tasks(fitness: np.ndarray, how: str) -> np.ndarray:
+    """One number a candidate from one number a candidate and task.
+
+    Args:
+      fitness: [N, K] of N candidates on K tasks (agents with their own hyperparameters and seeds,
+        the same for all candidates; several bandits).
+      how: "mean"; or "ranks", the mean over tasks of a candidate's rank among the candidates, so
+        that a task on which returns scatter widely counts no more than one on which they don't.
+
+    Returns:
+      [N]; NaN for a candidate that failed on any task.
+    """
+    if how == "mean":
+        return np.asarray(fitness.mean(axis=1))
+    failed = ~np.isfinite(fitness).all(axis=1)
+    ranks = rankdata(np.where(np.isfinite(fitness), fitness, -np.inf), axis=0).mean(axis=1)
+    return np.where(failed, np.nan, ranks)
 
 
 def rank_failed_last(fitness: np.ndarray) -> tuple[np.ndarray, int]:
@@ -172,9 +207,9 @@ def map_population(
 ) -> Callable[..., Any]:
     """`jit(vmap(function))` whose mapped axis is spread over all devices, with results as numpy arrays on every host.
 
-    Each device runs its part alone: no collective inside, so a device that is late holds nobody up, and a vmapped
-    `while_loop` ends when the device's own part has ended. A size that the devices don't divide is padded by repeating
-    entries, whose results are dropped.
+    Each device runs its part alone: no collective inside, so a device that is late holds nobody up,
+    and a vmapped `while_loop` ends when the device's own part has ended. A size that the devices
+    don't divide is padded by repeating entries, whose results are dropped.
 
     Args:
       function: of one population member.
@@ -231,7 +266,15 @@ class _Strategy:
                     config.learning_rate_limit,
                 )
             )
-        self._algorithm = algorithm(config.population_size, solution, **arguments)
+        try:
+            self._algorithm = algorithm(config.population_size, solution, **arguments)
+        except AssertionError as error:
+            # Antithetic pairs, groups, subspaces: what each strategy asserts about sizes.
+            weights = sum(np.size(leaf) for leaf in jax.tree.leaves(solution))
+            raise UserError(
+                f"{config.strategy} does not take a population_size of {config.population_size} for {weights} weights "
+                f"({error}): choose another size or strategy."
+            ) from error
         self._params = self._algorithm.default_params
         if hasattr(self._params, "std_init"):
             # evosax starts SNES at a standard deviation of 1; the paper's is 0.05.
@@ -246,7 +289,9 @@ class _Strategy:
         flat, unravel = jax.flatten_util.ravel_pytree(solution)
         noise = jax.random.normal(key_population, (self._size, flat.size))
         population = jax.vmap(unravel)(flat + self._sigma * noise.at[0].set(0.0))
-        unknown = jnp.full(self._size, jnp.inf)
+        # Worse than anything evaluated, but finite: strategies that standardise would make NaN of
+        # infinity.
+        unknown = jnp.full(self._size, 1e9)
         return self._algorithm.init(key_init, population, unknown, self._params)
 
     def ask(self, key: jax.Array, state: Any) -> tuple[Any, Any]:
@@ -269,14 +314,15 @@ def evolve(
 ) -> Outcome:
     """Runs, or resumes, an evolution.
 
-    Every generation is a function of (config, generation, strategy state), so a run that was killed and resumed ends with
-    the same bytes as one that was not, on the same machine, devices and versions.
+    Every generation is a function of (config, generation, strategy state), so a run that was killed
+    and resumed ends with the same bytes as one that was not, on the same machine, devices and
+    versions.
 
     Args:
       problem: what is evolved.
       config: how.
-      run: where to log and checkpoint; None keeps everything in memory. A resumed run continues after its newest
-        intact checkpoint.
+      run: where to log and checkpoint; None keeps everything in memory. A resumed run continues
+        after its newest intact checkpoint.
       quiet: no progress on the terminal.
 
     Returns:
@@ -316,7 +362,9 @@ def evolve(
 
     def judge_mean(generation: int) -> dict[str, float]:
         mean = strategy.mean(state["strategy"])
-        keys = jax.random.split(jax.random.fold_in(key_mean, generation), config.mean_evaluations)
+        # The same seeds at every judgement: means of different generations are then compared in
+        # pairs.
+        keys = jax.random.split(key_mean, config.mean_evaluations)
         outcome = {name: float(np.mean(v)) for name, v in evaluate_mean(mean, keys).items()}
         if outcome["fitness"] > float(state["best_mean_fitness"]):
             state["best_mean"] = mean
@@ -335,11 +383,16 @@ def evolve(
             ):
                 metrics |= judge_mean(generation)
             population, state["strategy"] = strategy.ask(key_ask, state["strategy"])
-            # One key for all: candidates are compared on the same seeds, hyperparameters and start states.
+            # One key for all: candidates are compared on the same seeds, hyperparameters and start
+            # states.
             results = evaluate(population, key_evaluate, jnp.int32(generation))
-            fitness, failed = rank_failed_last(np.asarray(results.pop("fitness"), np.float32))
+            tasks = np.asarray(results.pop("fitness"), np.float32).reshape(
+                config.population_size, -1
+            )
+            fitness, failed = rank_failed_last(tasks.mean(axis=1))
             if failed < len(fitness):
-                state["strategy"] = strategy.tell(key_tell, population, fitness, state["strategy"])
+                told, _ = rank_failed_last(combine_tasks(tasks, config.combine))
+                state["strategy"] = strategy.tell(key_tell, population, told, state["strategy"])
             done = (generation + 1) * config.population_size
             metrics |= {
                 "fitness/mean": fitness.mean(),

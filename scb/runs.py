@@ -1,7 +1,8 @@
 """Run folders: what a long computation writes, so that it can be watched, killed and resumed.
 
 runs/NAME/config.json       what was asked for; --resume refuses another
-runs/NAME/metrics.jsonl     one line a generation, free of clocks: a resumed run ends with the same bytes
+runs/NAME/metrics.jsonl     one line a generation, free of clocks: a resumed run ends with the same
+bytes
 runs/NAME/timing.jsonl      seconds per generation
 runs/NAME/tensorboard/      the same numbers for TensorBoard
 runs/NAME/checkpoints/      orbax
@@ -50,7 +51,8 @@ class Run:
           wandb_project: also log to this Weights & Biases project (extra `wandb`).
 
         Raises:
-          UserError: the folder can't be written, holds something already, isn't a run, or its config differs.
+          UserError: the folder can't be written, holds something already, isn't a run, or its
+            config differs.
         """
         folder = Path(folder)
         config = json.loads(json.dumps(config))
@@ -135,7 +137,7 @@ def read_config(folder: str | Path) -> dict[str, Any]:
     path = Path(folder) / "config.json"
     try:
         return dict(json.loads(path.read_text()))
-    except (OSError, ValueError) as error:
+    except (OSError, TypeError, ValueError) as error:
         raise UserError(
             f"{folder} is not a run (no readable config.json): give the folder of a run that was started with --out."
         ) from error
@@ -156,7 +158,8 @@ def settle(
 ) -> dict[str, Any]:
     """The settings of a run: the flags that were given, over the preset, over nothing.
 
-    With `resume`, the stored run's settings; a flag that says otherwise is an error, found by `Run.open`.
+    With `resume`, the stored run's settings; a flag that says otherwise is an error, found by
+    `Run.open`.
     """
     given = {name: value for name, value in flags.items() if value is not None}
     if resume is not None:
@@ -173,8 +176,8 @@ def settle(
 class Checkpoints:
     """Orbax checkpoints of a pytree of arrays, each with a digest, restored newest first.
 
-    A checkpoint that cannot be read, or whose digest does not fit (cut in half, altered), is passed over for the one
-    before it, and the caller is told.
+    A checkpoint that cannot be read, or whose digest does not fit (cut in half, altered), is passed
+    over for the one before it, and the caller is told.
     """
 
     def __init__(self, folder: Path, keep: int = 3) -> None:
@@ -202,7 +205,7 @@ class Checkpoints:
     def restore(self, template: Any) -> tuple[int, Any, list[int]] | None:
         """(step, state, steps of unreadable newer checkpoints), or None where no checkpoint can be read."""
         expected = _leaves(template)
-        damaged = []
+        damaged: list[int] = []
         for step in sorted(self._manager.all_steps(), reverse=True):
             try:
                 restored = self._manager.restore(
@@ -224,7 +227,8 @@ class Checkpoints:
         return None
 
     def _discard(self, steps: list[int]) -> None:
-        # Orbax refuses to save a step that exists, so a damaged one must make room for its repetition.
+        # Orbax refuses to save a step that exists, so a damaged one must make room for its
+        # repetition.
         for step in steps:
             shutil.rmtree(self.folder / str(step), ignore_errors=True)
         if steps:

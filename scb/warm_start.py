@@ -1,8 +1,8 @@
 """Fit a bandit to an expert before evolving it.
 
-The paper's lemma: a bandit whose reward is the expert's Q-function, on contexts that cover the expert's states, has the
-expert's policy as its optimum. Regression finds such a bandit in seconds; what it cannot know is which of them *trains*
-well, and that is what evolution is for.
+The paper's lemma: a bandit whose reward is the expert's Q-function, on contexts that cover the
+expert's states, has the expert's policy as its optimum. Regression finds such a bandit in seconds;
+what it cannot know is which of them *trains* well, and that is what evolution is for.
 """
 
 from dataclasses import dataclass
@@ -27,8 +27,9 @@ class WarmStartConfig:
     """How the expert is trained and the bandit is fitted.
 
     Attributes:
-      construction: the reward's target. "advantage": (Q(s, a) - max_a Q(s, a)) / std; "q": (Q - mean) / std;
-        "action_distance": -||a - a*|| (discrete: 1 where a = a*), a* the expert's mode action.
+      construction: the reward's target. "advantage": (Q(s, a) - max_a Q(s, a)) / std; "q": (Q -
+        mean) / std; "action_distance": -||a - a*|| (discrete: 1 where a = a*), a* the expert's mode
+        action.
       num_experts: agents trained on the environment; the best of them is the expert.
       expert_steps: environment steps of each; the environment's own setting where None.
       discount: of the Q-function.
@@ -98,9 +99,9 @@ def expert_dataset(
 ) -> tuple[ExpertDataset, int]:
     """Q-values by simulation: from a stored state take an action once, then follow the expert.
 
-    States come from trajectories that mix expert and random actions, each with its own proportion, so that they cover what
-    an agent meets on its way to becoming an expert. All actions of a state share one key: their differences are exact
-    where the environment is deterministic.
+    States come from trajectories that mix expert and random actions, each with its own proportion,
+    so that they cover what an agent meets on its way to becoming an expert. All actions of a state
+    share one key: their differences are exact where the environment is deterministic.
 
     Returns:
       (the dataset, environment steps it took).
@@ -196,11 +197,12 @@ def fit_bandit(
 ) -> tuple[Weights, dict[str, float]]:
     """Regresses the reward network, and matches the contexts' distribution to the dataset's states.
 
-    The reward by least squares; the contexts by the energy distance between generated and stored states, which is zero
-    only where the two distributions are equal.
+    The reward by least squares; the contexts by the energy distance between generated and stored
+    states, which is zero only where the two distributions are equal.
 
     Returns:
-      (weights, {"reward_r2": explained variance of the reward, "energy_distance": of the contexts}).
+      (weights, {"reward_r2": explained variance of the reward, "energy_distance": of the
+      contexts}).
     """
     key_init, key_reward, key_context = jax.random.split(key, 3)
     weights = bandit.init_weights(key_init)

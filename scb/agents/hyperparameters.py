@@ -37,13 +37,21 @@ def inner_loop_config(evaluation_environment: str) -> PPOConfig:
 
 
 def sample_hyperparameters(
-    key: jax.Array, lists: Mapping[str, Sequence[float]]
+    key: jax.Array, lists: Mapping[str, Sequence[float]], number: int
 ) -> PPOHyperparameters:
-    """One draw, uniform and independent per hyperparameter.
+    """Hyperparameters for `number` agents, uniform and independent per hyperparameter, dealt evenly.
+
+    Each agent's draw is uniform, but agents share the values out: of four agents and four learning
+    rates each has another (a Latin hypercube). A mean over few agents then depends less on who drew
+    what.
 
     Args:
-      key: decides the draw; vmap over keys for a population.
+      key: decides the draw.
       lists: {field of PPOHyperparameters: values}; fields left out keep their defaults.
+      number: N agents.
+
+    Returns:
+      PPOHyperparameters whose every leaf is [N].
     """
     known = PPOHyperparameters.__dataclass_fields__
     for name, values in lists.items():
@@ -51,12 +59,19 @@ def sample_hyperparameters(
             raise UserError(f"unknown hyperparameter {name!r}: known are {', '.join(known)}.")
         if not values:
             raise UserError(f"the list of values for {name} is empty: give at least one.")
+
+    def deal(key: jax.Array, values: Sequence[float]) -> jax.Array:
+        key_order, key_offset = jax.random.split(key)
+        order = jax.random.permutation(key_order, number)
+        offset = jax.random.randint(key_offset, (), 0, len(values))
+        return jnp.asarray(values, jnp.float32)[(order + offset) % len(values)]
+
     keys = jax.random.split(key, len(lists))
     drawn = {
-        name: jax.random.choice(k, jnp.asarray(values, jnp.float32))
-        for k, (name, values) in zip(keys, sorted(lists.items()), strict=True)
+        name: deal(k, values) for k, (name, values) in zip(keys, sorted(lists.items()), strict=True)
     }
-    return PPOHyperparameters(**drawn)
+    defaults = jax.tree.map(lambda x: jnp.full(number, x), PPOHyperparameters())
+    return defaults.replace(**drawn)
 
 
 @dataclass(frozen=True)

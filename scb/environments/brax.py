@@ -67,10 +67,10 @@ class BraxEnvironment(environment.Environment[BraxState, BraxParams]):
 
     `reset` runs brax's reset, so its start state is new for every key. Auto-reset would have to
     compute a whole reset at every step, and under `vmap` no branch avoids it; it draws from a pool
-    of start states computed once instead. Measured with
-    64 hoppers under random actions on two CPU cores, as a share of brax's bare step: 0.95 with the
-    pool and 0.79 without on the spring backend (91 000 steps/s bare), 1.00 and 0.95 on the
-    generalized one (8 400 steps/s). The size of the pool did not matter between 64 and 4096 states.
+    of start states computed once instead. Measured with 64 hoppers under random actions on two CPU
+    cores, as a share of the speed of brax's bare step: 0.95 with the pool and 0.79 with a reset in
+    every step on the spring backend, 1.00 and 0.95 on the generalized one. The size of the pool did
+    not matter between 64 and 4096 states.
 
     Args:
       name: one of `BRAX_NAMES`.

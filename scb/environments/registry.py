@@ -19,7 +19,8 @@ def make(name: str, **arguments: Any) -> tuple[environment.Environment[Any, Any]
 
     Args:
       name: "Synthetic-Pendulum-v1", "CartPole-v1", "hopper", ...
-      arguments: for the environment's constructor; Brax takes `backend="generalized" | "positional" | "spring"`.
+      arguments: for the environment's constructor; Brax takes `backend="generalized" | "positional"
+        | "spring"`.
 
     Raises:
       UserError: unknown name (with near matches), or arguments that the environment doesn't take.

@@ -1,14 +1,15 @@
 """Synthetic contextual bandits: one-step environments whose weights are evolved.
 
-Liesen et al. (2024), "Discovering Minimal Reinforcement Learning Environments". A context is a learned function of a
-latent, `obs = initial_state(latent)`; the reward is a learned function of context and action; the episode ends there.
-All weights live in the environment's parameters, so a population of bandits is `vmap` over `params` in one program.
+Liesen et al. (2024), "Discovering Minimal Reinforcement Learning Environments". A context is a
+learned function of a latent, `obs = initial_state(latent)`; the reward is a learned function of
+context and action; the episode ends there. All weights live in the environment's parameters, so a
+population of bandits is `vmap` over `params` in one program.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Literal, TypeAlias
+from typing import Any, Literal, TypeAlias, cast
 
 import distrax
 import jax
@@ -50,9 +51,9 @@ class BanditParams(environment.EnvParams):
 
     Attributes:
       weights: {"initial_state": {...}, "reward": {...}}, two Dense layers each.
-      reward_noise: standard deviation of Gaussian noise on the reward, in the reward's own units. Zero for training an
-        agent; larger than the reward's own spread for learning objectives, whose advantages must be as uncertain as a
-        real environment's.
+      reward_noise: standard deviation of Gaussian noise on the reward, in the reward's own units.
+        Zero for training an agent; larger than the reward's own spread for learning objectives,
+        whose advantages must be as uncertain as a real environment's.
       max_steps_in_episode: 1; a bandit has no second step.
     """
 
@@ -74,7 +75,7 @@ class _TwoLayers(nn.Module):
 
 @dataclass(frozen=True)
 class BanditConfig:
-    """What decides a bandit's shapes and program (the paper's Table "Hyperparameters for the synthetic environment")."""
+    """What decides a bandit's shapes and program; defaults are the paper's."""
 
     hidden_size: int = 32
     activation: str = "tanh"
@@ -96,10 +97,11 @@ class SyntheticBandit(environment.Environment[BanditState, BanditParams]):
 
     Args:
       observation_size: O, the flattened observation size of the evaluation environment.
-      action_space: the evaluation environment's action space. A discrete action enters the reward network one-hot, a
-        continuous one clipped to the bounds.
+      action_space: the evaluation environment's action space. A discrete action enters the reward
+        network one-hot, a continuous one clipped to the bounds.
       config: layer size, activation, latent distribution.
-      weights: what `default_params` holds; None for a bandit that is only ever given explicit `params`.
+      weights: what `default_params` holds; None for a bandit that is only ever given explicit
+        `params`.
       name: as registered, e.g. "Synthetic-Pendulum-v1".
     """
 
@@ -162,7 +164,8 @@ class SyntheticBandit(environment.Environment[BanditState, BanditParams]):
 
     def context(self, latent: jax.Array, params: BanditParams) -> jax.Array:
         """[L] latent -> [O] observation."""
-        return self._initial_state.apply({"params": params.weights["initial_state"]}, latent)
+        context = self._initial_state.apply({"params": params.weights["initial_state"]}, latent)
+        return cast(jax.Array, context)
 
     def mean_reward(self, context: jax.Array, action: ArrayLike, params: BanditParams) -> jax.Array:
         """[O] context, action -> [] reward without noise: the bandit's Q-function."""
@@ -172,7 +175,8 @@ class SyntheticBandit(environment.Environment[BanditState, BanditParams]):
             clipped = jnp.clip(jnp.asarray(action), self._action_space.low, self._action_space.high)
             encoded = jnp.reshape(clipped, (self._action_size,))
         inputs = jnp.concatenate([context, encoded])
-        return self._reward.apply({"params": params.weights["reward"]}, inputs)[0]
+        reward = self._reward.apply({"params": params.weights["reward"]}, inputs)
+        return cast(jax.Array, reward)[0]
 
     def reset_env(self, key: jax.Array, params: BanditParams) -> tuple[jax.Array, BanditState]:
         latent = LATENTS[self.config.latent](key, self.latent_size)
@@ -191,7 +195,8 @@ class SyntheticBandit(environment.Environment[BanditState, BanditParams]):
         return state.time >= 1
 
     def is_truncated(self, state: BanditState, params: BanditParams) -> jax.Array:
-        # The one step ends the episode by itself; calling it truncated too would invite bootstrapping.
+        # The one step ends the episode by itself; calling it truncated too would invite
+        # bootstrapping.
         return jnp.bool_(False)
 
     def action_space(self, params: BanditParams | None = None) -> spaces.Box | spaces.Discrete:

@@ -1,7 +1,7 @@
 """Bandits as files, and the ones that ship with the library.
 
-A bandit is NAME.npz (its weights) with NAME.json (its shapes, how it was found, what it is worth). Those in `scb/zoo` are
-registered with gymnax when `scb` is imported, and read when one is made.
+A bandit is NAME.npz (its weights) with NAME.json (its shapes, how it was found, what it is worth).
+Those in `scb/zoo` are registered with gymnax when `scb` is imported, and read when one is made.
 """
 
 from collections.abc import Mapping
@@ -42,8 +42,10 @@ def _make_zoo_bandit(name: str) -> SyntheticBandit:
         return load_bandit(folder / f"{name}.npz")
 
 
-def zoo_metadata(name: str) -> Mapping[str, Any]:
-    """What a zoo bandit's .json says: config, seeds, results, cost."""
+def bandit_metadata(name: str) -> Mapping[str, Any]:
+    """What the .json of a bandit (a zoo name, or path.npz) says: config, seeds, results, cost."""
+    if name.endswith(".npz"):
+        return artefacts.load(name, KIND).metadata
     with resources.as_file(resources.files("scb") / "zoo") as folder:
         return artefacts.load(folder / f"{name}.npz", KIND).metadata
 
@@ -60,11 +62,12 @@ def load_bandit(path: str | Path) -> SyntheticBandit:
             weights=jax.tree.map(jnp.asarray, dict(artefact.arrays)),
             name=artefact.name,
         )
+        shapes = bandit.weight_shapes()
     except (KeyError, TypeError) as error:
         raise UserError(
-            f"{path} does not describe a bandit: its .json lacks or garbles config entry {error}."
+            f"{path} does not describe a bandit: its .json lacks or garbles a config entry ({error})."
         ) from error
-    artefacts.expect_shapes(artefact, bandit.weight_shapes())
+    artefacts.expect_shapes(artefact, shapes)
     return bandit
 
 

@@ -115,7 +115,9 @@ def test_actions_are_clipped_to_the_actuators_bounds(env):
     _, state = env.reset(jax.random.key(0), env.default_params)
 
     def after(action: float) -> np.ndarray:
-        return env.step(jax.random.key(1), state, jnp.full(1, action), env.default_params)[0]
+        return env.step(
+            jax.random.key(1), state, jnp.array([action], jnp.float32), env.default_params
+        )[0]
 
     np.testing.assert_array_equal(after(5.0), after(1.0))
     np.testing.assert_array_equal(after(-7.0), after(-1.0))
@@ -371,10 +373,11 @@ def test_wrong_arguments_are_refused(arguments, message):
 
 @pytest.fixture(scope="module")
 def fresh_process(tmp_path_factory) -> tuple[list[str], list[str]]:
-    """What a new process prints, and the files it leaves, when it imports us and makes a cheetah."""
+    """What a new process that makes a cheetah prints, and the files that it leaves."""
     code = (
-        "import sys; from scb.environments.brax import BraxEnvironment; print('brax' in sys.modules);"
-        "BraxEnvironment('halfcheetah', 'spring'); print('brax' in sys.modules)"
+        "import sys; from scb.environments.brax import BraxEnvironment;"
+        "print('brax' in sys.modules); BraxEnvironment('halfcheetah', 'spring');"
+        "print('brax' in sys.modules)"
     )
     folder = tmp_path_factory.mktemp("folder")
     completed = subprocess.run(

@@ -1,0 +1,143 @@
+"""A certificate must tell a drift from what only looks like one."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+from lpo.certificate import Certificate, certify
+from lpo.drift import ClipDrift, DPODrift, Drift, LearnedDrift, NoDrift
+
+GRID = {"num_ratios": 61, "num_advantages": 11}
+
+
+@dataclass(frozen=True)
+class Formula:
+    """A drift by formula: (log ratio, advantage, progress) -> penalty."""
+
+    formula: Callable[[jax.Array, jax.Array, jax.Array], jax.Array]
+
+    def init(self, key: jax.Array) -> Any:
+        return ()
+
+    def __call__(self, parameters, log_ratio, advantage, progress):
+        return self.formula(log_ratio, advantage, progress)
+
+
+def certificate(formula: Callable[..., jax.Array]) -> Certificate:
+    return certify(Formula(formula), (), **GRID)
+
+
+def quadratic(x, a, p):
+    """(r - 1)^2."""
+    return jnp.expm1(x) ** 2
+
+
+@pytest.mark.parametrize("scale", [1.0, 100.0])
+@pytest.mark.parametrize("base", ["ppo", "none"])
+def test_a_learned_drift_is_a_drift_whatever_its_weights(base, scale):
+    drift = LearnedDrift(base=base, hidden_size=4)
+    parameters = jax.tree.map(lambda x: scale * x, drift.init(jax.random.key(1)))
+    found = certify(drift, parameters, **GRID)
+    assert found.holds
+    assert found.slope_at_0_01 > 0.0  # these weights charge something
+
+
+@pytest.mark.parametrize("drift", [ClipDrift(), DPODrift(), NoDrift()])
+def test_closed_forms_are_drifts(drift: Drift):
+    found = certify(drift, drift.init(jax.random.key(0)), **GRID)
+    assert found.holds
+    assert str(found).startswith("is a drift: min f 0, at ratio 1 |f| 0 and |df/dr| 0")
+
+
+def test_a_bias_is_no_drift():
+    found = certificate(lambda x, a, p: quadratic(x, a, p) + 0.25)
+    assert not found.holds
+    assert found.value_at_one == 0.25
+    assert found.minimum == 0.25  # reached at r = 1, which is on the grid
+    assert found.gradient_at_one == 0.0
+    assert str(found).startswith("is NOT a drift: min f 0.25")
+
+
+def test_a_linear_term_is_no_drift():
+    # f = r - 1 for r >= 1, else 0: non-negative and zero at 1, but it leaves 1 with slope 1.
+    found = certificate(lambda x, a, p: jnp.where(x >= 0, jnp.expm1(x), 0.0))
+    assert not found.holds
+    assert (found.minimum, found.value_at_one) == (0.0, 0.0)
+    assert found.gradient_at_one == 1.0
+
+
+def test_a_drift_that_pays_somewhere_is_none():
+    # (r - 1)^2 (1 - (r - 1) / 10) is negative beyond r = 11, at log r = 2.4 of a grid to 3.
+    found = certificate(lambda x, a, p: quadratic(x, a, p) * (1.0 - 0.1 * jnp.expm1(x)))
+    assert not found.holds
+    assert found.minimum < 0.0
+    assert (found.value_at_one, found.gradient_at_one, found.finite) == (0.0, 0.0, True)
+
+
+@pytest.mark.parametrize("bad", [jnp.nan, jnp.inf])
+def test_a_drift_that_is_not_finite_far_out_is_none(bad):
+    # Far out is log r in (15, 20], where a policy can get that moved far in one batch.
+    found = certificate(lambda x, a, p: jnp.where(x > 15.0, bad, quadratic(x, a, p)))
+    assert not found.holds
+    assert not found.finite
+    assert (found.minimum, found.value_at_one, found.gradient_at_one) == (0.0, 0.0, 0.0)
+
+
+def test_a_bias_of_one_advantage_only_is_found():
+    found = certificate(lambda x, a, p: jnp.where(a >= 10.0, 0.5, 0.0) * jnp.ones_like(x))
+    assert not found.holds
+    assert found.value_at_one == 0.5
+
+
+def test_a_bias_late_in_training_is_found():
+    found = certificate(lambda x, a, p: jnp.where(p == 1.0, 0.5, 0.0) * jnp.ones_like(x))
+    assert not found.holds
+    assert found.value_at_one == 0.5
+
+
+def test_a_gradient_that_is_not_a_number_late_in_training_is_found():
+    # sqrt(x^2) has no derivative at 0: autodiff multiplies infinity by zero.
+    def formula(x, a, p):
+        return jax.lax.cond(p[0] > 0.0, lambda x: jnp.sqrt(x**2), jnp.zeros_like, x)
+
+    found = certificate(formula)
+    assert not found.holds
+    assert found.gradient_at_one != found.gradient_at_one
+
+
+@pytest.mark.parametrize(
+    ("formula", "near", "further"),
+    [
+        # (r - 1)^2 has slope 2 |r - 1|.
+        (quadratic, 0.002, 0.02),
+        # relu(|log r| - 0.005): flat at 0.001; slope 1 / r outside, at most 1 / 0.99 = 1.0101.
+        (lambda x, a, p: jax.nn.relu(jnp.abs(x) - 0.005), 0.0, 1.0101),
+        # |A| (r - 1)^2 with advantages up to 10 is ten times the first.
+        (lambda x, a, p: jnp.abs(a) * quadratic(x, a, p), 0.02, 0.2),
+        # |r - 1| has a kink at 1 where autodiff says 0: its slope beside 1 tells.
+        (lambda x, a, p: jnp.abs(jnp.expm1(x)), 1.0, 1.0),
+    ],
+)
+def test_slopes_beside_ratio_one_are_those_of_the_formula(formula, near, further):
+    found = certificate(formula)
+    assert found.slope_at_0_001 == pytest.approx(near, rel=1e-3)
+    assert found.slope_at_0_01 == pytest.approx(further, rel=1e-3)
+
+
+def test_slope_of_a_clip_between_the_two_points():
+    # Clip 0.005 charges from |r - 1| = 0.005 on, with slope |A|, which is at most 10.
+    found = certify(ClipDrift(), jnp.float32(0.005), **GRID)
+    assert (found.slope_at_0_001, found.slope_at_0_01) == (0.0, 10.0)
+
+
+def test_a_certificate_says_on_which_grid():
+    # 61 log-ratios in [-3, 3] and 61 // 4 = 15 in [-20, 20], which share 0: 75.
+    found = certificate(quadratic)
+    expected = "75 log-ratios in [-20, 20] x 11 advantages in [-10, 10] x 3 training fractions"
+    assert found.grid == expected
+    assert found.as_dict()["grid"] == expected
+    assert Certificate(**found.as_dict()) == found

@@ -1,0 +1,525 @@
+"""The command line: a mistake costs one sentence and exit code 2, and never a file that was there."""
+
+import json
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from gymnax.environments import spaces
+
+import lpo
+from lpo import cli, commands
+from lpo.drift import NoDrift
+from lpo.generalization import LearningCurves
+from lpo.objectives import Objective, load_objective
+from scb.environments.synthetic import BanditConfig, SyntheticBandit
+from scb.environments.zoo import save_bandit
+from scb.errors import UserError
+
+PROGRAMS = {"lpo": cli.main, "scb": cli.scb_main}
+
+
+@pytest.fixture(autouse=True)
+def working_folder(tmp_path, monkeypatch, bandit_name) -> Path:
+    """Where default outputs such as runs/quick would go."""
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def files(folder: Path) -> dict[str, bytes]:
+    paths = (path for path in sorted(folder.rglob("*")) if path.is_file())
+    return {str(path.relative_to(folder)): path.read_bytes() for path in paths}
+
+
+@pytest.fixture
+def refused(capsys, working_folder, one_sentence):
+    """Runs a command that must fail as a user's mistake does, and returns its sentence."""
+
+    def run(*arguments: object, program: str = "lpo") -> str:
+        before = files(working_folder)
+        assert PROGRAMS[program]([str(a) for a in arguments]) == 2
+        output, error = capsys.readouterr()
+        assert output == ""
+        assert error.startswith(f"{program}: ") and error.endswith("\n")
+        assert files(working_folder) == before
+        return one_sentence(error.removesuffix("\n"))
+
+    return run
+
+
+# -- mistakes -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("train --environment Pendulm-v1", "unknown environment 'Pendulm-v1': did you mean Pend"),
+        ("evaluate --environment hoper", "unknown environment 'hoper': did you mean hopper"),
+        ("meta-train --environment Synthetic-Pendulm-v1", "did you mean Synthetic-Pendulum-v1"),
+        ("train --objective dop", "unknown objective 'dop': did you mean dpo?"),
+        ("evaluate --objectives ppo dop", "unknown objective 'dop': did you mean dpo?"),
+        ("certify --objective dop", "unknown objective 'dop': did you mean dpo?"),
+        ("run --objective dop", "unknown objective 'dop': did you mean dpo?"),
+        ("meta-train --strategy Open_SE", "unknown evolution strategy 'Open_SE': did you mean Op"),
+        ("run --preset quik", "unknown preset 'quik': did you mean quick"),
+        ("meta-train --preset papre", "unknown preset 'papre': did you mean paper"),
+        ("meta-train --fitness retrun", "unknown fitness 'retrun': did you mean return"),
+        ("meta-train --base pop", "unknown drift base 'pop': did you mean ppo"),
+    ],
+)
+def test_an_unknown_name_is_answered_by_near_ones(refused, arguments, message):
+    assert message in refused(*arguments.split())
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("meta-train --population-size 1", "population_size is 1"),
+        ("meta-train --population-size 3", "Open_ES samples antithetic pairs, so it must be even"),
+        ("meta-train --generations 0", "num_generations is 0: it must be at least 1"),
+        ("meta-train --generations -2", "num_generations is -2: it must be at least 1"),
+        ("meta-train --agents-per-candidate 0", "agents_per_candidate is 0"),
+        ("meta-train --contexts 0", "contexts is 0"),
+        ("meta-train --evaluation-episodes 0", "evaluation_episodes is 0"),
+        ("meta-train --sigma 0", "sigma is 0.0: it must be positive"),
+        ("meta-train --learning-rate -1", "learning_rate is -1.0: it must be positive"),
+        (
+            "meta-train --reward-noise nan",
+            "reward_noise is nan: it must be 0 or larger, and finite",
+        ),
+        ("meta-train --seed -1", "seed is -1: it must be 0 or larger"),
+        ("run --seed -1", "seed is -1: it must be 0 or larger"),
+        # 10 000 + 1000 x 5 000 000 has more than 32 bits.
+        ("run --seed 5000000", "a seed is 5000010000: each must be 0 or larger, and below 2^32"),
+        ("train --steps 0", "steps is 0: it must be at least 1"),
+        ("train --steps -100", "steps is -100: it must be at least 1"),
+        ("evaluate --steps -100", "steps is -100: it must be at least 1"),
+        ("train --seeds 0", "seeds is 0: give at least 1"),
+        ("evaluate --seeds -1", "seeds is -1: give at least 1"),
+        ("train --seed -1", "seed is -1: it must be 0 or larger"),
+        ("train --seed 4294967296", "a seed is 4294967296"),
+    ],
+)
+def test_a_number_out_of_range_is_told_its_range(refused, arguments, message):
+    assert message in refused(*arguments.split())
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("train --backend spring", "'Pendulum-v1' does not take {'backend': 'spring'}"),
+        ("meta-train --environment Pendulum-v1 --fitness transfer", "asks for a bandit"),
+        ("evaluate --objectives", "no objectives: give at least one"),
+        ("evaluate --objectives ppo ppo", "objective 'ppo' is there twice"),
+        ("run --objective ppo", "objective 'ppo' is there twice"),
+        ("certify --objective missing.npz", "missing.npz does not exist"),
+    ],
+)
+def test_what_does_not_go_together_is_refused(refused, arguments, message):
+    assert message in refused(*arguments.split())
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("train --bandit Synthetic-Pendulm-v1", "unknown bandit 'Synthetic-Pendulm-v1'"),
+        ("train --agents 0", "agents is 0: give at least 1"),
+        ("discover --init expret", "unknown initialisation 'expret': did you mean expert"),
+        ("discover --population-size 1", "population_size is 1"),
+        ("discover --preset quik", "unknown preset 'quik': did you mean quick"),
+    ],
+)
+def test_the_other_program_refuses_alike(refused, arguments, message):
+    assert message in refused(*arguments.split(), program="scb")
+
+
+# -- artefacts that do not fit ------------------------------------------------------------------
+
+
+@pytest.fixture
+def cartpole_bandit(working_folder) -> Path:
+    bandit = SyntheticBandit(4, spaces.Discrete(2), BanditConfig(hidden_size=2))
+    metadata = {"config": {}, "seeds": {}, "results": {}, "cost": {}, "command": "a test"}
+    weights = bandit.init_weights(jax.random.key(0))
+    return save_bandit(working_folder / "Synthetic-CartPole-v1.npz", bandit, weights, metadata)
+
+
+def test_a_bandit_of_another_environment_is_refused(refused, cartpole_bandit):
+    message = refused(
+        *("train", "--bandit", cartpole_bandit, "--evaluation-environment", "Pendulum-v1"),
+        program="scb",
+    )
+    assert "has 4 observations and 2 discrete actions, Pendulum-v1 has 3 obs" in message
+
+
+def test_bandits_and_objectives_do_not_stand_in_for_each_other(
+    refused, cartpole_bandit, objective_file
+):
+    assert "is a bandit: give a drift here" in refused("train", "--objective", cartpole_bandit)
+    message = refused("train", "--bandit", objective_file, program="scb")
+    assert "is a drift: give a bandit here" in message
+
+
+@pytest.mark.parametrize("command", ["certify", "train", "run"])
+def test_weights_of_another_shape_are_refused(refused, working_folder, objective_file, command):
+    path = working_folder / "other.npz"
+    path.write_bytes(objective_file.read_bytes())
+    metadata = json.loads(objective_file.with_suffix(".json").read_text())
+    metadata["config"]["drift"]["hidden_size"] = 8
+    path.with_suffix(".json").write_text(json.dumps(metadata))
+    message = refused(command, "--objective", path)
+    assert "has shape (8, 4) where (8, 8) is expected" in message
+
+
+# -- folders ------------------------------------------------------------------------------------
+
+WRITING = {
+    "run": ["run", "--objective", "none"],
+    "meta-train": ["meta-train"],
+    "train": ["train"],
+    "evaluate": ["evaluate"],
+}
+
+
+@pytest.fixture(autouse=True)
+def no_training(monkeypatch):
+    """No mistake may get as far as training; the test that trains undoes this."""
+
+    def refuse(*arguments, **named):
+        raise AssertionError("this must fail before any training")
+
+    monkeypatch.setattr(commands, "evolve", refuse)
+    monkeypatch.setattr(commands, "run_pipeline", refuse)
+    monkeypatch.setattr("lpo.generalization.PPO", refuse)
+
+
+@pytest.mark.parametrize("command", WRITING)
+def test_a_folder_that_holds_something_is_left_alone(refused, working_folder, command):
+    (working_folder / "mine").mkdir()
+    (working_folder / "mine" / "comparison.json").write_text("precious")
+    message = refused(*WRITING[command], "--out", "mine")
+    assert "mine already exists and is not empty: choose another --out" in message
+
+
+@pytest.mark.parametrize("command", WRITING)
+def test_a_folder_that_cannot_be_made_is_told_before_training(refused, working_folder, command):
+    (working_folder / "file").write_text("precious")
+    message = refused(*WRITING[command], "--out", "file/inside")
+    assert "cannot write to file/inside (Not a directory): choose an --out folder" in message
+
+
+@pytest.mark.parametrize("command", ["train", "evaluate"])
+def test_a_folder_without_permission_is_told_before_training(refused, monkeypatch, command):
+    # By a stand-in for the system's answer, since an administrator may write anywhere.
+    monkeypatch.setattr(os, "access", lambda path, mode: False)
+    assert "cannot write to mine: choose an --out folder" in refused(command, "--out", "mine")
+
+
+@pytest.mark.parametrize("command", ["run", "meta-train"])
+@pytest.mark.parametrize("config", [None, "not json", "[1, 2]", '"text"'])
+def test_only_a_run_can_be_resumed(refused, working_folder, command, config):
+    (working_folder / "other").mkdir()
+    if config is not None:
+        (working_folder / "other" / "config.json").write_text(config)
+    assert "other is not a run (no readable config.json)" in refused(command, "--resume", "other")
+
+
+@pytest.mark.parametrize("command", ["run", "meta-train"])
+def test_a_folder_that_is_not_there_cannot_be_resumed(refused, command):
+    assert "nowhere is not a run" in refused(command, "--resume", "nowhere")
+
+
+@pytest.fixture
+def interrupted(working_folder, monkeypatch, capsys) -> Path:
+    """A meta-training that was interrupted at once."""
+
+    def interrupt(*arguments):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(commands, "evolve", interrupt)
+    arguments = ["--population-size", "4", "--reward-noise", "2", "--out", "started"]
+    assert cli.main(["meta-train", *arguments]) == 130
+    error = capsys.readouterr().err
+    assert error == "lpo: interrupted; a run with checkpoints continues with --resume.\n"
+    return working_folder / "started"
+
+
+@pytest.mark.parametrize(
+    ("flags", "difference"),
+    [
+        (["--population-size", "6"], "population_size (4 there, 6 now)"),
+        (["--reward-noise", "0"], "reward_noise (2.0 there, 0.0 now)"),
+        (["--seed", "5"], "seed (None there, 5 now)"),
+        (["--preset", "paper"], "preset ('quick' there, 'paper' now)"),
+    ],
+)
+def test_a_resumed_run_keeps_its_settings(refused, interrupted, flags, difference):
+    message = refused("meta-train", "--resume", interrupted, *flags)
+    assert f"its config differs at {difference}" in message
+
+
+def test_a_run_of_another_command_is_not_resumed(refused, interrupted):
+    message = refused("run", "--resume", interrupted)
+    assert "its config differs at command ('meta-train' there, 'run' now)" in message
+
+
+def test_a_resumed_run_takes_the_stored_settings(interrupted, monkeypatch):
+    seen = []
+
+    def record(problem, config, run):
+        seen.append((config.population_size, problem.config.reward_noise, run.resumed))
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(commands, "evolve", record)
+    assert cli.main(["meta-train", "--resume", str(interrupted)]) == 130
+    # The same flags again are no contradiction.
+    repeated = ["--population-size", "4", "--resume", str(interrupted)]
+    assert cli.main(["meta-train", *repeated]) == 130
+    assert seen == [(4, 2.0, True)] * 2
+
+
+# -- what tyro parses ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        "",
+        "tarin",
+        "train --environmnet Pendulum-v1",
+        "train --steps many",
+        "train --seeds 1.5",
+        "certify",
+    ],
+)
+def test_what_cannot_be_parsed_is_a_mistake_too(arguments, capsys):
+    with pytest.raises(SystemExit) as stop:
+        cli.main(arguments.split())
+    assert stop.value.code == 2
+    output = capsys.readouterr()
+    assert "Traceback" not in output.err and output.err != ""
+
+
+@pytest.mark.parametrize(
+    ("program", "arguments", "mentioned"),
+    [
+        ("lpo", "", ["run", "meta-train", "train", "evaluate", "certify"]),
+        ("lpo", "run", ["--preset", "--seed", "--out", "--resume", "--objective"]),
+        (
+            "lpo",
+            "meta-train",
+            ["--environment", "--fitness", "--reward-noise", "--strategy", "--population-size"],
+        ),
+        ("lpo", "train", ["--environment", "--objective", "--steps", "--seeds", "--out"]),
+        ("lpo", "evaluate", ["--environment", "--objectives", "--seeds", "--backend"]),
+        ("lpo", "certify", ["--objective"]),
+        ("scb", "", ["discover", "train", "list"]),
+        ("scb", "discover", ["--environment", "--init", "--strategy", "--resume"]),
+        ("scb", "train", ["--bandit", "--evaluation-environment", "--agents"]),
+        ("scb", "list", ["--help"]),
+    ],
+)
+def test_help_names_the_flags(program, arguments, mentioned, capsys):
+    with pytest.raises(SystemExit) as stop:
+        PROGRAMS[program]([*arguments.split(), "--help"])
+    assert stop.value.code == 0
+    text = capsys.readouterr().out
+    assert f"usage: {program} {arguments}".rstrip() in text
+    for name in mentioned:
+        assert name in text
+
+
+def test_a_process_exits_with_two_and_shows_no_traceback(working_folder):
+    root = str(Path(lpo.__file__).parents[1])
+    finished = subprocess.run(
+        [sys.executable, "-m", "lpo.cli", "train", "--environment", "Pendulm-v1"],
+        capture_output=True,
+        text=True,
+        check=False,
+        env={**os.environ, "PYTHONPATH": root},
+        cwd=working_folder,
+    )
+    assert finished.returncode == 2
+    assert finished.stdout == ""
+    assert finished.stderr.startswith("lpo: unknown environment 'Pendulm-v1': did you mean ")
+    assert finished.stderr.count("\n") == 1
+
+
+def test_importing_the_packages_does_not_import_jax(working_folder):
+    # The command line has to set the number of devices before anything starts JAX.
+    root = str(Path(lpo.__file__).parents[1])
+    code = "import sys, lpo, lpo.cli; sys.exit('jax' in sys.modules)"
+    environment = {**os.environ, "PYTHONPATH": root}
+    finished = subprocess.run([sys.executable, "-c", code], env=environment, cwd=working_folder)
+    assert finished.returncode == 0
+
+
+def test_every_public_name_is_there():
+    for name in lpo.__all__:
+        assert getattr(lpo, name).__name__ == name
+    with pytest.raises(AttributeError, match="module 'lpo' has no attribute 'Drfit'"):
+        _ = lpo.Drfit
+
+
+def test_a_bug_is_not_dressed_up_as_a_mistake(monkeypatch):
+    def broken(name):
+        raise ValueError("a bug")
+
+    monkeypatch.setattr(commands, "load_objective", broken)
+    with pytest.raises(ValueError, match="a bug") as error:
+        cli.main(["certify", "--objective", "ppo"])
+    assert not isinstance(error.value, UserError)
+
+
+# -- what works ---------------------------------------------------------------------------------
+
+
+def test_certify_says_what_it_found(capsys):
+    assert cli.main(["certify", "--objective", "ppo-0.3"]) == 0
+    assert capsys.readouterr().out.startswith("ppo-0.3 is a drift: min f 0,")
+
+
+def test_certify_exits_with_one_where_the_conditions_fail(monkeypatch, capsys):
+    class Bias(NoDrift):
+        def __call__(self, parameters, log_ratio, advantage, progress):
+            return jnp.ones_like(log_ratio)
+
+    monkeypatch.setattr(commands, "load_objective", lambda name: Objective(name, Bias(), ()))
+    with pytest.raises(SystemExit) as stop:
+        cli.main(["certify", "--objective", "mine"])
+    assert stop.value.code == 1
+    assert capsys.readouterr().out.startswith("mine is NOT a drift: min f 1, at ratio 1 |f| 1")
+
+
+def measured(environment, objective, seeds, mode_actions=True, **_) -> LearningCurves:
+    """Curves as a training would measure them: the return ends at -100 times the name's length."""
+    end = -100.0 * len(objective.name)
+    returns = np.tile([-1500.0, end], (len(seeds), 1))
+    steps = np.array([0, 1000])
+    return LearningCurves(
+        environment, None, objective.name, steps, returns, list(seeds), 20, mode_actions
+    )
+
+
+@pytest.fixture
+def trained(monkeypatch) -> None:
+    monkeypatch.setattr("lpo.generalization.learning_curves", measured)
+    monkeypatch.setattr(commands, "learning_curves", measured)
+
+
+def test_train_prints_the_curve_and_stores_it(trained, working_folder, capsys):
+    arguments = ["--objective", "ppo", "--seeds", "2", "--seed", "5", "--sampled-actions"]
+    assert cli.main(["train", *arguments, "--out", "results"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].strip() == "0 steps: return -1500.0"
+    assert lines[1].strip() == "1000 steps: return -300.0"
+    assert lines[2] == "final return, IQM: -300.0 [-300.0, -300.0] (n=2)"
+    (curve,) = json.loads((working_folder / "results" / "comparison.json").read_text())["curves"]
+    assert curve["returns"] == [[-1500.0, -300.0]] * 2
+    assert (curve["seeds"], curve["mode_actions"]) == ([5, 6], False)
+    assert (working_folder / "results" / "curves.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_evaluate_compares_with_the_first_objective(trained, working_folder, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "200")
+    assert cli.main(["evaluate", "--objectives", "dpo", "none", "--seeds", "4", "--out", "o"]) == 0
+    table = capsys.readouterr().out
+    assert "difference to dpo" in table
+    # "none" has four letters and "dpo" three: -400 - -300 = -100.
+    row = next(line for line in table.splitlines() if " none " in line)
+    assert "-400.0 [-400.0, -400.0] (n=4)" in row
+    assert "-100.0 [-100.0, -100.0] (n=4)" in row
+    stored = json.loads((working_folder / "o" / "comparison.json").read_text())
+    assert stored["reference"] == "dpo"
+    assert stored["paired_differences"]["none"]["value"] == -100.0
+    assert [c["seeds"] for c in stored["curves"]] == [[1000, 1001, 1002, 1003]] * 2
+
+
+def test_files_of_one_name_are_told_apart_by_what_was_typed(
+    trained, working_folder, objective_file, capsys
+):
+    # Every `lpo meta-train` writes an objective.npz.
+    for folder in ("a", "bb"):
+        (working_folder / folder).mkdir()
+        for path in (objective_file, objective_file.with_suffix(".json")):
+            (working_folder / folder / path.name).write_bytes(path.read_bytes())
+    names = ["a/tiny.npz", "bb/tiny.npz"]
+    assert cli.main(["evaluate", "--objectives", "ppo", *names, "--out", "o"]) == 0
+    stored = json.loads((working_folder / "o" / "comparison.json").read_text())
+    # -1000 - -300 and -1100 - -300.
+    differences = {k: v["value"] for k, v in stored["paired_differences"].items()}
+    assert differences == {"a/tiny.npz": -700.0, "bb/tiny.npz": -800.0}
+
+
+def test_meta_train_writes_an_objective_that_loads(
+    monkeypatch, working_folder, tiny_agent, tiny_drift, capsys
+):
+    from scb.evolution import evolve
+
+    configured = commands.meta_training_config
+
+    def small(settings):
+        config = configured(settings)
+        evolution = replace(config.evolution, mean_evaluations=2)
+        return replace(config, agent=tiny_agent, drift=tiny_drift, evolution=evolution)
+
+    monkeypatch.setattr(commands, "meta_training_config", small)
+    monkeypatch.setattr(commands, "evolve", evolve)
+    flags = {
+        "population-size": 2,
+        "generations": 2,
+        "agents-per-candidate": 1,
+        "evaluation-episodes": 2,
+        "seed": 4,
+        "out": "learned",
+    }
+    arguments = [f"--{name}={value}" for name, value in flags.items()]
+    assert cli.main(["meta-train", *arguments]) == 0
+    output = capsys.readouterr().out
+    assert "it is a drift: min f 0" in " ".join(output.split())
+
+    objective = load_objective(working_folder / "learned" / "objective.npz")
+    assert objective.drift == tiny_drift
+    settings = objective.metadata["config"]["settings"]
+    assert (settings["preset"], settings["population_size"], settings["seed"]) == ("quick", 2, 4)
+    assert objective.metadata["config"]["meta_training"]["fitness"] == "transfer"
+    # 2 generations x 2 candidates x 1 agent x 3 batches of 8 contexts; 2 episodes of 200 steps.
+    assert objective.metadata["cost"]["environment_steps_training"] == 96
+    assert objective.metadata["cost"]["environment_steps_evaluation"] == 1600
+    figure = working_folder / "learned" / "figures" / "meta_training.png"
+    assert figure.read_bytes().startswith(b"\x89PNG")
+
+
+def test_flags_of_meta_train_reach_the_configuration():
+    flags = {
+        "environment": "Pendulum-v1",
+        "reward_noise": 1.5,
+        "base": "none",
+        "strategy": "SNES",
+        "population_size": 6,
+        "generations": 7,
+        "agents_per_candidate": 3,
+        "sigma": 0.2,
+        "learning_rate": 0.3,
+        "contexts": 40,
+        "evaluation_episodes": 8,
+        "backend": "spring",
+        "seed": 9,
+    }
+    config = commands.meta_training_config(flags)
+    evolution = config.evolution
+    # An environment that is no bandit has nothing to transfer to.
+    assert (config.environment, config.fitness) == ("Pendulum-v1", "return")
+    assert (config.reward_noise, config.drift.base, config.contexts) == (1.5, "none", 40)
+    assert (config.agents_per_candidate, config.evaluation_episodes) == (3, 8)
+    assert (config.backend, evolution.strategy, evolution.seed) == ("spring", "SNES", 9)
+    assert (evolution.population_size, evolution.num_generations) == (6, 7)
+    assert (evolution.sigma, evolution.learning_rate) == (0.2, 0.3)
+    # And what is left out keeps its default.
+    assert commands.meta_training_config({}).fitness == "transfer"

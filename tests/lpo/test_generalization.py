@@ -1,0 +1,213 @@
+"""Comparing objectives: the same seeds for all, and numbers that can be redone by hand."""
+
+import json
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lpo.generalization import (
+    Comparison,
+    LearningCurves,
+    compare,
+    evaluation_interval,
+    learning_curves,
+    training_setting,
+)
+from lpo.objectives import Objective, load_objective
+from scb.agents.hyperparameters import Setting
+from scb.agents.ppo import PPOHyperparameters
+from scb.errors import UserError
+
+SEEDS = (7, 8, 9)
+
+
+def curves(objective: str = "ppo", returns=((0.0, 2.0, 4.0), (1.0, 1.0, 7.0))) -> LearningCurves:
+    """Two seeds, evaluated before, half way through, and at the end of 20 steps."""
+    returns = np.asarray(returns)
+    seeds = list(range(len(returns)))
+    return LearningCurves(
+        "Pendulum-v1", None, objective, np.array([0, 10, 20]), returns, seeds, 5, True
+    )
+
+
+# -- by hand ------------------------------------------------------------------------------------
+
+
+def test_final_is_the_last_evaluation_and_area_the_mean_without_the_untrained_agent():
+    # (2 + 4) / 2 = 3 and (1 + 7) / 2 = 4; what was there before training counts in neither.
+    np.testing.assert_array_equal(curves().final, [4.0, 7.0])
+    np.testing.assert_array_equal(curves().area, [3.0, 4.0])
+
+
+def test_a_difference_is_positive_where_the_objective_is_better_than_the_reference():
+    reference = curves("ppo", [[0, 0, -5.0]] * 4)
+    better, worse = curves("dpo", [[0, 0, -3.0]] * 4), curves("none", [[0, 0, -9.0]] * 4)
+    differences = Comparison([reference, better, worse]).differences()
+    assert differences.keys() == {"dpo", "none"}
+    # -3 - -5 = 2 and -9 - -5 = -4; equal seeds leave the interval no width.
+    assert (differences["dpo"].value, differences["dpo"].low, differences["dpo"].high) == (2, 2, 2)
+    assert differences["none"].value == -4
+
+
+def test_a_table_has_a_row_for_each_objective_and_no_difference_for_the_reference():
+    comparison = Comparison([curves("ppo"), curves("dpo", [[0, 4, 6], [1, 3, 9]])])
+    first, second = comparison.table()
+    assert (first["objective"], first["difference"]) == ("ppo", None)
+    # Of two seeds the interquartile mean drops none: (4 + 7) / 2 and (3 + 4) / 2.
+    assert (first["final"].value, first["area"].value) == (5.5, 3.5)
+    # (6 + 9) / 2 - 5.5 = 2; (4 + 6) / 2 = 5 and (3 + 9) / 2 = 6 are 5.5 in the mean.
+    assert second["objective"] == "dpo"
+    assert (second["difference"].value, second["area"].value) == (2.0, 5.5)
+
+
+def test_dictionaries_are_json_and_hold_what_was_measured():
+    comparison = Comparison([curves("ppo"), curves("dpo")])
+    content = comparison.as_dict()
+    assert json.loads(json.dumps(content, allow_nan=False)) == content
+    assert content["reference"] == "ppo"
+    assert content["paired_differences"]["dpo"]["value"] == 0.0
+    curve = content["curves"][0]
+    assert curve["returns"] == [[0.0, 2.0, 4.0], [1.0, 1.0, 7.0]]
+    assert (curve["steps"], curve["seeds"], curve["episodes"]) == ([0, 10, 20], [0, 1], 5)
+    assert (curve["final_iqm"]["value"], curve["area_iqm"]["value"]) == (5.5, 3.5)
+
+
+@given(
+    num_iterations=st.integers(1, 500),
+    points=st.integers(1, 50),
+)
+def test_evaluation_interval_divides_the_training(num_iterations, points):
+    every = evaluation_interval(num_iterations, points)
+    assert 1 <= every <= num_iterations
+    assert num_iterations % every == 0
+
+
+@pytest.mark.parametrize(
+    ("num_iterations", "points", "every"),
+    [
+        (15, 15, 1),
+        # 150 / 10 = 15 evaluations.
+        (150, 15, 10),
+        # 16 gives 16, 8, 4, 2 or 1 evaluations; 16 is nearest to 15.
+        (16, 15, 1),
+        # 7 gives 7 or 1; 1 is nearer to 3.
+        (7, 3, 7),
+    ],
+)
+def test_evaluation_interval_gives_about_as_many_points_as_asked(num_iterations, points, every):
+    assert evaluation_interval(num_iterations, points) == every
+
+
+def test_training_setting_is_the_environments_own_but_for_the_steps():
+    own = training_setting("Pendulum-v1")
+    shorter = training_setting("Pendulum-v1", 20_000)
+    assert own.config.total_steps == 150_000
+    assert shorter.config == replace(own.config, total_steps=20_000)
+    assert shorter.hyperparameters is not None
+    assert shorter.hyperparameters == own.hyperparameters
+
+
+# -- trained ------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def arguments(bandit_name, tiny_agent):
+    # Seven batches of eight contexts.
+    setting = Setting(
+        replace(tiny_agent, total_steps=56), PPOHyperparameters(learning_rate=0.03), "a test"
+    )
+    return {"environment": bandit_name, "seeds": SEEDS, "setting": setting, "points": 3}
+
+
+@pytest.fixture(scope="module")
+def objectives(objective_file, tiny_drift):
+    weights = tiny_drift.init(jax.random.key(0))
+    zero = {**weights, "output": jnp.zeros_like(weights["output"])}
+    names = ("ppo", "dpo", "none", objective_file)
+    return [*map(load_objective, names), Objective("zero", tiny_drift, zero)]
+
+
+@pytest.fixture(scope="module")
+def trained(arguments, objectives):
+    comparison = compare(objectives=objectives, **arguments)
+    return {c.objective: c for c in comparison.curves}
+
+
+def test_every_member_of_the_contract_trains_inside_ppo(trained):
+    assert list(trained) == ["ppo", "dpo", "none", "tiny", "zero"]
+    for name, curve in trained.items():
+        assert np.all(np.isfinite(curve.returns))
+        # The agent has learned something: its return is another than before.
+        assert np.all(curve.returns[:, 1] != curve.returns[:, 0]), name
+
+
+def test_objectives_start_from_the_same_agents_and_lead_elsewhere(trained):
+    # Paired seeds: the same networks and evaluation contexts, so the same return before training.
+    for name in ("dpo", "none", "tiny"):
+        np.testing.assert_array_equal(trained[name].returns[:, 0], trained["ppo"].returns[:, 0])
+        assert np.all(np.any(trained[name].returns != trained["ppo"].returns, axis=1))
+
+
+def test_training_with_zero_output_weights_is_training_with_ppos_clip(trained):
+    # The two drifts differ by xi = 1e-6 at most.
+    zero, ppo = trained["zero"].returns, trained["ppo"].returns
+    np.testing.assert_allclose(zero, ppo, atol=1e-3)
+
+
+def test_seeds_differ_from_each_other(trained):
+    assert len(set(trained["ppo"].returns[:, 1])) == len(SEEDS)
+
+
+def test_the_same_seeds_and_objective_give_the_same_curves(trained, arguments, objectives):
+    again = learning_curves(objective=objectives[0], **arguments)
+    np.testing.assert_array_equal(again.returns, trained["ppo"].returns)
+
+
+def test_training_is_rounded_up_to_a_multiple_of_the_points(trained, bandit_name):
+    # 7 batches of 8 have no divisor near 3 points: 9 batches are trained, 3 for each point.
+    curve = trained["ppo"]
+    assert curve.steps.tolist() == [0, 24, 48, 72]
+    assert curve.returns.shape == (len(SEEDS), 4)
+    assert (curve.environment, curve.backend) == (bandit_name, None)
+    assert (curve.seeds, curve.episodes, curve.mode_actions) == (list(SEEDS), 20, True)
+
+
+# -- bad input ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"seeds": []}, "no seeds: give at least one."),
+        ({"seeds": [0, -1]}, "a seed is -1: each must be 0 or larger, and below 2^32."),
+        ({"seeds": [2**32]}, "a seed is 4294967296"),
+        ({"points": 0}, "points is 0: it must be at least 1."),
+        ({"episodes": 0}, "episodes is 0: it must be at least 1."),
+        ({"environment": "CartPoel-v1"}, "unknown environment 'CartPoel-v1': did you mean CartPo"),
+        ({"environment": "Pendulum-v1", "backend": "spring"}, "does not take {'backend'"),
+    ],
+)
+def test_what_cannot_be_trained_is_refused(arguments, changes, message, one_sentence):
+    with pytest.raises(UserError) as error:
+        learning_curves(objective=load_objective("ppo"), **{**arguments, **changes})
+    assert message in one_sentence(str(error.value))
+
+
+@pytest.mark.parametrize("steps", [0, -5])
+def test_no_steps_are_refused(steps, one_sentence):
+    with pytest.raises(UserError) as error:
+        training_setting("Pendulum-v1", steps)
+    assert one_sentence(str(error.value)) == f"steps is {steps}: it must be at least 1."
+
+
+def test_two_objectives_of_one_name_are_refused(arguments, one_sentence):
+    # Their results are told apart by name.
+    pair = [load_objective("ppo"), replace(load_objective("dpo"), name="ppo")]
+    with pytest.raises(UserError) as error:
+        compare(objectives=pair, **arguments)
+    assert "objective 'ppo' is there twice" in one_sentence(str(error.value))

@@ -1,0 +1,287 @@
+"""Learning an objective: what a candidate is worth, what it costs, and where the noise goes."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from gymnax.environments import spaces
+
+from lpo import meta_training
+from lpo.drift import LearnedDrift
+from lpo.meta_training import MetaTraining, MetaTrainingConfig, inner_loop, meta_train
+from scb.agents.ppo import PPOConfig
+from scb.environments.synthetic import BanditConfig, SyntheticBandit
+from scb.errors import UserError
+from scb.evolution import EvolutionConfig
+
+EVOLUTION = EvolutionConfig(
+    strategy="Open_ES", population_size=2, num_generations=2, mean_evaluations=2, seed=1
+)
+
+
+@pytest.fixture(scope="module")
+def config(bandit_name, tiny_agent, tiny_drift) -> MetaTrainingConfig:
+    return MetaTrainingConfig(
+        environment=bandit_name,
+        drift=tiny_drift,
+        fitness="return",
+        agent=tiny_agent,
+        agents_per_candidate=1,
+        evaluation_episodes=2,
+        evolution=EVOLUTION,
+    )
+
+
+def bandit(reward_factor: float = 1.0) -> SyntheticBandit:
+    """A bandit of Pendulum's shapes, its rewards `reward_factor` times those of the plain one."""
+    shape = SyntheticBandit(3, spaces.Box(-2.0, 2.0, (1,), jnp.float32), BanditConfig(4))
+    weights = shape.init_weights(jax.random.key(0))
+    last = weights["reward"]["Dense_1"]
+    weights["reward"]["Dense_1"] = jax.tree.map(lambda x: reward_factor * x, last)
+    return SyntheticBandit(3, shape.action_space(), shape.config, weights)
+
+
+# -- it learns ----------------------------------------------------------------------------------
+
+
+def check_run(config: MetaTrainingConfig) -> list[float]:
+    """Meta-trains; checks the log and that the mean has moved; returns every fitness."""
+    outcome = meta_train(config, quiet=True)
+    start = config.drift.init(jax.random.key(0))
+    assert jax.tree.map(np.shape, outcome.mean) == jax.tree.map(np.shape, start)
+    assert [line["generation"] for line in outcome.metrics] == [0, 1]
+    assert [line["failed"] for line in outcome.metrics] == [0, 0]
+    names = ("fitness/mean", "fitness/max", "mean/fitness", "final_mean/fitness")
+    values = [line[name] for line in outcome.metrics for name in names if name in line]
+    # Two generations' mean and maximum, the mean's at the start and at the end.
+    assert len(values) == 6
+    assert np.all(np.isfinite(values))
+    # evolve splits its seed in four and draws the start from the first.
+    key_start = jax.random.split(jax.random.key(config.evolution.seed), 4)[0]
+    initial = MetaTraining(config).initial_solution(key_start)
+    for name, weights in outcome.mean.items():
+        assert np.all(np.isfinite(weights))
+        assert np.any(weights != np.asarray(initial[name]))
+    return [float(value) for value in values]
+
+
+# A step of Pendulum costs at most pi^2 + 0.1 * 8^2 + 0.001 * 2^2 = 16.3, and it takes 200.
+WORST_PENDULUM_RETURN = -16.3 * 200
+
+
+@pytest.mark.parametrize("fitness", ["return", "area"])
+def test_fitness_in_the_bandit_is_the_reward_of_one_step(config, fitness):
+    values = check_run(replace(config, fitness=fitness))
+    assert np.abs(values).max() < 100
+
+
+def test_fitness_transfer_is_the_return_in_the_evaluation_environment(config):
+    values = check_run(replace(config, fitness="transfer"))
+    # 24 contexts make no swing-up.
+    assert WORST_PENDULUM_RETURN < min(values) <= max(values) < -100
+
+
+def test_the_same_code_trains_on_the_environment_itself(config):
+    # Two epochs: at the first update of a batch the ratio is 1, where all drifts are alike and all
+    # candidates tie.
+    agent = PPOConfig(
+        num_envs=2, num_steps=10, num_epochs=2, num_minibatches=1, total_steps=20, hidden_sizes=(4,)
+    )
+    values = check_run(replace(config, environment="Pendulum-v1", agent=agent))
+    assert WORST_PENDULUM_RETURN < min(values) <= max(values) < -100
+
+
+def test_area_is_the_mean_over_the_training_without_the_untrained_agent(config):
+    class Recorded:
+        def train_with_evaluations(self, *arguments, every):
+            return None, jnp.array([100.0, 1.0, 2.0, 6.0])
+
+    problem = MetaTraining(replace(config, fitness="area", reward_noise=0.0))
+    problem.agent = Recorded()
+    # (1 + 2 + 6) / 3 = 3, and 27.25 with the untrained agent's 100.
+    assert float(problem.train_one({}, jax.random.key(0))) == 3.0
+
+
+# -- where it starts ----------------------------------------------------------------------------
+
+
+def test_the_search_starts_near_the_base_but_not_at_zero(config):
+    key = jax.random.key(4)
+    start = MetaTraining(replace(config, reward_noise=0.0)).initial_solution(key)
+    plain = config.drift.init(key)
+    np.testing.assert_array_equal(start["hidden"], plain["hidden"])
+    np.testing.assert_allclose(start["output"], 0.1 * plain["output"], rtol=1e-6)
+    assert np.all(np.asarray(start["output"]) != 0.0)
+
+
+def test_the_inner_loop_on_a_bandit_keeps_the_number_of_updates():
+    # Pendulum's setting has 100 environments x 100 steps a batch and 150 000 steps: 15 batches.
+    # With 200 contexts a batch, 15 batches are 3000 transitions, fifty times fewer.
+    there, here = inner_loop("Pendulum-v1", 200), inner_loop("Synthetic-Pendulum-v1", 200)
+    assert (there.num_iterations, there.batch_size) == (15, 10_000)
+    assert (here.num_iterations, here.batch_size) == (15, 200)
+    for name in ("num_epochs", "num_minibatches", "hidden_sizes", "activation"):
+        assert getattr(here, name) == getattr(there, name)
+
+
+def test_hyperparameters_are_the_environments_own_and_the_papers_on_a_bandit(config):
+    on_bandit = MetaTraining(replace(config, reward_noise=0.0)).base_hyperparameters
+    on_pendulum = MetaTraining(replace(config, environment="Pendulum-v1")).base_hyperparameters
+    assert (on_bandit.discount, on_pendulum.discount) == (0.99, 0.995)
+
+
+# -- what it costs ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("changes", "training", "evaluation"),
+    [
+        # 3 agents x 3 batches of 8 = 72; 3 agents x 5 episodes x 200 steps of Pendulum = 3000.
+        ({"fitness": "transfer"}, 72, 3000),
+        # In the bandit an episode is one step: 3 x 5 x 1.
+        ({"fitness": "return"}, 72, 15),
+        # 3 batches, evaluated before the first and after each: 3 x 4 points x 5.
+        ({"fitness": "area"}, 72, 60),
+        ({"environment": "Pendulum-v1", "fitness": "return"}, 72, 3000),
+        ({"environment": "Pendulum-v1", "fitness": "area"}, 72, 12_000),
+        # Pendulum's image on the bandit: 3 agents x 15 batches of 50.
+        ({"fitness": "return", "agent": None, "contexts": 50}, 2250, 15),
+        # A fifth of 15 batches is 3, which divides them: 5 points and the start, 3 x 6 x 5.
+        ({"fitness": "area", "agent": None, "contexts": 50}, 2250, 90),
+    ],
+)
+def test_steps_of_a_candidate(config, changes, training, evaluation):
+    changes = {"agents_per_candidate": 3, "evaluation_episodes": 5, "reward_noise": 0.0, **changes}
+    steps = MetaTraining(replace(config, **changes)).steps()
+    assert (steps.training, steps.evaluation) == (training, evaluation)
+    assert steps.total == training + evaluation
+
+
+def test_area_of_a_training_with_a_prime_number_of_batches_has_equal_distances(config):
+    # A fifth of 13 is 2, which does not divide it; 1 does: 13 points and the start.
+    agent = replace(config.agent, total_steps=13 * 8)
+    problem = MetaTraining(replace(config, fitness="area", agent=agent, reward_noise=0.0))
+    assert problem.steps().evaluation == 14 * 2
+
+
+# -- reward noise -------------------------------------------------------------------------------
+
+
+def test_reward_noise_is_given_in_the_bandits_own_standard_deviations(config, monkeypatch):
+    plain = bandit()
+    rng = np.random.default_rng(0)
+    contexts = jax.vmap(plain.reset_env, (0, None))(
+        jax.random.split(jax.random.key(9), 4000), plain.default_params
+    )[0]
+    actions = jnp.asarray(rng.uniform(-2.0, 2.0, (4000, 1)), jnp.float32)
+    rewards = jax.vmap(plain.mean_reward, (0, 0, None))(contexts, actions, plain.default_params)
+
+    noise = {}
+    for factor in (1.0, 3.0):
+        scaled = bandit(factor)
+        monkeypatch.setattr(
+            meta_training, "make", lambda name, b=scaled, **_: (b, b.default_params)
+        )
+        problem = MetaTraining(replace(config, reward_noise=5.0))
+        noise[factor] = float(problem.training_params.reward_noise)
+        assert problem.evaluation_params.reward_noise == 0.0
+    # 4000 samples know a standard deviation to about 1 / sqrt(2 * 4000) = 1 %.
+    assert noise[1.0] == pytest.approx(5.0 * float(jnp.std(rewards)), rel=0.06)
+    assert noise[3.0] == pytest.approx(3.0 * noise[1.0], rel=1e-5)
+
+
+def test_reward_noise_enters_training_and_not_evaluation(config):
+    # Half of the agents draw the learning rate 0 and stay as they were initialised: were noise in
+    # the evaluation, none of them would be worth the same as without. The other half learns, and
+    # learns something else under noise.
+    keys = jax.random.split(jax.random.key(0), 16)
+    start = config.drift.init(jax.random.key(1))
+    with_noise, without = (
+        jax.jit(jax.vmap(MetaTraining(c).train_one, (None, 0)))(start, keys)
+        for c in (
+            replace(config, learning_rates=(0.0, 0.1), reward_noise=noise) for noise in (5.0, 0.0)
+        )
+    )
+    equal = np.asarray(with_noise == without)
+    assert 2 < equal.sum() < 14
+
+
+def test_environments_take_no_reward_noise(config):
+    problem = MetaTraining(replace(config, environment="Pendulum-v1", reward_noise=5.0))
+    assert problem.training_params is problem.env_params
+
+
+# -- where it trains ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("environment", "fitness", "made"),
+    [
+        # A bandit has no physics: the backend is for the environment that it stands for.
+        ("Synthetic-hopper", "transfer", [("Synthetic-hopper", {}), ("hopper", {"backend": "x"})]),
+        ("hopper", "return", [("hopper", {"backend": "x"})]),
+    ],
+)
+def test_physics_go_to_the_environment_and_not_to_its_bandit(
+    config, monkeypatch, environment, fitness, made
+):
+    calls = []
+
+    def record(name, **arguments):
+        calls.append((name, arguments))
+        return bandit(), bandit().default_params
+
+    monkeypatch.setattr(meta_training, "make", record)
+    MetaTraining(replace(config, environment=environment, fitness=fitness, backend="x"))
+    assert calls == made
+
+
+# -- bad input ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"fitness": "retrun"}, "unknown fitness 'retrun': did you mean return"),
+        (
+            {"environment": "Pendulum-v1"},
+            "fitness 'transfer' asks for a bandit, and 'Pendulum-v1' is none: use 'return' or "
+            "'area', or train on 'Synthetic-Pendulum-v1'.",
+        ),
+        ({"agents_per_candidate": 0}, "agents_per_candidate is 0: it must be at least 1."),
+        ({"evaluation_episodes": -1}, "evaluation_episodes is -1: it must be at least 1."),
+        ({"contexts": 0}, "contexts is 0: it must be at least 1."),
+        ({"learning_rates": ()}, "learning_rates is empty: give at least one value."),
+        ({"entropy_coefficients": ()}, "entropy_coefficients is empty: give at least one value."),
+        ({"reward_noise": -0.1}, "reward_noise is -0.1: it must be 0 or larger, and finite."),
+        ({"reward_noise": float("nan")}, "reward_noise is nan"),
+        ({"reward_noise": float("inf")}, "reward_noise is inf"),
+    ],
+)
+def test_a_configuration_that_cannot_be_is_refused(arguments, message, one_sentence):
+    with pytest.raises(UserError) as error:
+        MetaTrainingConfig(**arguments)
+    assert message in one_sentence(str(error.value))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"environment": "Synthetic-Pendulm-v1"}, "did you mean Synthetic-Pendulum-v1"),
+        ({"environment": "Pendulum-v1", "backend": "spring"}, "does not take {'backend': 'spring'"),
+    ],
+)
+def test_an_environment_that_cannot_be_is_refused(config, changes, message, one_sentence):
+    with pytest.raises(UserError) as error:
+        MetaTraining(replace(config, **changes))
+    assert message in one_sentence(str(error.value))
+
+
+def test_defaults_are_a_bandit_with_noise_judged_by_transfer():
+    # What the library recommends: README and the shipped objective rest on it.
+    default = MetaTrainingConfig()
+    assert (default.environment, default.fitness) == ("Synthetic-Pendulum-v1", "transfer")
+    assert (default.reward_noise, default.drift) == (5.0, LearnedDrift(base="ppo"))
+    assert default.evolution.strategy == "Open_ES"

@@ -1,0 +1,243 @@
+"""Objectives by name and file: what loads is what was saved; anything else is refused, and why."""
+
+import hashlib
+import json
+import shutil
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from gymnax.environments import spaces
+
+from lpo.certificate import certify
+from lpo.drift import FEATURES, ClipDrift, DPODrift, LearnedDrift, NoDrift
+from lpo.objectives import load_objective, objective_names, save_objective, zoo_names
+from scb.environments.synthetic import BanditConfig, SyntheticBandit
+from scb.environments.zoo import save_bandit
+from scb.errors import UserError
+
+METADATA = {"config": {}, "seeds": {}, "results": {}, "cost": {}, "command": "a test"}
+
+
+@pytest.fixture
+def file(tmp_path: Path, objective_file: Path) -> Path:
+    """A copy of the learned objective, to be damaged."""
+    for path in (objective_file, objective_file.with_suffix(".json")):
+        shutil.copy(path, tmp_path)
+    return tmp_path / objective_file.name
+
+
+def refusal(path: Path) -> str:
+    with pytest.raises(UserError) as error:
+        load_objective(path)
+    return str(error.value)
+
+
+def edit(path: Path, change) -> None:
+    """Changes a copy of the metadata in place, or replaces it by what `change` returns."""
+    json_path = path.with_suffix(".json")
+    metadata = json.loads(json_path.read_text())
+    change(metadata)
+    json_path.write_text(json.dumps(metadata))
+
+
+def sign(path: Path) -> None:
+    """Makes the checksum fit again, as one would who tampers with both files."""
+    edit(path, lambda m: m.update(sha256=hashlib.sha256(path.read_bytes()).hexdigest()))
+
+
+# -- names --------------------------------------------------------------------------------------
+
+
+def test_closed_forms_load_by_name():
+    assert load_objective("ppo").drift == ClipDrift(0.2)
+    assert load_objective("ppo-0.3").drift == ClipDrift(0.3)
+    assert float(load_objective("ppo-0.3").parameters) == pytest.approx(0.3)
+    assert load_objective("dpo").drift == DPODrift(alpha=2.0, beta=0.6)
+    assert load_objective("none").drift == NoDrift()
+
+
+@pytest.mark.parametrize("name", ["ppo", "ppo-0.3", "dpo", "none"])
+def test_an_objective_bears_the_name_that_it_was_loaded_by(name):
+    assert load_objective(name).name == name
+
+
+def test_every_listed_name_loads():
+    for name in objective_names():
+        assert load_objective(name).name == name
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("dop", "unknown objective 'dop': did you mean dpo?"),
+        ("PPO", "unknown objective 'PPO': did you mean ppo"),
+        ("nothing-like-it", "unknown objective 'nothing-like-it': known are dpo, "),
+        ("ppo-0", "the clip epsilon is 0.0: it must be positive."),
+    ],
+)
+def test_an_unknown_name_is_told_what_is_known(name, message, one_sentence):
+    assert message in one_sentence(refusal(Path(name)))
+
+
+# -- files --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("base", ["ppo", "none"])
+def test_a_saved_objective_charges_the_same_bit_for_bit(tmp_path, base):
+    drift = LearnedDrift(base=base, hidden_size=3, clip=0.1, xi=1e-4)
+    parameters = drift.init(jax.random.key(5))
+    path, certificate = save_objective(tmp_path / "mine.npz", drift, parameters, METADATA)
+    loaded = load_objective(path)
+    assert (loaded.name, loaded.drift) == ("mine", drift)
+    assert loaded.metadata["certificate"] == certificate.as_dict()
+    assert certificate.holds
+
+    log_ratio = jnp.linspace(-2.0, 2.0, 101)
+    arguments = (log_ratio, jnp.cos(7.0 * log_ratio), jnp.zeros(101))
+    np.testing.assert_array_equal(
+        loaded.drift(loaded.parameters, *arguments), drift(parameters, *arguments)
+    )
+
+
+def test_metadata_of_the_meta_training_is_kept(tmp_path, tiny_drift):
+    given = {**METADATA, "config": {"meta_training": {"fitness": "transfer"}}, "seeds": {"a": 7}}
+    parameters = tiny_drift.init(jax.random.key(0))
+    path, _ = save_objective(tmp_path / "mine.npz", tiny_drift, parameters, given)
+    metadata = load_objective(path).metadata
+    assert metadata["config"]["meta_training"] == {"fitness": "transfer"}
+    assert metadata["config"]["drift"]["features"] == list(FEATURES)
+    assert metadata["seeds"] == {"a": 7}
+    assert given["config"].keys() == {"meta_training"}  # the caller's own is left as it was
+
+
+def test_a_bandit_is_no_objective(tmp_path, one_sentence):
+    bandit = SyntheticBandit(2, spaces.Discrete(2), BanditConfig(hidden_size=2))
+    weights = bandit.init_weights(jax.random.key(0))
+    path = save_bandit(tmp_path / "bandit.npz", bandit, weights, METADATA)
+    assert "is a bandit: give a drift here." in one_sentence(refusal(path))
+
+
+def test_a_changed_weight_is_noticed(file, one_sentence):
+    data = bytearray(file.read_bytes())
+    data[len(data) // 2] ^= 1
+    file.write_bytes(data)
+    assert "SHA-256 differs" in one_sentence(refusal(file))
+
+
+@pytest.mark.parametrize("signed", [False, True])
+def test_a_file_cut_in_half_is_refused(file, signed, one_sentence):
+    data = file.read_bytes()
+    file.write_bytes(data[: len(data) // 2])
+    if signed:
+        sign(file)
+    expected = "not a usable .npz" if signed else "SHA-256 differs"
+    assert expected in one_sentence(refusal(file))
+
+
+class Trap:
+    """Unpickling this would call `print`, as another pickle would call `os.system`."""
+
+    def __reduce__(self):
+        return print, ("the pickle ran",)
+
+
+def test_a_pickle_is_refused_and_never_run(file, one_sentence, capsys):
+    np.savez(file, hidden=np.array([Trap()], dtype=object), output=np.zeros((4, 1)))
+    sign(file)
+    assert "not a usable .npz" in one_sentence(refusal(file))
+    assert "the pickle ran" not in capsys.readouterr().out
+
+
+def test_weights_that_are_not_numbers_are_refused(file, one_sentence):
+    np.savez(file, hidden=np.full((8, 4), np.nan), output=np.zeros((4, 1)))
+    sign(file)
+    assert "'hidden' has 32 NaN or infinite among its 32" in one_sentence(refusal(file))
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".json"])
+def test_one_file_without_the_other_is_refused(file, suffix, one_sentence):
+    file.with_suffix(suffix).unlink()
+    assert f"tiny{suffix} does not exist" in one_sentence(refusal(file))
+
+
+def test_other_features_are_refused(file, one_sentence):
+    # The same eight in another order, as other code has them, would load and charge something else.
+    def swap(metadata):
+        metadata["config"]["drift"]["features"] = [*FEATURES[1::-1], *FEATURES[2:]]
+
+    edit(file, swap)
+    assert "was learned on other features ((1-r)^2, 1-r, log r," in one_sentence(refusal(file))
+
+
+@pytest.mark.parametrize("entry", ["base", "hidden_size", "clip", "xi", "features"])
+def test_a_missing_config_entry_is_named(file, entry, one_sentence):
+    edit(file, lambda m: m["config"]["drift"].pop(entry))
+    assert f"its .json lacks config entry '{entry}'." in one_sentence(refusal(file))
+
+
+def test_a_missing_config_is_named(file, one_sentence):
+    edit(file, lambda m: m["config"].pop("drift"))
+    assert "its .json lacks config entry 'drift'." in one_sentence(refusal(file))
+
+
+@pytest.mark.parametrize(
+    ("entry", "value", "message"),
+    [
+        ("hidden_size", "four", "its .json garbles config entry 'drift'"),
+        ("clip", "0.2", "its .json garbles config entry 'drift'"),
+        ("xi", None, "its .json garbles config entry 'drift'"),
+        ("features", 8, "its .json garbles config entry 'drift'"),
+        ("base", "ppo3", "unknown drift base 'ppo3'"),
+        ("hidden_size", 0, "hidden_size is 0: it must be at least 1."),
+    ],
+)
+def test_a_garbled_config_entry_is_refused(file, entry, value, message, one_sentence):
+    edit(file, lambda m: m["config"]["drift"].update({entry: value}))
+    assert message in one_sentence(refusal(file))
+
+
+def test_a_config_that_is_no_mapping_is_refused(file, one_sentence):
+    edit(file, lambda m: m["config"].update(drift="ppo"))
+    assert "garbles config entry 'drift'" in one_sentence(refusal(file))
+
+
+def test_weights_of_another_size_than_the_config_says_are_refused(file, one_sentence):
+    edit(file, lambda m: m["config"]["drift"].update(hidden_size=5))
+    message = one_sentence(refusal(file))
+    assert "array 'hidden' of drift 'tiny' has shape (8, 4) where (8, 5) is expected" in message
+
+
+def test_weights_of_another_network_are_refused(file, one_sentence):
+    np.savez(file, hidden=np.ones((8, 4)), out=np.ones((4, 1)))
+    sign(file)
+    assert "has no array 'output'" in one_sentence(refusal(file))
+
+
+# -- the zoo ------------------------------------------------------------------------------------
+
+
+def test_the_objective_learned_for_pendulum_ships():
+    assert "lpo-pendulum" in zoo_names()
+
+
+@pytest.mark.parametrize("name", zoo_names())
+def test_an_objective_of_the_zoo_is_the_drift_that_its_certificate_says(name):
+    objective = load_objective(name)
+    stored = dict(objective.metadata["certificate"])
+    fresh = certify(objective.drift, objective.parameters).as_dict()
+    assert stored["holds"] is True
+    # Slopes are sums of products, which another machine may round otherwise; the rest is exact.
+    for slope in ("slope_at_0_001", "slope_at_0_01"):
+        assert stored.pop(slope) == pytest.approx(fresh.pop(slope), rel=1e-4)
+    assert stored == fresh
+
+
+@pytest.mark.parametrize("name", zoo_names())
+def test_an_objective_of_the_zoo_says_how_it_was_made(name):
+    metadata = load_objective(name).metadata
+    assert metadata["command"]
+    assert metadata["cost"]["environment_steps_training"] > 0
+    assert metadata["results"]

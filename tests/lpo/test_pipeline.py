@@ -1,0 +1,225 @@
+"""`lpo run` from nothing to its report, at the smallest size that has every part."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lpo import cli, pipeline
+from lpo.objectives import load_objective
+from scb.agents.hyperparameters import Setting
+from scb.agents.ppo import PPOConfig, PPOHyperparameters
+
+
+@pytest.fixture(scope="module", autouse=True)
+def small(bandit_name, tiny_agent, tiny_drift):
+    """The preset "tiny" with smaller networks, fewer contexts and steps than any preset has."""
+    on_bandit, on_environment = pipeline.pipeline_config, pipeline.training_setting
+
+    def config(settings):
+        default = on_bandit(settings)
+        return replace(
+            default,
+            agent=tiny_agent,
+            drift=tiny_drift,
+            evaluation_episodes=2,
+            evolution=replace(default.evolution, population_size=2, mean_evaluations=2),
+        )
+
+    def setting(environment, total_steps):
+        on_environment(environment, total_steps)
+        agent = PPOConfig(
+            num_envs=2,
+            num_steps=8,
+            num_epochs=2,
+            num_minibatches=1,
+            total_steps=32,
+            hidden_sizes=(4,),
+        )
+        return Setting(agent, PPOHyperparameters(), "a test")
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(pipeline, "pipeline_config", config)
+        patch.setattr(pipeline, "training_setting", setting)
+        yield
+
+
+@pytest.fixture(scope="module")
+def folder(small, tmp_path_factory) -> Path:
+    """A finished run. Tests may resume it, and leave it as it was but for clocks."""
+    out = tmp_path_factory.mktemp("runs") / "tiny"
+    assert cli.main(["run", "--preset", "tiny", "--seed", "3", "--out", str(out)]) == 0
+    return out
+
+
+def contents(folder: Path) -> dict[str, tuple[bytes, int]]:
+    """{file: (its bytes, when it was written)}."""
+    files = (path for path in sorted(folder.rglob("*")) if path.is_file())
+    return {str(p.relative_to(folder)): (p.read_bytes(), p.stat().st_mtime_ns) for p in files}
+
+
+def results(folder: Path) -> dict:
+    return json.loads((folder / "results.json").read_text())
+
+
+CURVES = [f"curves/Pendulum-v1_{name}.json" for name in ("ppo", "dpo", "lpo")]
+LAST_STAGE = [
+    "figures/Pendulum-v1.png",
+    "figures/drift_heatmaps.png",
+    "figures/environment_steps.png",
+    "figures/meta_training.png",
+    "report.html",
+    "results.json",
+]
+
+
+def test_a_run_leaves_what_each_stage_made(folder):
+    made = {
+        name for name in contents(folder) if not name.startswith(("checkpoints", "tensorboard"))
+    }
+    evolution = ["config.json", "metrics.jsonl", "timing.jsonl", "lpo.json", "lpo.npz"]
+    assert made == {*evolution, *CURVES, *LAST_STAGE}
+
+
+def test_results_are_the_stored_curves(folder):
+    comparison = results(folder)["comparisons"]["Pendulum-v1"]
+    stored = [json.loads((folder / name).read_text()) for name in CURVES]
+    assert comparison["curves"] == stored
+    assert comparison["reference"] == "ppo"
+    for curve in stored:
+        # Preset tiny judges two seeds, from 10 000 + 1000 x seed on; 2 batches of 2 x 8 steps, each
+        # evaluated.
+        assert curve["seeds"] == [13_000, 13_001]
+        assert curve["steps"] == [0, 16, 32]
+        # Of two seeds the interquartile mean drops none.
+        assert curve["final_iqm"]["value"] == pytest.approx(np.mean(curve["returns"], axis=0)[-1])
+    ppo, _, lpo = (curve["final_iqm"]["value"] for curve in stored)
+    difference = comparison["paired_differences"]["lpo"]
+    assert difference["value"] == pytest.approx(lpo - ppo)
+    assert difference["n"] == 2
+
+
+def test_results_count_the_steps_of_the_meta_training(folder):
+    meta = results(folder)["meta_training"]
+    # 2 generations of 2 candidates, of one agent each: 3 batches of 8 contexts, then 2 episodes of
+    # 200 steps.
+    assert meta["steps"] == {"training": 96, "evaluation": 1600, "total": 1696}
+    # The same on Pendulum trains each agent for its 150 000 steps.
+    assert meta["environment_steps"]["training"] == 600_000
+    assert meta["environment_steps"]["evaluation"] == 1600
+    assert (meta["environment"], meta["fitness"]) == ("Synthetic-Pendulum-v1", "transfer")
+    assert meta["generations"] == 2
+
+
+def test_the_learned_objective_is_stored_with_its_certificate(folder):
+    objective = load_objective(folder / "lpo.npz")
+    stored = results(folder)["objective"]
+    assert stored == {"name": "lpo", "certificate": objective.metadata["certificate"]}
+    assert stored["certificate"]["holds"] is True
+    assert objective.metadata["cost"]["environment_steps_training"] == 96
+    # The mean before the first generation and after the last is judged.
+    judged = objective.metadata["results"]["mean_fitness"]
+    assert [line["generation"] for line in judged] == [0, 1]
+
+
+def test_the_report_shows_every_figure_in_its_place(folder):
+    page = (folder / "report.html").read_text()
+    assert page.count("data:image/png;base64,") == 4
+    # Where the report does not know a figure's name, it ends up under this heading.
+    assert "Further figures" not in page
+
+
+def test_the_command_of_a_run_starts_it_afresh(folder):
+    command = "lpo run --preset=tiny --seed=3"
+    assert results(folder)["command"] == command
+    assert load_objective(folder / "lpo.npz").metadata["command"] == command
+    assert command in (folder / "report.html").read_text()
+
+
+def test_resuming_redoes_the_missing_stage_and_no_other(folder, monkeypatch):
+    before, results_before = contents(folder), results(folder)
+    for name in LAST_STAGE:
+        (folder / name).unlink()
+
+    def refuse(*arguments, **named):
+        raise AssertionError("this stage was done already")
+
+    monkeypatch.setattr(pipeline, "evolve", refuse)
+    monkeypatch.setattr(pipeline, "learning_curves", refuse)
+    assert cli.main(["run", "--resume", str(folder)]) == 0
+
+    after = contents(folder)
+    assert after.keys() == before.keys()
+    for name in after.keys() - set(LAST_STAGE):
+        assert after[name] == before[name], name
+    for name in LAST_STAGE:
+        if name.endswith(".png"):
+            assert after[name][0] == before[name][0], name
+    clocked = {"seconds": None}
+    assert results(folder) | clocked == results_before | clocked
+
+
+def test_resuming_trains_the_missing_curve_to_the_same_bytes(folder, monkeypatch):
+    before = contents(folder)
+    (folder / CURVES[0]).unlink()
+    trained = []
+
+    def record(environment, objective, *arguments, **named):
+        trained.append((environment, objective.name))
+        return learning_curves(environment, objective, *arguments, **named)
+
+    learning_curves = pipeline.learning_curves
+    monkeypatch.setattr(pipeline, "learning_curves", record)
+    assert cli.main(["run", "--resume", str(folder)]) == 0
+    assert trained == [("Pendulum-v1", "ppo")]
+    after = contents(folder)
+    assert after[CURVES[0]][0] == before[CURVES[0]][0]
+    for name in ("lpo.npz", "lpo.json", "metrics.jsonl", *CURVES[1:]):
+        assert after[name] == before[name], name
+
+
+def test_a_half_saved_objective_is_saved_again(folder, monkeypatch):
+    # The .json is written last: without it, the evolution's checkpoint gives the same weights.
+    before = contents(folder)
+    (folder / "lpo.json").unlink()
+    assert cli.main(["run", "--resume", str(folder)]) == 0
+    after = contents(folder)
+    for name in ("lpo.npz", "lpo.json", "metrics.jsonl"):
+        assert after[name][0] == before[name][0], name
+
+
+def test_a_given_objective_is_judged_and_not_learned(tmp_path, objective_file, monkeypatch):
+    def refuse(*arguments, **named):
+        raise AssertionError("there is nothing to learn")
+
+    monkeypatch.setattr(pipeline, "evolve", refuse)
+    monkeypatch.setattr(pipeline, "learning_curves", fake_curves)
+    out = tmp_path / "run"
+    arguments = ["--preset", "tiny", "--objective", str(objective_file), "--out", str(out)]
+    assert cli.main(["run", *arguments]) == 0
+    found = results(out)
+    assert found["objective"]["name"] == "tiny"
+    assert found["meta_training"] == {}
+    assert found["comparisons"]["Pendulum-v1"]["paired_differences"].keys() == {"dpo", "tiny"}
+    assert found["command"] == f"lpo run --preset=tiny --seed=0 --objective={objective_file}"
+    assert not (out / "figures" / "meta_training.png").exists()
+
+
+def fake_curves(environment, objective, seeds, **_):
+    returns = np.tile([-1500.0, -900.0, -200.0], (len(seeds), 1)) + len(objective.name)
+    steps = np.array([0, 16, 32])
+    return pipeline.LearningCurves(
+        environment, None, objective.name, steps, returns, list(seeds), 20, True
+    )
+
+
+@pytest.mark.parametrize("preset", pipeline.PRESETS)
+def test_seeds_that_judge_are_not_those_that_learn(preset):
+    # Learning takes the seed itself; and runs of neighbouring seeds are judged by different agents.
+    for evaluation in pipeline.PRESETS[preset]["evaluations"]:
+        first = pipeline.reporting_seeds(0, evaluation["seeds"])
+        second = pipeline.reporting_seeds(1, evaluation["seeds"])
+        assert min(first) == 10_000
+        assert not set(first) & set(second)

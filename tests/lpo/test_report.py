@@ -1,0 +1,312 @@
+"""The report must say what the numbers allow to say, all of it, and load nothing from elsewhere."""
+
+import base64
+import json
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+from lpo import figures, report
+from lpo.generalization import Comparison, LearningCurves
+from scb.errors import UserError
+
+VOID = {"meta", "link", "img", "br", "hr"}
+
+
+class Page(HTMLParser):
+    """Elements, text and references of a page; fails on tags that do not nest."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__()
+        self.references: list[str] = []
+        self.tags: list[str] = []
+        self.text = ""
+        self._open: list[str] = []
+        self.source = path.read_text(encoding="utf-8")
+        self.feed(self.source)
+        self.close()
+        assert not self._open
+        self.text = " ".join(self.text.split())  # no-break spaces become spaces, too
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append(tag)
+        self.references += [v for k, v in attrs if k in ("src", "href", "srcset", "action")]
+        if tag not in VOID:
+            self._open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self._open.pop() == tag
+        if tag in ("td", "th"):
+            self.text += " "
+
+    def handle_data(self, data):
+        if self._open and self._open[-1] != "style":
+            self.text += data
+
+
+def curves(objective: str, final: float, seeds: int = 12, **changes: Any) -> LearningCurves:
+    noise = np.random.default_rng(len(objective)).normal(size=(seeds, 3))
+    arguments: dict[str, Any] = {
+        "environment": "Pendulum-v1",
+        "backend": None,
+        "objective": objective,
+        "steps": np.array([0, 5_000, 10_000]),
+        "returns": np.array([-1000.0, -500.0, final]) + noise,
+        "seeds": list(range(seeds)),
+        "episodes": 20,
+        "mode_actions": True,
+    }
+    return LearningCurves(**(arguments | changes))
+
+
+def comparison(gain: float = 30.0, learned: str = "mine", **changes: Any) -> Comparison:
+    names = {"ppo": -180.0, "dpo": -190.0, learned: -180.0 + gain}
+    return Comparison([curves(name, final, **changes) for name, final in names.items()])
+
+
+def difference(low: float | None, high: float | None, value: float = 1.0, n: int = 20) -> Any:
+    """A comparison of which only the difference matters."""
+    estimate = {"value": value, "low": low, "high": high, "n": n}
+    return {"curves": [], "reference": "ppo", "paired_differences": {"mine": estimate}}
+
+
+def results(**changes: Any) -> dict[str, Any]:
+    certificate = {
+        "holds": True,
+        "minimum": 0.0,
+        "value_at_one": 0.0,
+        "gradient_at_one": 0.0,
+        "slope_at_0_001": 0.123,
+        "slope_at_0_01": 0.456,
+        "finite": True,
+        "grid": "11 log-ratios",
+    }
+    made: dict[str, Any] = {
+        "schema_version": 1,
+        "preset": "quick",
+        "command": "lpo run --preset quick",
+        "versions": {"jax": "0.10.2"},
+        "machine": {"processor": "2 cores"},
+        "objective": {"name": "mine", "certificate": certificate},
+        "meta_training": {
+            "environment": "Synthetic-Pendulum-v1",
+            "config": {
+                "fitness": "transfer",
+                "evolution": {"seed": 7, "population_size": 32},
+                "learning_rates": [0.001, 0.01],
+                "evaluations": [{"environment": "hopper", "backend": None}],
+            },
+            "seconds": 123.4,
+            "generations": 40,
+            "steps": {"training": 1_000_000, "evaluation": 500, "total": 1_000_500},
+            "environment_steps": {
+                "training": 120_000_000,
+                "evaluation": 500,
+                "total": 120_000_500,
+            },
+        },
+        "comparisons": {
+            "Pendulum-v1": comparison().as_dict(),
+            "hopper": comparison(
+                -100.0, seeds=5, environment="hopper", backend="spring", mode_actions=False
+            ).as_dict(),
+        },
+        "seconds": 4000.0,
+    }
+    return made | changes
+
+
+@pytest.fixture
+def picture(tmp_path: Path) -> Path:
+    return figures.save(Figure(figsize=(1, 1)), tmp_path / "picture.png")
+
+
+def write(folder: Path, made: dict[str, Any] | None = None, **shown: Path) -> Page:
+    return Page(report.write_report(folder, made or results(), shown))
+
+
+@pytest.mark.parametrize("gain", [30.0, -250.0])
+def test_the_page_holds_every_number_of_the_table(tmp_path, gain):
+    made = comparison(gain)
+    page = write(tmp_path, results(comparisons={"Pendulum-v1": made.as_dict()}))
+    rows = [line.split("|")[1:-1] for line in report.markdown_table(made).splitlines()]
+    assert len(rows) == 2 + 3
+    cells = [cell.strip() for row in (rows[0], *rows[2:]) for cell in row]
+    assert len(cells) == 4 * 8
+    for cell in cells:
+        assert cell in page.text
+
+
+def test_the_page_shows_cost_certificate_configuration_and_how_to_repeat_it(tmp_path):
+    text = write(tmp_path).text
+    for said in (
+        "1 000 500", "120 000 500", "120 times fewer", "the same",  # steps, and their ratio
+        "2 min 3 s", "1 h 6 min", "40 generations",
+        "evolution.population_size 32", "evolution.seed 7", "learning_rates 0.001, 0.01",
+        "evaluations.1.environment hopper", "evaluations.1.backend –",
+        "is a drift", "0.123", "0.456", "11 log-ratios",
+        "lpo run --preset quick", "jax 0.10.2", "processor 2 cores", "hopper: 0 to 4",
+    ):  # fmt: skip
+        assert said in text, said
+
+
+def test_names_are_escaped(tmp_path):
+    evil = "<script>alert('x')</script>"
+    made = results(
+        objective={"name": evil},
+        comparisons={f"<b>{evil}": comparison(learned=evil).as_dict()},
+        command=f"lpo run --objective {evil}",
+        machine={evil: "<img src=x>"},
+    )
+    page = write(tmp_path, made)
+    assert "script" not in page.tags and "img" not in page.tags and "b" not in page.tags
+    assert evil in page.text
+    assert evil not in page.source
+
+
+def test_the_page_loads_nothing_from_elsewhere(tmp_path, picture):
+    page = write(tmp_path, meta_training=picture, hopper=picture)
+    assert "img" in page.tags
+    assert all(reference.startswith("data:") for reference in page.references)
+    assert not re.search(r"https?:|url\(|@import|<script", page.source)
+    assert "default-src 'none'" in page.source
+
+
+def test_images_are_embedded_whole_and_once(tmp_path, picture):
+    page = write(tmp_path, drift_heatmaps=picture)
+    images = [r for r in page.references if r.startswith("data:image/png;base64,")]
+    assert [base64.b64decode(i.partition(",")[2]) for i in images] == [picture.read_bytes()]
+    assert 'width="200" height="200"' in page.source  # 1 inch at 200 dpi
+
+
+def test_learning_curves_stand_with_their_environment_and_strangers_at_the_end(tmp_path, picture):
+    page = write(tmp_path, hopper=picture, **{"something else": picture})
+    own, stranger = (
+        page.source.index(f'alt="{start}') for start in ("Return on hopper", "something else")
+    )
+    assert page.source.index("<h3>hopper</h3>") < own < page.source.index("Meta-training</h2>")
+    assert page.source.index("Further figures") < stranger
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "verdict", "said"),
+    [
+        (0.5, 2.0, "better", "mine ends better than PPO's clip on Pendulum-v1"),
+        (-3.0, -0.5, "worse", "mine ends worse than PPO's clip on Pendulum-v1"),
+        (-0.5, 2.0, "undecided", "No difference between mine and PPO's clip could be shown"),
+        (0.0, 2.0, "undecided", "includes zero"),
+        (-2.0, 0.0, "undecided", "includes zero"),
+        (None, None, "one seed", "One seed cannot tell mine from PPO's clip"),
+    ],
+)
+def test_the_headline_claims_only_what_the_interval_allows(tmp_path, low, high, verdict, said):
+    made = results(comparisons={"Pendulum-v1": difference(low, high)})
+    headline = report.headline(made)
+    assert headline.verdict == verdict
+    assert said in str(headline)
+    assert ("better" in str(headline)) == (verdict == "better")
+
+
+def test_the_headline_gives_the_difference_with_its_sign_and_interval():
+    made = results(comparisons={"Pendulum-v1": difference(-31.2, -8.9, value=-20.4)})
+    assert "−20 [−31, −9] (mine minus ppo" in str(report.headline(made))
+    assert "20 paired seeds, 95 % interval" in str(report.headline(made))
+
+
+def test_the_headline_is_about_the_environment_that_the_bandit_stands_for():
+    made = results(comparisons={"hopper": difference(1, 2), "Pendulum-v1": difference(-2, -1)})
+    assert report.headline(made).verdict == "worse"
+    # Learned elsewhere altogether: the first comparison.
+    del made["meta_training"]
+    assert report.headline(made).verdict == "better"
+
+
+def test_a_worse_result_elsewhere_stands_beside_a_good_headline(tmp_path):
+    page = write(tmp_path)
+    assert report.headline(results()).verdict == "better"
+    before_the_results = page.text.partition("Results")[0]
+    assert "mine ends worse than PPO's clip on hopper" in before_the_results
+
+
+def test_an_objective_that_was_not_compared_is_not_praised(tmp_path):
+    alone = Comparison([curves("mine", -100.0)]).as_dict()
+    page = write(tmp_path, results(comparisons={"Pendulum-v1": alone}))
+    assert "mine was compared with no other objective." in page.text
+    assert "better" not in page.text
+
+
+def test_an_end_of_an_interval_is_never_rounded_to_zero():
+    # Two digits of the half-width 20 are no decimals, which would print the lower end as 0.
+    made = results(comparisons={"Pendulum-v1": difference(0.04, 40.0, value=20.0)})
+    assert "+20.00 [+0.04, +40.00]" in str(report.headline(made))
+
+
+@pytest.mark.parametrize(("seeds", "warned"), [(1, True), (5, True), (20, False)])
+def test_few_seeds_come_with_a_warning(tmp_path, seeds, warned):
+    made = results(comparisons={"Pendulum-v1": comparison(seeds=seeds).as_dict()})
+    assert ("read 95 % as about 90 %" in write(tmp_path, made).text) == warned
+
+
+def test_physics_and_actions_are_named(tmp_path):
+    made = results()
+    page = write(tmp_path, made)
+    assert "Returns under spring physics cannot be compared" in page.text
+    table = report.markdown_table(comparison(backend="spring", mode_actions=False))
+    assert all(row.endswith("| 20 | spring | sampled |") for row in table.splitlines()[2:])
+
+
+def test_a_failed_certificate_is_not_hidden(tmp_path):
+    made = results()
+    made["objective"]["certificate"] |= {"holds": False, "minimum": -0.25}
+    text = write(tmp_path, made).text
+    assert "mine is not a drift" in text
+    assert "smallest penalty f -0.25 ≥ 0 no" in text
+
+
+def test_what_was_not_done_is_not_shown(tmp_path):
+    made = results(objective={"name": "mine"})
+    del made["meta_training"]
+    text = write(tmp_path, made).text
+    for absent in ("Meta-training", "Certificate", "The objective", "Further figures"):
+        assert absent not in text
+
+
+def test_a_meta_training_without_its_counterpart_shows_its_own_steps(tmp_path):
+    made = results()
+    del made["meta_training"]["environment_steps"]
+    text = write(tmp_path, made).text
+    assert "on Synthetic-Pendulum-v1 training 1" in text
+    assert "fewer" not in text
+
+
+def test_results_read_from_a_file_give_the_same_bytes(tmp_path, picture):
+    made = results()
+    first = report.write_report(tmp_path, made, {"hopper": picture}).read_bytes()
+    again = json.loads(json.dumps(made))
+    assert report.write_report(tmp_path, again, {"hopper": picture}).read_bytes() == first
+
+
+def test_a_table_in_markdown_has_one_row_an_objective_and_survives_its_names():
+    table = report.markdown_table(comparison(learned="a|b"))
+    assert table.endswith("|\n")
+    rows = [re.split(r"(?<!\\)\|", line) for line in table.splitlines()]
+    assert {len(row) for row in rows} == {8 + 2}
+    assert [row[1].strip() for row in rows] == ["objective", "---", "ppo", "dpo", r"a\|b"]
+    assert rows[2][4].strip() == "reference"
+
+
+def test_what_cannot_be_reported_is_refused_in_one_sentence(tmp_path, picture):
+    with pytest.raises(UserError, match="schema version 2"):
+        report.write_report(tmp_path, results(schema_version=2), {})
+    with pytest.raises(UserError, match="lack objective and comparisons"):
+        report.write_report(tmp_path, {"schema_version": 1}, {})
+    with pytest.raises(UserError, match=r"cannot read the figure .*absent\.png"):
+        report.write_report(tmp_path, results(), {"hopper": tmp_path / "absent.png"})
+    picture.write_bytes(b"<svg/>")
+    with pytest.raises(UserError, match="is no PNG"):
+        report.write_report(tmp_path, results(), {"hopper": picture})

@@ -1,0 +1,124 @@
+"""Environments whose values and optima are known, for the tests of everything that trains or evaluates."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from gymnax.environments import environment, spaces
+
+from scb.environments.synthetic import BanditConfig, SyntheticBandit
+from scb.evolution import EnvironmentSteps
+
+
+@struct.dataclass
+class CorridorState(environment.EnvState):
+    cell: jax.Array
+
+
+@struct.dataclass
+class CorridorParams(environment.EnvParams):
+    """All traced: corridors of different lengths and rewards are one program.
+
+    Attributes:
+      rewards: [C, A] reward of an action in a cell.
+      last: the cell after which the episode terminates; C or more for a corridor that goes on from cell 0.
+      random_start: 1 to start in a uniformly random cell (up to `last`), 0 to start in cell 0.
+    """
+
+    rewards: Any = struct.field(default_factory=lambda: jnp.ones((3, 2)))
+    last: Any = 2
+    random_start: Any = 0
+    max_steps_in_episode: Any = 100
+
+
+class Corridor(environment.Environment[CorridorState, CorridorParams]):
+    """Walks through `cells` cells, whatever the agent does; the observation is the cell, one-hot."""
+
+    def __init__(self, cells: int = 3, num_actions: int = 2) -> None:
+        self.cells, self._num_actions = cells, num_actions
+
+    @property
+    def default_params(self) -> CorridorParams:
+        return CorridorParams(
+            rewards=jnp.ones((self.cells, self._num_actions)), last=self.cells - 1
+        )
+
+    @property
+    def num_actions(self) -> int:
+        return self._num_actions
+
+    def reset_env(self, key: jax.Array, params: CorridorParams) -> tuple[jax.Array, CorridorState]:
+        end = jnp.minimum(params.last + 1, self.cells)
+        start = jax.random.randint(key, (), 0, end) * params.random_start
+        state = CorridorState(time=jnp.int32(0), cell=jnp.int32(start))
+        return self.get_obs(state), state
+
+    def step_env(
+        self, key: jax.Array, state: CorridorState, action: jax.Array, params: CorridorParams
+    ) -> tuple[jax.Array, CorridorState, jax.Array, jax.Array, dict[str, Any]]:
+        reward = params.rewards[state.cell, action]
+        terminated = state.cell >= params.last
+        state = CorridorState(time=state.time + 1, cell=(state.cell + 1) % self.cells)
+        return self.get_obs(state), state, reward, terminated, {}
+
+    def get_obs(self, state: CorridorState, params: Any = None, key: Any = None) -> jax.Array:
+        return jax.nn.one_hot(state.cell, self.cells)
+
+    def action_space(self, params: CorridorParams | None = None) -> spaces.Discrete:
+        return spaces.Discrete(self._num_actions)
+
+    def observation_space(self, params: CorridorParams | None = None) -> spaces.Box:
+        return spaces.Box(0.0, 1.0, (self.cells,), jnp.float32)
+
+
+def context_bandit() -> SyntheticBandit:
+    """A bandit with weights by hand: the context is uniform in [0, 1], the reward is -|action - context|.
+
+    initial_state: relu(1 z) * 1, z the uniform latent. reward: -relu(a - c) - relu(c - a).
+    """
+    weights = {
+        "initial_state": {
+            "Dense_0": {"kernel": jnp.array([[1.0, 0.0]]), "bias": jnp.zeros(2)},
+            "Dense_1": {"kernel": jnp.array([[1.0], [0.0]]), "bias": jnp.zeros(1)},
+        },
+        "reward": {
+            "Dense_0": {"kernel": jnp.array([[-1.0, 1.0], [1.0, -1.0]]), "bias": jnp.zeros(2)},
+            "Dense_1": {"kernel": jnp.array([[-1.0], [-1.0]]), "bias": jnp.zeros(1)},
+        },
+    }
+    return SyntheticBandit(
+        observation_size=1,
+        action_space=spaces.Box(-1.0, 2.0, (1,), jnp.float32),
+        config=BanditConfig(hidden_size=2, activation="relu", latent="uniform"),
+        weights=weights,
+        name="Synthetic-Context",
+    )
+
+
+class Parabola:
+    """An evolution problem: fitness -|x - 3|^2 of a candidate {"x": [2]}, plus noise that all candidates share.
+
+    Attributes:
+      noise: its standard deviation.
+    """
+
+    def __init__(self, noise: float = 0.0) -> None:
+        self.noise = noise
+
+    def initial_solution(self, key: jax.Array) -> dict[str, jax.Array]:
+        return {"x": jnp.zeros(2)}
+
+    def evaluate(
+        self, candidate: dict[str, jax.Array], key: jax.Array, generation: jax.Array
+    ) -> dict[str, jax.Array]:
+        fitness = -jnp.sum((candidate["x"] - 3.0) ** 2) + self.noise * jax.random.normal(key)
+        return {"fitness": fitness, "x0": candidate["x"][0]}
+
+    def evaluate_mean(
+        self, candidate: dict[str, jax.Array], key: jax.Array
+    ) -> dict[str, jax.Array]:
+        return {"fitness": self.evaluate(candidate, key, jnp.int32(0))["fitness"]}
+
+    def steps(self) -> EnvironmentSteps:
+        return EnvironmentSteps(training=10, evaluation=3)

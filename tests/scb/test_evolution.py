@@ -1,0 +1,522 @@
+import json
+import math
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import scb
+from scb.errors import UserError
+from scb.evolution import (
+    STRATEGIES,
+    EnvironmentSteps,
+    EvolutionConfig,
+    config_dict,
+    evolve,
+    map_population,
+    rank_failed_last,
+)
+from scb.runs import Run
+from tests.scb.probes import Parabola
+
+CONFIG = EvolutionConfig(
+    population_size=8,
+    num_generations=8,
+    sigma=0.3,
+    learning_rate=0.3,
+    mean_evaluations=4,
+    evaluate_mean_every=3,
+    checkpoint_every=3,
+)
+
+
+def column(outcome, name):
+    return [line[name] for line in outcome.metrics]
+
+
+def distance(solution):
+    return float(np.linalg.norm(solution["x"] - 3.0))
+
+
+# -- what evolution achieves --------------------------------------------------------------------------
+
+START = math.sqrt(2 * 3.0**2)  # distance of (0, 0) from (3, 3)
+
+
+@pytest.mark.parametrize("strategy", ["SNES", "Open_ES", "CMA_ES", "SimpleGA"])
+def test_strategies_find_the_maximum(strategy):
+    config = replace(CONFIG, strategy=strategy, num_generations=40)
+    outcome = evolve(Parabola(noise=0.5), config, quiet=True)
+    assert distance(outcome.mean) < START / 6
+    assert distance(outcome.best_mean) < START / 6
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("strategy", sorted(STRATEGIES))
+def test_every_strategy_that_is_offered_gets_closer_to_the_maximum(strategy):
+    config = replace(CONFIG, strategy=strategy, num_generations=40)
+    outcome = evolve(Parabola(), config, quiet=True)
+    assert distance(outcome.best_mean) < 0.75 * START
+    assert sum(column(outcome, "failed")) == 0
+
+
+class Slope(Parabola):
+    """Fitness is x, or -x."""
+
+    def __init__(self, sign):
+        self.sign = sign
+
+    def evaluate(self, candidate, key, generation):
+        return {"fitness": self.sign * candidate["x"].sum()}
+
+
+@pytest.mark.parametrize("strategy", ["SNES", "Open_ES"])
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_fitness_is_maximised(strategy, sign):
+    outcome = evolve(Slope(sign), replace(CONFIG, strategy=strategy), quiet=True)
+    assert sign * float(outcome.mean["x"].sum()) > 0.5
+
+
+@pytest.mark.parametrize("strategy", ["SNES", "Open_ES"])
+@pytest.mark.parametrize("sigma", [0.05, 2.0])
+def test_the_search_starts_with_the_given_deviation(strategy, sigma):
+    # x0 of 400 candidates around 0: the error of a deviation is 1 / sqrt(800) = 3.5 %.
+    class Spread(Parabola):
+        def evaluate(self, candidate, key, generation):
+            return {"fitness": candidate["x"][0]}
+
+    config = replace(CONFIG, strategy=strategy, sigma=sigma, population_size=400, num_generations=1)
+    deviations = column(evolve(Spread(), config, quiet=True), "fitness/std")
+    assert deviations[0] == pytest.approx(sigma, rel=0.15)
+
+
+def test_sigma_decays_down_to_its_limit():
+    # evosax applies a schedule one generation late: sigma_g = max(0.5^(g - 1), 0.2) from g = 1 on.
+    config = replace(
+        CONFIG,
+        strategy="Open_ES",
+        population_size=400,
+        num_generations=6,
+        sigma=1.0,
+        sigma_decay=0.5,
+        sigma_limit=0.2,
+    )
+    deviations = column(evolve(Slope(1.0), config, quiet=True), "fitness/std")
+    # The sum of two entries has sqrt(2) times the deviation of one.
+    expected = np.sqrt(2) * np.array([1.0, 1.0, 0.5, 0.25, 0.2, 0.2])
+    np.testing.assert_allclose(deviations, expected, rtol=0.15)
+
+
+# -- what a candidate is given ------------------------------------------------------------------------
+
+
+class Draw(Parabola):
+    """Fitness is a number drawn from the key alone, or the generation."""
+
+    def evaluate(self, candidate, key, generation):
+        return {"fitness": jax.random.uniform(key), "generation": jnp.float32(generation)}
+
+    def evaluate_mean(self, candidate, key):
+        return {"fitness": jax.random.uniform(key), "square": jax.random.uniform(key) ** 2}
+
+
+@pytest.fixture(scope="module")
+def drawn():
+    return evolve(Draw(), CONFIG, quiet=True)
+
+
+def test_all_candidates_of_a_generation_share_their_randomness(drawn):
+    assert column(drawn, "fitness/min") == column(drawn, "fitness/max")
+    # And no two generations do.
+    assert len(set(column(drawn, "fitness/mean"))) == 8
+
+
+def test_a_candidate_is_told_the_generation(drawn):
+    assert column(drawn, "candidates/generation") == list(range(8))
+    assert column(drawn, "generation") == list(range(8))
+
+
+def test_the_mean_is_judged_on_agents_of_its_own_every_third_generation_and_at_the_end(drawn):
+    judged = [line["generation"] for line in drawn.metrics if "mean/fitness" in line]
+    assert judged == [0, 3, 6]
+    assert ["final_mean/fitness" in line for line in drawn.metrics] == 7 * [False] + [True]
+    last = drawn.metrics[-1]
+    # Four agents with four keys: were the keys equal, the mean square would be the squared mean.
+    assert last["final_mean/square"] > last["final_mean/fitness"] ** 2 + 1e-4
+
+
+def test_environment_steps_are_counted_apart(drawn):
+    # 8 candidates of 10 training and 3 evaluation steps each: 80 and 24 a generation.
+    assert column(drawn, "steps/training") == [80 * g for g in range(1, 9)]
+    assert column(drawn, "steps/evaluation") == [24 * g for g in range(1, 9)]
+    assert column(drawn, "steps/total") == [104 * g for g in range(1, 9)]
+    assert EnvironmentSteps(training=10, evaluation=3).total == 13
+
+
+def test_strategies_that_keep_a_population_are_not_judged_before_they_were_told_anything():
+    config = replace(CONFIG, strategy="SimpleGA", num_generations=4)
+    outcome = evolve(Parabola(), config, quiet=True)
+    assert [line["generation"] for line in outcome.metrics if "mean/fitness" in line] == [3]
+
+
+class Overshoot(Slope):
+    """Candidates are drawn to ever larger x, but the mean is judged best at (3, 3)."""
+
+    def evaluate_mean(self, candidate, key):
+        return {"fitness": -jnp.sum((candidate["x"] - 3.0) ** 2)}
+
+
+def test_the_best_mean_is_the_one_that_was_judged_best():
+    config = replace(CONFIG, num_generations=30, sigma=1.0, evaluate_mean_every=1)
+    outcome = evolve(Overshoot(1.0), config, quiet=True)
+    judged = [*column(outcome, "mean/fitness"), outcome.metrics[-1]["final_mean/fitness"]]
+    assert outcome.best_mean_generation == int(np.argmax(judged))
+    assert 0 < outcome.best_mean_generation < 30
+    assert -(distance(outcome.best_mean) ** 2) == pytest.approx(max(judged), rel=1e-5)
+    assert distance(outcome.mean) > 2 * distance(outcome.best_mean)
+
+
+# -- candidates that fail -----------------------------------------------------------------------------
+
+
+def test_failed_candidates_rank_below_the_worst():
+    # Best 4, worst 1: a failed one gets 1 - (4 - 1) / 6 = 0.5.
+    fitness, failed = rank_failed_last(np.array([1.0, np.nan, 4.0, np.inf, -np.inf, 2.0]))
+    np.testing.assert_array_equal(fitness, [1.0, 0.5, 4.0, 0.5, 0.5, 2.0])
+    assert failed == 3
+
+
+def test_where_all_failed_nobody_ranks():
+    fitness, failed = rank_failed_last(np.array([np.nan, np.inf]))
+    np.testing.assert_array_equal(fitness, [0.0, 0.0])
+    assert failed == 2
+
+
+@settings(max_examples=200)
+@given(
+    st.lists(
+        st.one_of(st.floats(-1e6, 1e6, width=32), st.sampled_from([np.nan, np.inf, -np.inf])),
+        min_size=1,
+        max_size=10,
+    )
+)
+def test_failed_candidates_are_always_last_and_the_others_are_untouched(values):
+    given_fitness = np.array(values, np.float32)
+    fitness, failed = rank_failed_last(given_fitness)
+    finite = np.isfinite(given_fitness)
+    assert np.isfinite(fitness).all()
+    assert failed == (~finite).sum()
+    np.testing.assert_array_equal(fitness[finite], given_fitness[finite])
+    if finite.any() and failed:
+        assert fitness[~finite].max() < fitness[finite].min()
+
+
+class Fragile(Parabola):
+    """A parabola that breaks where x0 is negative; a mean is never judged a number."""
+
+    def __init__(self, broken):
+        self.broken = broken
+
+    def evaluate(self, candidate, key, generation):
+        fails = candidate["x"][0] < 0
+        fitness = jnp.where(fails, self.broken, -jnp.sum((candidate["x"] - 3.0) ** 2))
+        return {"fitness": fitness, "fails": fails.astype(jnp.float32)}
+
+    def evaluate_mean(self, candidate, key):
+        return {"fitness": jnp.float32(jnp.nan)}
+
+
+@pytest.mark.parametrize("strategy", ["SNES", "Open_ES"])
+@pytest.mark.parametrize("broken", [np.nan, np.inf])
+def test_failed_candidates_are_counted_and_never_poison_the_search(strategy, broken):
+    config = replace(CONFIG, strategy=strategy, num_generations=20)
+    outcome = evolve(Fragile(broken), config, quiet=True)
+    # The search starts at x0 = 0, so about half of the first generation fails.
+    assert 0 < outcome.metrics[0]["failed"] < 8
+    shares = np.array(column(outcome, "candidates/fails"))
+    np.testing.assert_array_equal(column(outcome, "failed"), 8 * shares)
+    assert np.isfinite(column(outcome, "fitness/mean")).all()
+    assert distance(outcome.mean) < START / 2
+    # A mean that cannot be judged is not chosen: the start stays the best.
+    assert outcome.best_mean_generation == -1
+    np.testing.assert_array_equal(outcome.best_mean["x"], [0.0, 0.0])
+
+
+class Broken(Parabola):
+    def evaluate(self, candidate, key, generation):
+        return {"fitness": jnp.where(generation < 100, jnp.nan, candidate["x"].sum())}
+
+
+@pytest.mark.parametrize("strategy", ["SNES", "Open_ES", "CMA_ES"])
+def test_a_generation_that_fails_altogether_leaves_the_mean_where_it_was(strategy):
+    outcome = evolve(Broken(), replace(CONFIG, strategy=strategy), quiet=True)
+    np.testing.assert_array_equal(outcome.mean["x"], [0.0, 0.0])
+    assert column(outcome, "failed") == 8 * [8]
+
+
+# -- devices ------------------------------------------------------------------------------------------
+
+
+def test_the_tests_run_on_two_devices():
+    assert len(jax.devices()) == 2
+
+
+@pytest.mark.parametrize("size", [1, 2, 5, 8])
+def test_a_mapped_function_does_not_see_how_many_devices_there_are(size):
+    def function(weights, key, shared):
+        return {"a": weights["w"] * shared + jax.random.normal(key), "b": weights["w"].sum()}
+
+    key_weights, key_members = jax.random.split(jax.random.key(0))
+    weights = {"w": jax.random.normal(key_weights, (size, 3))}
+    keys = jax.random.split(key_members, size)
+    mapped = map_population(function, size, (0, 0, None))(weights, keys, jnp.float32(2.0))
+    expected = jax.vmap(function, in_axes=(0, 0, None))(weights, keys, jnp.float32(2.0))
+    assert isinstance(mapped["a"], np.ndarray) and mapped["a"].shape == (size, 3)
+    chex.assert_trees_all_close(mapped, jax.device_get(expected), atol=1e-6)
+
+
+def test_a_population_is_spread_over_the_devices():
+    # Seen from inside, each device has its half of the population.
+    sizes = []
+
+    def function(x):
+        return jax.pure_callback(
+            lambda x: sizes.append(x.shape) or x,
+            jax.ShapeDtypeStruct((), jnp.float32),
+            x,
+            vmap_method="broadcast_all",
+        )
+
+    map_population(function, 8, (0,))(jnp.arange(8.0))
+    assert sizes == [(4,), (4,)]
+
+
+def test_a_population_that_the_devices_do_not_divide_evolves_as_on_one_device(monkeypatch):
+    config = replace(CONFIG, population_size=5, mean_evaluations=3)
+    on_two = evolve(Parabola(noise=0.5), config, quiet=True)
+    first = jax.devices()[:1]
+    monkeypatch.setattr("scb.evolution.jax.devices", lambda: first)
+    on_one = evolve(Parabola(noise=0.5), config, quiet=True)
+    np.testing.assert_allclose(on_two.mean["x"], on_one.mean["x"], rtol=1e-5)
+    for name in ("fitness/mean", "fitness/min", "fitness/max", "candidates/x0"):
+        np.testing.assert_allclose(column(on_two, name), column(on_one, name), rtol=1e-4)
+
+
+# -- interruption -------------------------------------------------------------------------------------
+
+
+class Killed(BaseException):
+    """A kill: nothing in the code may catch it."""
+
+
+class KilledRun(Run):
+    """Dies in generation `last`, after its line was written and in the middle of another."""
+
+    last = 0
+
+    def log(self, generation, metrics, seconds):
+        super().log(generation, metrics, seconds)
+        if generation == self.last:
+            with (self.folder / "metrics.jsonl").open("a") as file:
+                file.write('{"generation": 1')
+            raise Killed
+
+
+def evolve_in(folder, config, resume=False, kill_at=None, quiet=True):
+    kind = Run if kill_at is None else KilledRun
+    run = kind.open(folder, config_dict(config), resume=resume)
+    if kill_at is not None:
+        run.last = kill_at
+    try:
+        return evolve(Parabola(noise=0.5), config, run, quiet)
+    finally:
+        run.close()
+
+
+def fingerprint(folder, outcome):
+    """All bytes that must not depend on interruptions."""
+    weights = [np.asarray(x).tobytes() for x in jax.tree.leaves((outcome.mean, outcome.best_mean))]
+    metrics = (Path(folder) / "metrics.jsonl").read_bytes()
+    return weights, outcome.best_mean_generation, metrics
+
+
+STRATEGIES_RESUMED = ["SNES", "Open_ES", "SimpleGA"]
+
+
+@pytest.fixture(scope="module")
+def uninterrupted(tmp_path_factory):
+    """{strategy: fingerprint} of runs that nobody disturbed."""
+    fingerprints = {}
+    for strategy in STRATEGIES_RESUMED:
+        folder = tmp_path_factory.mktemp(strategy) / "run"
+        outcome = evolve_in(folder, replace(CONFIG, strategy=strategy))
+        fingerprints[strategy] = fingerprint(folder, outcome)
+    return fingerprints
+
+
+@pytest.mark.parametrize(
+    ("strategy", "kills"),
+    [
+        # Checkpoints are written after generations 2, 5 and 7: before the first, in the generation
+        # whose checkpoint was about to be written, between two, in the very last, and three times.
+        ("SNES", [1]),
+        ("SNES", [2]),
+        ("SNES", [4]),
+        ("SNES", [7]),
+        ("SNES", [0, 5, 6]),
+        ("Open_ES", [4]),
+        ("SimpleGA", [4]),
+    ],
+)
+def test_a_run_that_was_killed_and_resumed_ends_with_the_same_bytes(
+    tmp_path, uninterrupted, strategy, kills
+):
+    config = replace(CONFIG, strategy=strategy)
+    folder = tmp_path / "run"
+    for attempt, kill_at in enumerate(kills):
+        with pytest.raises(Killed):
+            evolve_in(folder, config, resume=attempt > 0, kill_at=kill_at)
+    outcome = evolve_in(folder, config, resume=True)
+    assert fingerprint(folder, outcome) == uninterrupted[strategy]
+    # One line a generation in both logs, and the outcome tells the whole story.
+    assert column(outcome, "generation") == list(range(8))
+    assert len((folder / "timing.jsonl").read_text().splitlines()) == 8
+
+
+def test_resuming_a_finished_run_changes_nothing(tmp_path, uninterrupted):
+    folder = tmp_path / "run"
+    evolve_in(folder, CONFIG)
+    seconds = (folder / "timing.jsonl").read_bytes()
+    outcome = evolve_in(folder, CONFIG, resume=True)
+    assert fingerprint(folder, outcome) == uninterrupted["SNES"]
+    assert (folder / "timing.jsonl").read_bytes() == seconds
+    assert outcome.seconds == sum(json.loads(line)["seconds"] for line in seconds.splitlines())
+
+
+def test_another_seed_ends_with_other_bytes(tmp_path, uninterrupted):
+    outcome = evolve_in(tmp_path / "run", replace(CONFIG, seed=1))
+    assert fingerprint(tmp_path / "run", outcome)[0] != uninterrupted["SNES"][0]
+
+
+def cut_in_half(folder):
+    for path in [p for p in folder.rglob("*") if p.is_file()]:
+        path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+@pytest.mark.parametrize(
+    ("damaged", "said"),
+    [
+        (["8"], ["checkpoint 8 is damaged: resuming from checkpoint 6 before it."]),
+        (
+            ["8", "6"],
+            [
+                "checkpoint 8 is damaged: resuming from checkpoint 3 before it.",
+                "checkpoint 6 is damaged: resuming from checkpoint 3 before it.",
+            ],
+        ),
+        (["8", "6", "3"], ["no checkpoint could be read: starting again at generation 0."]),
+    ],
+)
+def test_a_damaged_checkpoint_is_told_and_the_one_before_is_taken(
+    tmp_path, uninterrupted, capsys, damaged, said
+):
+    folder = tmp_path / "run"
+    evolve_in(folder, CONFIG)
+    for step in damaged:
+        cut_in_half(folder / "checkpoints" / step)
+    outcome = evolve_in(folder, CONFIG, resume=True, quiet=False)
+    messages = capsys.readouterr().err.splitlines()
+    assert [line for line in messages if "checkpoint" in line] == said
+    assert fingerprint(folder, outcome) == uninterrupted["SNES"]
+
+
+@pytest.mark.slow
+def test_a_process_that_was_killed_mid_way_is_resumed_to_the_same_bytes(tmp_path):
+    # SIGKILL at no chosen moment, in a process of its own.
+    config = replace(CONFIG, num_generations=400, checkpoint_every=7)
+    code = (
+        "import sys; from scb.evolution import *; from scb.runs import Run\n"
+        "from tests.scb.probes import Parabola\n"
+        f"config = EvolutionConfig(**{asdict(config)!r})\n"
+        "evolve(Parabola(0.5), config, Run.open(sys.argv[1], config_dict(config)), quiet=True)"
+    )
+    killed, whole = tmp_path / "killed", tmp_path / "whole"
+    root = Path(scb.__file__).parents[1]
+    process = subprocess.Popen(
+        [sys.executable, "-c", code, str(killed)],
+        cwd=root,
+        env={**os.environ, "PYTHONPATH": str(root)},
+    )
+    log = killed / "metrics.jsonl"
+    deadline = time.monotonic() + 60
+    while not log.exists() or log.read_bytes().count(b"\n") < 25:
+        assert process.poll() is None and time.monotonic() < deadline
+        time.sleep(0.01)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    assert log.read_bytes().count(b"\n") < 400
+    resumed = fingerprint(killed, evolve_in(killed, config, resume=True))
+    assert resumed == fingerprint(whole, evolve_in(whole, config))
+
+
+# -- what the user is told ----------------------------------------------------------------------------
+
+
+def test_progress_says_fitness_failures_and_time_left(capsys):
+    evolve(Fragile(np.nan), replace(CONFIG, num_generations=3))
+    first, *_, last = capsys.readouterr().err.splitlines()
+    assert first.startswith("generation 1/3: fitness -") and first.endswith(" min left")
+    assert " failed, " in first
+    assert last.startswith("generation 3/3: ")
+    evolve(Parabola(), replace(CONFIG, num_generations=1), quiet=True)
+    assert capsys.readouterr().err == ""
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"strategy": "SNESS"}, "unknown evolution strategy 'SNESS': did you mean SNES or"),
+        ({"strategy": "open_es"}, "unknown evolution strategy 'open_es': did you mean Open_ES"),
+        ({"strategy": "RandomSearch"}, "unknown evolution strategy 'RandomSearch'"),
+        ({"population_size": 1}, "population_size is 1: .* at least 2"),
+        ({"population_size": 5, "strategy": "Open_ES"}, "population_size is 5: .* must be even"),
+        ({"num_generations": 0}, "num_generations is 0: it must be at least 1"),
+        ({"mean_evaluations": 0}, "mean_evaluations is 0: it must be at least 1"),
+        ({"evaluate_mean_every": 0}, "evaluate_mean_every is 0: it must be at least 1"),
+        ({"checkpoint_every": 0}, "checkpoint_every is 0: it must be at least 1"),
+        ({"seed": -1}, "seed is -1: it must be 0 or larger"),
+        ({"sigma": 0.0}, "sigma is 0.0: it must be positive"),
+        ({"sigma": math.nan}, "sigma is nan: it must be positive"),
+        ({"learning_rate": -1.0}, "learning_rate is -1.0: it must be positive"),
+        ({"sigma_decay": 0.0}, "sigma_decay is 0.0: it must be positive"),
+    ],
+)
+def test_impossible_configurations_are_refused(arguments, message):
+    with pytest.raises(UserError, match=message):
+        EvolutionConfig(**arguments)
+
+
+@pytest.mark.parametrize(
+    ("strategy", "size", "reason"),
+    [("PGPE", 5, "must be even"), ("DifferentialEvolution", 3, "population_size >= 4")],
+)
+def test_a_size_that_a_strategy_does_not_take_is_refused(strategy, size, reason):
+    config = replace(CONFIG, strategy=strategy, population_size=size)
+    message = f"{strategy} does not take a population_size of {size} for 2 weights .*{reason}"
+    with pytest.raises(UserError, match=message):
+        evolve(Parabola(), config, quiet=True)
+
+
+def test_a_configuration_is_plain_json():
+    assert EvolutionConfig(**json.loads(json.dumps(config_dict(CONFIG)))) == CONFIG

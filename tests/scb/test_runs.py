@@ -1,0 +1,275 @@
+import json
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from scb.errors import UserError
+from scb.runs import Checkpoints, Run, Stopwatch, read_config, settle, write_json
+
+CONFIG = {"seed": 0, "evolution": {"sigma": 0.05, "strategy": "SNES"}, "hidden_sizes": (8, 8)}
+
+
+@pytest.fixture
+def run(tmp_path):
+    run = Run.open(tmp_path / "run", CONFIG)
+    yield run
+    run.close()
+
+
+def lines(run, name="metrics.jsonl"):
+    return (run.folder / name).read_text().splitlines()
+
+
+# -- opening ------------------------------------------------------------------------------------------
+
+
+def test_a_new_run_stores_its_config(run):
+    assert not run.resumed
+    # As JSON has it: a tuple is a list by now.
+    assert read_config(run.folder) == {**CONFIG, "hidden_sizes": [8, 8]}
+
+
+def test_a_run_may_start_in_an_empty_folder(tmp_path):
+    (tmp_path / "empty").mkdir()
+    assert Run.open(tmp_path / "empty", CONFIG).folder == tmp_path / "empty"
+
+
+def test_a_folder_that_holds_something_is_refused(tmp_path):
+    (tmp_path / "notes.txt").write_text("mine")
+    with pytest.raises(UserError, match="already exists and is not empty: choose another --out"):
+        Run.open(tmp_path, CONFIG)
+    assert [p.name for p in tmp_path.iterdir()] == ["notes.txt"]
+
+
+def test_a_file_in_the_place_of_the_folder_is_refused(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(UserError, match="already exists"):
+        Run.open(tmp_path / "file", CONFIG)
+
+
+def test_a_folder_that_cannot_be_made_is_refused(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(UserError, match=r"cannot write to .*run \(Not a directory\): choose"):
+        Run.open(tmp_path / "file" / "run", CONFIG)
+
+
+def test_resuming_with_the_same_config_keeps_everything(run):
+    run.log(0, {"fitness": 1.0}, seconds=0.5)
+    resumed = Run.open(run.folder, CONFIG, resume=True)
+    assert resumed.resumed
+    assert resumed.metrics() == [{"generation": 0, "fitness": 1.0}]
+    assert resumed.seconds() == 0.5
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"seed": 1}, r"differs at seed \(0 there, 1 now\)"),
+        (
+            {"evolution": {"sigma": 0.1, "strategy": "SNES"}},
+            r"differs at evolution.sigma \(0.05 there, 0.1 now\)",
+        ),
+        ({"evolution": {"sigma": 0.05}}, r"at evolution.strategy \('SNES' there, None now\)"),
+        ({"hidden_sizes": [8]}, r"differs at hidden_sizes \(\[8, 8\] there, \[8\] now\)"),
+        ({"new": True}, r"differs at new \(None there, True now\)"),
+    ],
+)
+def test_another_config_cannot_resume_a_run(run, change, message):
+    with pytest.raises(UserError, match=message):
+        Run.open(run.folder, {**CONFIG, **change}, resume=True)
+
+
+@pytest.mark.parametrize("content", [None, "", "{", '{"seed": ', "[1]", "3", "null"])
+def test_what_is_no_run_cannot_be_resumed(tmp_path, content):
+    if content is not None:
+        (tmp_path / "config.json").write_text(content)
+    with pytest.raises(UserError, match=r"is not a run \(no readable config.json\)"):
+        Run.open(tmp_path, CONFIG, resume=True)
+
+
+def test_logging_to_wandb_needs_its_package(tmp_path, monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "wandb", None)
+    with pytest.raises(UserError, match="needs the package wandb: install the extra"):
+        Run.open(tmp_path / "run", CONFIG, wandb_project="bandits")
+
+
+# -- logs ---------------------------------------------------------------------------------------------
+
+
+def test_a_logged_generation_is_one_line_of_json_without_clocks(run):
+    run.log(0, {"fitness": np.float32(0.5), "failed": 2, "steps": np.int64(7)}, seconds=1.25)
+    assert lines(run) == ['{"generation": 0, "fitness": 0.5, "failed": 2, "steps": 7}']
+    assert lines(run, "timing.jsonl") == ['{"generation": 0, "seconds": 1.25}']
+
+
+def test_a_number_that_json_does_not_know_is_null(run):
+    run.log(0, {"a": float("nan"), "b": np.float32("inf"), "c": 1.0}, seconds=0.0)
+    assert json.loads(lines(run)[0]) == {"generation": 0, "a": None, "b": None, "c": 1.0}
+
+
+def test_seconds_add_up_over_generations(run):
+    assert (run.metrics(), run.seconds()) == ([], 0.0)
+    for generation, seconds in enumerate([0.5, 1.5, 0.25]):
+        run.log(generation, {}, seconds)
+    assert run.seconds() == 2.25
+
+
+def test_tensorboard_gets_the_same_numbers(run):
+    run.log(0, {"fitness": 0.5}, seconds=0.0)
+    run.close()
+    (events,) = (run.folder / "tensorboard").iterdir()
+    assert b"fitness" in events.read_bytes()
+
+
+def test_rewinding_drops_what_came_after_the_checkpoint(run):
+    for generation in range(5):
+        run.log(generation, {"fitness": float(generation)}, seconds=1.0)
+    run.rewind(3)
+    assert [line["generation"] for line in run.metrics()] == [0, 1, 2]
+    assert run.seconds() == 3.0
+    # And the next generation is appended behind them.
+    run.log(3, {"fitness": 30.0}, seconds=1.0)
+    assert run.metrics()[-1] == {"generation": 3, "fitness": 30.0}
+
+
+def test_rewinding_drops_the_half_line_that_a_kill_left(run):
+    for generation in range(3):
+        run.log(generation, {"fitness": 1.0}, seconds=1.0)
+    whole = lines(run)
+    for cut in (whole[2][:5], whole[2][:-1]):
+        (run.folder / "metrics.jsonl").write_text("\n".join([*whole[:2], cut]))
+        run.rewind(3)
+        assert lines(run) == whole[:2]
+
+
+def test_rewinding_a_run_without_logs_is_nothing(run):
+    run.rewind(0)
+    assert not (run.folder / "metrics.jsonl").exists()
+
+
+# -- settings -----------------------------------------------------------------------------------------
+
+PRESETS = {"quick": {"generations": 3, "population": 8}, "paper": {"generations": 1000}}
+
+
+def test_a_flag_wins_over_the_preset_and_the_preset_over_nothing():
+    flags = {"generations": None, "population": 4, "seed": None}
+    settings = settle(flags, PRESETS, None, None)
+    assert settings == {"generations": 3, "population": 4, "seed": None, "preset": "quick"}
+    assert settle(flags, PRESETS, "paper", None)["generations"] == 1000
+
+
+def test_an_unknown_preset_is_refused():
+    with pytest.raises(UserError, match=r"unknown preset .quik.: did you mean quick\?"):
+        settle({}, PRESETS, "quik", None)
+
+
+def test_a_resumed_run_keeps_its_settings_and_a_contradicting_flag_is_found(tmp_path):
+    stored = {"generations": 3, "population": 4, "seed": 1, "preset": "quick"}
+    run = Run.open(tmp_path / "run", stored)
+    flags = {"generations": None, "population": None, "seed": None}
+    assert settle(flags, PRESETS, None, run.folder) == stored
+    for flags, preset, field in [({"seed": 2}, None, "seed"), ({}, "paper", "preset")]:
+        settings = settle(flags, PRESETS, preset, run.folder)
+        with pytest.raises(UserError, match=f"its config differs at {field}"):
+            Run.open(run.folder, settings, resume=True)
+
+
+# -- checkpoints --------------------------------------------------------------------------------------
+
+
+def state(value):
+    return {
+        "mean": jnp.full(3, value),
+        "inner": (jnp.int32(value), {"x": jnp.ones((2, 2)) * value}),
+    }
+
+
+def assert_is(restored, value):
+    step, tree, damaged = restored
+    assert (step, damaged) == (value, [])
+    np.testing.assert_array_equal(tree["mean"], np.full(3, value))
+    assert tree["inner"][0] == value and tree["inner"][0].dtype == jnp.int32
+    np.testing.assert_array_equal(tree["inner"][1]["x"], np.full((2, 2), value))
+
+
+def test_the_newest_checkpoint_is_restored_and_only_three_are_kept(tmp_path):
+    checkpoints = Checkpoints(tmp_path)
+    for step in (1, 2, 3, 4):
+        checkpoints.save(step, state(step))
+    checkpoints.close()
+    again = Checkpoints(tmp_path)
+    assert_is(again.restore(state(0)), 4)
+    again.close()
+    assert {p.name for p in (tmp_path / "checkpoints").iterdir()} == {"2", "3", "4"}
+
+
+def test_without_checkpoints_there_is_nothing_to_restore(tmp_path):
+    checkpoints = Checkpoints(tmp_path)
+    assert checkpoints.restore(state(0)) is None
+    checkpoints.close()
+
+
+def cut_in_half(folder):
+    """Cuts every file of a checkpoint, as a full disk or a killed copy does."""
+    for path in [p for p in folder.rglob("*") if p.is_file()]:
+        path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+def test_a_damaged_checkpoint_is_passed_over_and_makes_room_for_its_repetition(tmp_path):
+    checkpoints = Checkpoints(tmp_path)
+    for step in (1, 2, 3):
+        checkpoints.save(step, state(step))
+    checkpoints.close()
+    for step in (2, 3):
+        cut_in_half(tmp_path / "checkpoints" / str(step))
+    again = Checkpoints(tmp_path)
+    step, tree, damaged = again.restore(state(0))
+    assert (step, sorted(damaged)) == (1, [2, 3])
+    np.testing.assert_array_equal(tree["mean"], np.full(3, 1.0))
+    again.save(2, state(2))
+    assert_is(again.restore(state(0)), 2)
+    again.close()
+
+
+def test_a_checkpoint_whose_numbers_were_altered_is_passed_over(tmp_path):
+    # It reads well, but the digest beside it is another state's.
+    checkpoints = Checkpoints(tmp_path)
+    for step in (1, 2):
+        checkpoints.save(step, state(step))
+    checkpoints.close()
+    old, new = (next((tmp_path / "checkpoints" / s / "digest").rglob("metadata")) for s in "12")
+    new.write_bytes(old.read_bytes())
+    again = Checkpoints(tmp_path)
+    step, _, damaged = again.restore(state(0))
+    again.close()
+    assert (step, damaged) == (1, [2])
+
+
+def test_where_all_checkpoints_are_damaged_none_is_restored(tmp_path):
+    checkpoints = Checkpoints(tmp_path)
+    checkpoints.save(1, state(1))
+    checkpoints.close()
+    cut_in_half(tmp_path / "checkpoints" / "1")
+    again = Checkpoints(tmp_path)
+    assert again.restore(state(0)) is None
+    again.close()
+
+
+# -- small things -------------------------------------------------------------------------------------
+
+
+def test_json_is_replaced_whole(tmp_path):
+    path = tmp_path / "report.json"
+    for content in ({"a": 1}, {"a": 2}):
+        write_json(path, content)
+        assert json.loads(path.read_text()) == content
+    assert [p.name for p in tmp_path.iterdir()] == ["report.json"]
+
+
+def test_a_stopwatch_counts_from_its_last_reading(monkeypatch):
+    readings = iter([10.0, 12.5, 13.0])
+    monkeypatch.setattr("scb.runs.time.perf_counter", lambda: next(readings))
+    watch = Stopwatch()
+    assert (watch.lap(), watch.lap()) == (2.5, 0.5)

@@ -1,0 +1,273 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from gymnax.environments import spaces
+
+from scb.agents.hyperparameters import Setting
+from scb.agents.ppo import PPO, PPOConfig, PPOHyperparameters
+from scb.environments.synthetic import BanditConfig, BanditParams, SyntheticBandit, bandit_for
+from scb.errors import UserError
+from scb.warm_start import (
+    Expert,
+    ExpertDataset,
+    WarmStartConfig,
+    energy_distance,
+    expert_dataset,
+    fit_bandit,
+    reward_targets,
+    train_expert,
+)
+from tests.scb.probes import Corridor, CorridorParams, context_bandit
+
+TINY = PPOConfig(
+    num_envs=2, num_steps=8, num_epochs=1, num_minibatches=1, total_steps=16, hidden_sizes=(4,)
+)
+
+
+def normal(seed, size, shift=0.0):
+    return jax.random.normal(jax.random.key(seed), (size, 2)) + shift
+
+
+# -- the distance between two samples -----------------------------------------------------------------
+
+
+def test_energy_distance_by_hand():
+    # a = {0, 2}, b = {1, 5}. Between: (1 + 5 + 1 + 3) / 4 = 2.5; within a: 2, within b: 4.
+    # 2 * 2.5 - 2 - 4 = -1: unbiased, so it can be negative where the samples are small.
+    a, b = jnp.array([[0.0], [2.0]]), jnp.array([[1.0], [5.0]])
+    assert float(energy_distance(a, b)) == pytest.approx(-1.0, abs=1e-4)
+    # Points in the plane: (0, 0) twice and (3, 4) twice are 5 apart, 2 * 5 - 0 - 0.
+    far = energy_distance(jnp.zeros((2, 2)), jnp.tile(jnp.array([3.0, 4.0]), (2, 1)))
+    assert float(far) == pytest.approx(10.0, abs=1e-4)
+
+
+def test_energy_distance_of_samples_of_one_distribution_is_zero_on_average():
+    distances = [
+        float(energy_distance(normal(2 * i, 100), normal(2 * i + 1, 100))) for i in range(40)
+    ]
+    error = np.std(distances) / np.sqrt(40)
+    assert abs(np.mean(distances)) < 4 * error < 0.02
+
+
+@pytest.mark.parametrize("scale_b", [0.5, 2.0])
+def test_energy_distance_sees_a_shift_and_a_spread(scale_b):
+    same = energy_distance(normal(0, 500), normal(1, 500))
+    assert energy_distance(normal(0, 500), normal(1, 500, shift=0.5)) > same + 0.1
+    assert energy_distance(normal(0, 500), scale_b * normal(1, 500)) > same + 0.1
+
+
+def test_energy_distance_has_a_finite_gradient_where_points_coincide():
+    gradient = jax.grad(energy_distance)(jnp.zeros((3, 2)), jnp.zeros((3, 2)))
+    assert np.isfinite(gradient).all()
+
+
+# -- reward targets -----------------------------------------------------------------------------------
+
+
+def target(construction, discrete, action, q, expert_action):
+    dataset = ExpertDataset(
+        jnp.zeros((len(q), 1)), jnp.array(action), jnp.array(q), jnp.array(expert_action)
+    )
+    return np.asarray(reward_targets(dataset, construction, discrete))
+
+
+def test_the_q_construction_is_q_standardised():
+    # Q = 1 2 3 6: mean 3, deviations -2 -1 0 3, variance (4 + 1 + 0 + 9) / 4 = 3.5.
+    actual = target("q", True, [[0, 1], [0, 1]], [[1.0, 2.0], [3.0, 6.0]], [1, 1])
+    np.testing.assert_allclose(actual, np.array([[-2, -1], [0, 3]]) / np.sqrt(3.5), rtol=1e-5)
+
+
+def test_the_advantage_construction_is_q_below_each_states_best():
+    # Q - max: -1 0 | -3 0, mean -1, variance (0 + 1 + 4 + 1) / 4 = 1.5. The best action of every state
+    # has reward 0, however good the state is.
+    actual = target("advantage", True, [[0, 1], [0, 1]], [[1.0, 2.0], [3.0, 6.0]], [1, 1])
+    np.testing.assert_allclose(actual, np.array([[-1, 0], [-3, 0]]) / np.sqrt(1.5), rtol=1e-5)
+
+
+def test_the_action_distance_of_discrete_actions_is_one_where_the_expert_acts_so():
+    # State 0's expert takes 1, state 1's takes 0: 0 1 | 1 0, deviation 1/2.
+    actual = target("action_distance", True, [[0, 1], [0, 1]], [[9.0, 9.0], [9.0, 9.0]], [1, 0])
+    np.testing.assert_allclose(actual, [[0, 2], [2, 0]], rtol=1e-5)
+
+
+def test_the_action_distance_of_continuous_actions_is_euclidean():
+    # Expert (1, 1) and (0, 0). Distances: to (1, 1) 0, to (4, 5) 5; to (0, 1) 1, to (0, -2) 2.
+    # -(0 5 1 2): mean -2, variance (4 + 9 + 1 + 0) / 4 = 3.5.
+    actions = [[[1.0, 1.0], [4.0, 5.0]], [[0.0, 1.0], [0.0, -2.0]]]
+    actual = target("action_distance", False, actions, np.zeros((2, 2)), [[1.0, 1.0], [0.0, 0.0]])
+    np.testing.assert_allclose(actual, -np.array([[0, 5], [1, 2]]) / np.sqrt(3.5), rtol=1e-5)
+
+
+# -- the expert's dataset -----------------------------------------------------------------------------
+
+
+def untrained(env, env_params):
+    """An expert whose mode action is 0 everywhere: all its policy's weights are zero."""
+    agent = PPO(env, TINY)
+    state = agent.init(jax.random.key(0), PPOHyperparameters(), env_params)
+    policy = jax.tree.map(jnp.zeros_like, state.params["policy"])
+    state = state.replace(params={**state.params, "policy": policy})
+    return Expert(agent, state, mean_return=0.0, environment_steps=0)
+
+
+@pytest.fixture(scope="module")
+def corridor_dataset():
+    # Three cells, then the end; action 0 pays 1, 2, 4 and action 1 pays 10, 20, 40.
+    params = CorridorParams(rewards=jnp.array([[1.0, 10], [2, 20], [4, 40]]), random_start=1)
+    config = WarmStartConfig(discount=0.5, num_states=64, horizon=10)
+    expert = untrained(Corridor(), params)
+    dataset, steps = expert_dataset(expert, params, jax.random.key(1), config)
+    return jax.tree.map(np.asarray, dataset), steps, params
+
+
+def test_q_values_are_those_of_acting_once_and_then_following_the_expert(corridor_dataset):
+    # The expert takes 0 everywhere. V(2) = 4, V(1) = 2 + 4/2 = 4, V(0) = 1 + 4/2 = 3; the first action's
+    # own reward in front: Q(2, .) = 4 40, Q(1, .) = 2 + V(2)/2 = 4 and 20 + 2 = 22, Q(0, .) = 1 + V(1)/2 = 3
+    # and 10 + 2 = 12. Nothing is earned after the end, though the corridor would go on.
+    dataset, _, _ = corridor_dataset
+    by_hand = np.array([[3.0, 12.0], [4.0, 22.0], [4.0, 40.0]])
+    cell = dataset.observation.argmax(axis=1)
+    np.testing.assert_allclose(dataset.q, by_hand[cell], rtol=1e-6)
+    np.testing.assert_array_equal(dataset.action, np.tile([0, 1], (64, 1)))
+    np.testing.assert_array_equal(dataset.expert_action, 0)
+    assert set(cell) == {0, 1, 2}
+
+
+def test_the_datasets_steps_are_counted(corridor_dataset):
+    # 256 trajectories of 100 steps (the environment's limit), and 64 states x 2 actions x 10 steps.
+    assert corridor_dataset[1] == 256 * 100 + 64 * 2 * 10
+
+
+def test_the_horizon_cuts_the_return():
+    # Two steps: Q(0, .) = 1 + 2/2 = 2 and 10 + 1 = 11; Q(1, .) = 2 + 4/2 = 4 and 22.
+    params = CorridorParams(rewards=jnp.array([[1.0, 10], [2, 20], [4, 40]]))
+    config = WarmStartConfig(discount=0.5, num_states=16, horizon=2)
+    expert = untrained(Corridor(), params)
+    dataset, _ = expert_dataset(expert, params, jax.random.key(1), config)
+    by_hand = np.array([[2.0, 11.0], [4.0, 22.0], [4.0, 40.0]])
+    np.testing.assert_allclose(dataset.q, by_hand[np.argmax(dataset.observation, axis=1)])
+
+
+@pytest.fixture(scope="module")
+def bandit_dataset():
+    """Of the context bandit, whose Q is its reward: -|action - context|."""
+    bandit = context_bandit()
+    config = WarmStartConfig(num_states=256, num_actions=8, horizon=3)
+    expert = untrained(bandit, bandit.default_params)
+    return expert_dataset(expert, bandit.default_params, jax.random.key(2), config)[0]
+
+
+def test_continuous_actions_are_the_experts_and_random_ones_within_the_bounds(bandit_dataset):
+    action = np.asarray(bandit_dataset.action)
+    assert action.shape == (256, 8, 1) and bandit_dataset.q.shape == (256, 8)
+    np.testing.assert_array_equal(action[:, 0], bandit_dataset.expert_action)
+    np.testing.assert_array_equal(bandit_dataset.expert_action, 0.0)
+    others = action[:, 1:]
+    assert others.min() >= -1.0 and others.max() <= 2.0 and len(np.unique(others)) > 1700
+    np.testing.assert_allclose(
+        bandit_dataset.q, -np.abs(action[..., 0] - bandit_dataset.observation), atol=1e-6
+    )
+
+
+# -- the fit ------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def fitted(bandit_dataset):
+    bandit = SyntheticBandit(1, context_bandit().action_space(), BanditConfig(hidden_size=8))
+    config = WarmStartConfig(construction="q", fit_steps=1000)
+    return bandit, *fit_bandit(bandit, bandit_dataset, jax.random.key(3), config)
+
+
+def test_a_reward_that_the_network_can_represent_is_fitted(fitted, bandit_dataset):
+    bandit, weights, report = fitted
+    assert report["reward_r2"] > 0.9
+    # The report is about these weights: measured anew, the explained variance is the same.
+    predict = jax.vmap(jax.vmap(bandit.mean_reward, (None, 0, None)), (0, 0, None))
+    predicted = predict(
+        bandit_dataset.observation, bandit_dataset.action, BanditParams(weights=weights)
+    )
+    wanted = reward_targets(bandit_dataset, "q", discrete=False)
+    r2 = 1 - float(jnp.mean((predicted - wanted) ** 2) / wanted.var())
+    assert r2 == pytest.approx(report["reward_r2"], abs=0.03)
+
+
+def test_the_contexts_are_fitted_to_the_states(fitted, bandit_dataset):
+    bandit, weights, report = fitted
+    assert abs(report["energy_distance"]) < 0.02
+    params = BanditParams(weights=weights)
+    contexts, _ = jax.vmap(bandit.reset, (0, None))(
+        jax.random.split(jax.random.key(4), 1000), params
+    )
+    # Uniform in [0, 1]: mean 1/2, deviation sqrt(1/12) = 0.289.
+    assert float(contexts.mean()) == pytest.approx(0.5, abs=0.08)
+    assert float(contexts.std()) == pytest.approx(0.289, abs=0.06)
+
+
+def test_the_fitted_weights_are_a_bandits(fitted):
+    bandit, weights, _ = fitted
+    shapes = {
+        f"{network}/{layer}/{name}": array.shape
+        for network, layers in weights.items()
+        for layer, arrays in layers.items()
+        for name, array in arrays.items()
+    }
+    assert shapes == bandit.weight_shapes()
+
+
+def test_a_discrete_bandit_is_fitted_too(corridor_dataset):
+    dataset, _, params = corridor_dataset
+    bandit = bandit_for(Corridor(), params, BanditConfig(hidden_size=8), "Synthetic-Corridor")
+    config = WarmStartConfig(construction="action_distance", fit_steps=300)
+    dataset = jax.tree.map(jnp.asarray, dataset)
+    weights, report = fit_bandit(bandit, dataset, jax.random.key(5), config)
+    assert report["reward_r2"] > 0.9
+    # The expert's action 0 is the better one in every cell.
+    params = BanditParams(weights=weights)
+    for context in jnp.eye(3):
+        assert bandit.mean_reward(context, 0, params) > bandit.mean_reward(context, 1, params)
+
+
+# -- the expert ---------------------------------------------------------------------------------------
+
+
+def test_the_expert_is_the_best_of_those_that_were_trained():
+    # Ten cells, in each of which action 1 pays 1: agents after one batch earn about 5, give or take 1.6,
+    # and the best of sixteen earns more than the first of them.
+    env, key = Corridor(cells=10), jax.random.key(0)
+    params = CorridorParams(rewards=jnp.tile(jnp.array([0.0, 1.0]), (10, 1)), last=9)
+    setting = Setting(TINY, PPOHyperparameters(), source="this test")
+    first, best = (train_expert(env, params, setting, key, number) for number in (1, 16))
+    assert best.mean_return > first.mean_return
+    # 16 agents with one batch of 2 x 8 steps.
+    assert best.environment_steps == 16 * 16
+    # The agent that is handed out earns what it says.
+    actions = [best.agent.act(best.state, cell, key, params, mode=True) for cell in jnp.eye(10)]
+    assert sum(map(int, actions)) == best.mean_return
+
+
+# -- configuration ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"construction": "Q"}, "unknown warm-start construction 'Q': did you mean q"),
+        ({"num_experts": 0}, "num_experts is 0: it must be at least 1"),
+        ({"num_states": 0}, "num_states is 0"),
+        ({"num_actions": -2}, "num_actions is -2"),
+        ({"horizon": 0}, "horizon is 0"),
+        ({"fit_steps": 0}, "fit_steps is 0"),
+    ],
+)
+def test_impossible_configurations_are_refused(arguments, message):
+    with pytest.raises(UserError, match=message):
+        WarmStartConfig(**arguments)
+
+
+def test_an_action_space_of_one_number_has_scalar_shapes():
+    # Pendulum's actions are [1]; a space of shape () must work as well.
+    bandit = SyntheticBandit(1, spaces.Box(-1.0, 1.0, (), jnp.float32), BanditConfig(hidden_size=2))
+    params = BanditParams(weights=bandit.init_weights(jax.random.key(0)))
+    assert bandit.mean_reward(jnp.zeros(1), jnp.float32(0.5), params).shape == ()
