@@ -29,11 +29,11 @@ from lpo.pipeline import check_settings, meta_training_artefact, run_pipeline
 from scb.artefacts import package_versions
 from scb.errors import UserError
 from scb.evolution import EvolutionConfig, evolve
-from scb.runs import Run, settle, write_json
+from scb.runs import Run, command_of, settle, write_json
 from scb.statistics import estimate
 
 META_TRAINING_PRESETS: dict[str, dict[str, Any]] = {
-    "quick": {"population_size": 32, "generations": 60},
+    "quick": {"population_size": 32, "generations": 50},
     "paper": {"population_size": 64, "generations": 512},
 }
 
@@ -45,11 +45,6 @@ def seed_list(count: int, first: int) -> list[int]:
     if first < 0:
         raise UserError(f"seed is {first}: it must be 0 or larger.")
     return list(range(first, first + count))
-
-
-def command_line() -> str:
-    """The command that is running, as one would type it."""
-    return shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])
 
 
 def run(
@@ -110,13 +105,14 @@ def meta_train_command(
 
     Args:
       environment: where the inner loop trains: Synthetic-Pendulum-v1, Pendulum-v1, hopper, ...
-      preset: quick (60 generations of 32) or paper (512 of 64); single flags override it.
+      preset: quick (50 generations of 32) or paper (512 of 64); single flags override it.
       seed: decides everything.
       out: folder to write; must be new or empty.
       resume: a run folder to continue; its settings apply, and a flag that contradicts them is an
         error.
-      fitness: transfer (return of the bandit-trained agent in the evaluation environment), return
-        (in the bandit), or area (mean of the return over training).
+      fitness: return (of the trained agent where it was trained, without noise), area (the mean of
+        that over the training), or transfer (return of the bandit-trained agent in the bandit's
+        evaluation environment).
       reward_noise: noise on the bandit's reward, in its standard deviations. Without it the drift
         overfits the bandit.
       base: ppo (the network corrects PPO's clip) or none.
@@ -162,7 +158,7 @@ def meta_train_command(
         folder.folder / "objective.npz",
         config.drift,
         outcome.mean,
-        meta_training_artefact(problem, outcome, settings, command_line()),
+        meta_training_artefact(problem, outcome, settings, command_of("lpo", settings)),
     )
     figures.save(
         figures.meta_training_curve(
@@ -205,23 +201,18 @@ def meta_training_config(settings: Mapping[str, Any]) -> MetaTrainingConfig:
         }
     )
     drift = LearnedDrift(**given(base="base"))
-    environment = settings.get("environment") or default.environment
-    fitness = {} if environment.startswith("Synthetic-") else {"fitness": "return"}
     return MetaTrainingConfig(
         drift=drift,
         evolution=evolution,
-        **{
-            **fitness,
-            **given(
-                environment="environment",
-                fitness="fitness",
-                reward_noise="reward_noise",
-                agents_per_candidate="agents_per_candidate",
-                contexts="contexts",
-                evaluation_episodes="evaluation_episodes",
-                backend="backend",
-            ),
-        },
+        **given(
+            environment="environment",
+            fitness="fitness",
+            reward_noise="reward_noise",
+            agents_per_candidate="agents_per_candidate",
+            contexts="contexts",
+            evaluation_episodes="evaluation_episodes",
+            backend="backend",
+        ),
     )
 
 

@@ -18,9 +18,10 @@ import jax.numpy as jnp
 
 from lpo.drift import LearnedDrift
 from scb.agents.hyperparameters import environment_setting
-from scb.agents.ppo import PPO, PPOConfig, PPOHyperparameters, PPOState
+from scb.agents.ppo import PPO, PPOConfig, PPOState
 from scb.environments.registry import make
 from scb.environments.synthetic import SyntheticBandit
+from scb.environments.zoo import home_of
 from scb.errors import UserError, unknown_name
 from scb.evolution import EnvironmentSteps, EvolutionConfig, Outcome, evolve
 from scb.runs import Run
@@ -43,12 +44,13 @@ class MetaTrainingConfig:
         the mean of that over the training; "transfer": in the bandit's evaluation environment.
       agent: PPO's static configuration; None takes `inner_loop(environment, contexts)`.
       contexts: size of a batch on a bandit.
-      learning_rates, entropy_coefficients: values that an inner agent's are drawn from.
+      learning_rates, entropy_coefficients: values that an inner agent's are drawn from; where
+        empty, those of the (evaluation) environment's own setting.
       reward_noise: standard deviation of the noise on a bandit's reward, in standard deviations of
         that reward over random contexts and actions. Real environments have noise of their own and
         take none.
       agents_per_candidate: inner agents whose mean is a candidate's fitness.
-      evaluation_episodes: of each inner agent; on a bandit an episode is one step.
+      evaluation_episodes: of each inner agent; None takes 50 where they are of one step, else 20.
       mode_actions: evaluate the most likely actions rather than sampled ones.
       backend: Brax physics, where the environment is Brax's (with "transfer": the evaluation
         environment).
@@ -58,14 +60,14 @@ class MetaTrainingConfig:
     environment: str = "Synthetic-Pendulum-v1"
     drift: LearnedDrift = field(default_factory=LearnedDrift)
     initial_scale: float = 0.1
-    fitness: Fitness = "transfer"
+    fitness: Fitness = "return"
     agent: PPOConfig | None = None
     contexts: int = 200
-    learning_rates: tuple[float, ...] = (1e-3,)
-    entropy_coefficients: tuple[float, ...] = (0.01,)
+    learning_rates: tuple[float, ...] = ()
+    entropy_coefficients: tuple[float, ...] = ()
     reward_noise: float = 5.0
-    agents_per_candidate: int = 2
-    evaluation_episodes: int = 20
+    agents_per_candidate: int = 4
+    evaluation_episodes: int | None = None
     mode_actions: bool = True
     backend: str | None = None
     evolution: EvolutionConfig = field(
@@ -77,17 +79,15 @@ class MetaTrainingConfig:
     def __post_init__(self) -> None:
         if self.fitness not in FITNESSES:
             raise unknown_name("fitness", self.fitness, FITNESSES)
-        if self.fitness == "transfer" and not self.environment.startswith("Synthetic-"):
+        if self.fitness == "transfer" and home_of(self.environment) is None:
             raise UserError(
                 f"fitness 'transfer' asks for a bandit, and {self.environment!r} is none: use 'return' or 'area', or "
                 f"train on 'Synthetic-{self.environment}'."
             )
         for name in ("agents_per_candidate", "evaluation_episodes", "contexts"):
-            if getattr(self, name) < 1:
-                raise UserError(f"{name} is {getattr(self, name)}: it must be at least 1.")
-        for name in ("learning_rates", "entropy_coefficients"):
-            if not getattr(self, name):
-                raise UserError(f"{name} is empty: give at least one value.")
+            value = getattr(self, name)
+            if value is not None and value < 1:
+                raise UserError(f"{name} is {value}: it must be at least 1.")
         if not 0 <= self.reward_noise < math.inf:
             raise UserError(
                 f"reward_noise is {self.reward_noise}: it must be 0 or larger, and finite."
@@ -101,9 +101,10 @@ def inner_loop(environment: str, contexts: int) -> PPOConfig:
     environment's setting, so that the objective meets the regime in which it will be used, while a
     batch holds a fraction of the transitions: contexts are independent, consecutive steps are not.
     """
-    if not environment.startswith("Synthetic-"):
+    home = home_of(environment)
+    if home is None:
         return environment_setting(environment).config
-    setting = environment_setting(environment.removeprefix("Synthetic-")).config
+    setting = environment_setting(home).config
     return replace(
         setting,
         num_envs=contexts,
@@ -118,24 +119,24 @@ class MetaTraining:
 
     def __init__(self, config: MetaTrainingConfig) -> None:
         self.config = config
+        self.home = home_of(config.environment) or config.environment
         physics = {} if config.backend is None else {"backend": config.backend}
         if config.fitness == "transfer":
             # The bandit has no physics; the environment that it stands for may.
             self.env, self.env_params = make(config.environment)
-            evaluated = config.environment.removeprefix("Synthetic-")
-            self.evaluation_env, self.evaluation_params = make(evaluated, **physics)
+            self.evaluation_env, self.evaluation_params = make(self.home, **physics)
         else:
             self.env, self.env_params = make(config.environment, **physics)
             self.evaluation_env, self.evaluation_params = self.env, self.env_params
         self.agent_config = config.agent or inner_loop(config.environment, config.contexts)
         self.agent = PPO(self.env, self.agent_config, config.drift)
+        one_step = isinstance(self.evaluation_env, SyntheticBandit)
+        self.evaluation_episodes = config.evaluation_episodes or (50 if one_step else 20)
         self.training_params = self.env_params
         if isinstance(self.env, SyntheticBandit) and config.reward_noise:
             scale = self.env.reward_scale(self.env_params, jax.random.key(0))
             self.training_params = self.env_params.replace(reward_noise=config.reward_noise * scale)
-        self.base_hyperparameters = PPOHyperparameters()
-        if not isinstance(self.env, SyntheticBandit):
-            self.base_hyperparameters = environment_setting(config.environment).hyperparameters
+        self.base_hyperparameters = environment_setting(self.home).hyperparameters
 
     def initial_solution(self, key: jax.Array) -> dict[str, jax.Array]:
         weights = self.config.drift.init(key)
@@ -156,20 +157,19 @@ class MetaTraining:
         """[] fitness of one agent that was trained with these drift parameters."""
         config = self.config
         key_rate, key_entropy, key_train, key_evaluate = jax.random.split(key, 4)
-        hyperparameters = replace(
-            self.base_hyperparameters,
-            learning_rate=jax.random.choice(key_rate, jnp.asarray(config.learning_rates)),
-            entropy_coefficient=jax.random.choice(
-                key_entropy, jnp.asarray(config.entropy_coefficients)
-            ),
-            drift=drift_parameters,
-        )
+        hyperparameters = replace(self.base_hyperparameters, drift=drift_parameters)
+        if config.learning_rates:
+            rate = jax.random.choice(key_rate, jnp.asarray(config.learning_rates))
+            hyperparameters = replace(hyperparameters, learning_rate=rate)
+        if config.entropy_coefficients:
+            entropy = jax.random.choice(key_entropy, jnp.asarray(config.entropy_coefficients))
+            hyperparameters = replace(hyperparameters, entropy_coefficient=entropy)
 
         def judge(state: PPOState, key: jax.Array) -> jax.Array:
             return self.agent.evaluate(
                 state,
                 key,
-                config.evaluation_episodes,
+                self.evaluation_episodes,
                 self.evaluation_env,
                 self.evaluation_params,
                 mode=config.mode_actions,
@@ -198,7 +198,7 @@ class MetaTraining:
             training=agents * self.agent_config.num_iterations * self.agent_config.batch_size,
             evaluation=agents
             * points
-            * self.config.evaluation_episodes
+            * self.evaluation_episodes
             * int(self.evaluation_params.max_steps_in_episode),
         )
 

@@ -26,6 +26,8 @@ from lpo.meta_training import MetaTraining, MetaTrainingConfig
 from lpo.objectives import Objective, load_objective, save_objective
 from scb.artefacts import machine_description, package_versions
 from scb.environments.registry import make
+from scb.environments.synthetic import SyntheticBandit
+from scb.environments.zoo import bandit_metadata, home_of
 from scb.evolution import EvolutionConfig, Outcome, evolve
 from scb.runs import Run, Stopwatch, write_json
 
@@ -43,8 +45,8 @@ PRESETS: dict[str, dict[str, Any]] = {
     },
     "quick": {
         "population_size": 32,
-        "generations": 40,
-        "agents_per_candidate": 2,
+        "generations": 50,
+        "agents_per_candidate": 4,
         "evaluations": [
             {"environment": "Pendulum-v1", "backend": None, "seeds": 10, "steps": 150_000},
             {"environment": "hopper", "backend": "spring", "seeds": 4, "steps": 500_000},
@@ -53,7 +55,7 @@ PRESETS: dict[str, dict[str, Any]] = {
     "paper": {
         "population_size": 64,
         "generations": 512,
-        "agents_per_candidate": 2,
+        "agents_per_candidate": 4,
         "evaluations": [
             {"environment": "Pendulum-v1", "backend": None, "seeds": 20, "steps": 150_000},
             {
@@ -114,8 +116,9 @@ def run_pipeline(run: Run, settings: Mapping[str, Any], command: str) -> Path:
         "objective": {"name": objective.name, "certificate": certificate.as_dict()},
         "meta_training": {k: v for k, v in meta.items() if k != "metrics"},
         "comparisons": {name: c.as_dict() for name, c in comparisons.items()},
-        "seconds": round(watch.lap(), 1),
     }
+    if not run.resumed:  # else it would be the time of the last stages alone
+        results["seconds"] = round(watch.lap(), 1)
     write_json(folder / "results.json", results)
     return report.write_report(folder, results, paths)
 
@@ -181,7 +184,7 @@ def _learn(
     meta = {
         "environment": config.environment,
         "fitness": config.fitness,
-        "config": dict(settings),
+        "config": _plain(config),
         "seconds": round(run.seconds(), 1),
         "generations": config.evolution.num_generations,
         "steps": {
@@ -198,7 +201,7 @@ def _learn(
 
 def environment_problem(config: MetaTrainingConfig) -> MetaTraining:
     """The same meta-training on the bandit's evaluation environment itself."""
-    name = config.environment.removeprefix("Synthetic-")
+    name = home_of(config.environment) or config.environment
     return MetaTraining(replace(config, environment=name, fitness="return", agent=None))
 
 
@@ -215,8 +218,12 @@ def meta_training_artefact(
         for key, value in line.items()
         if key in ("mean/fitness", "final_mean/fitness")
     ]
+    config = {"meta_training": _plain(problem.config), "settings": dict(settings)}
+    if isinstance(problem.env, SyntheticBandit):
+        # The name alone does not say which weights it stood for.
+        config["bandit_sha256"] = bandit_metadata(problem.config.environment)["sha256"]
     return {
-        "config": {"meta_training": _plain(problem.config), "settings": dict(settings)},
+        "config": config,
         "seeds": {"meta_training": evolution.seed},
         "results": {"mean_fitness": judged},
         "cost": {
@@ -277,7 +284,11 @@ def _figures(
     drawn = {}
     if meta:
         drawn["meta_training"] = figures.meta_training_curve(
-            meta["metrics"], config.environment, config.fitness
+            meta["metrics"],
+            config.environment,
+            config.fitness,
+            config.evolution.population_size,
+            config.evolution.mean_evaluations,
         )
         drawn["environment_steps"] = figures.environment_steps(
             meta["steps"], meta["environment_steps"]

@@ -1,7 +1,5 @@
 """What the subcommands of `scb` do. Their docstrings are the command line's help."""
 
-import shlex
-import sys
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -14,18 +12,18 @@ from rich.table import Table
 from scb.agents.hyperparameters import inner_loop_config, inner_loop_lists
 from scb.artefacts import machine_description
 from scb.discovery import (
+    BanditDiscovery,
     BanditTraining,
     DiscoveryConfig,
     check_fits,
-    discover,
     judge,
 )
 from scb.environments.registry import make
 from scb.environments.synthetic import BanditConfig
 from scb.environments.zoo import PREFIX, bandit_metadata, open_bandit, save_bandit, zoo_names
 from scb.errors import UserError
-from scb.evolution import config_dict
-from scb.runs import Run, settle
+from scb.evolution import config_dict, evolve
+from scb.runs import Run, command_of, settle
 from scb.statistics import estimate
 from scb.warm_start import WarmStartConfig
 
@@ -111,8 +109,10 @@ def discover_command(
     }
     settings = settle(flags, PRESETS, preset, resume)
     config = discovery_config(settings)
+    # The problem first: where a name is wrong, no folder is left behind to be in the next try's way.
+    problem = BanditDiscovery(config)
     folder = Run.open(resume or out, settings, resume=resume is not None, wandb_project=wandb)
-    problem, outcome = discover(config, folder)
+    outcome = evolve(problem, config.evolution, folder)
     folder.close()
     console = Console()
     results = {}
@@ -154,7 +154,7 @@ def discover_command(
                 "seconds": round(outcome.seconds, 1),
                 "machine": machine_description(),
             },
-            "command": shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]]),
+            "command": command_of("scb", settings),
         },
     )
     console.print(f"bandit: {path}")

@@ -134,17 +134,22 @@ class BanditDiscovery:
             self.bandit, self.env, self.env_params, self.agent_config, lists
         )
         self.warm_start_report: dict[str, float] = {}
+        # Read now, so that a wrong name is told before anything is computed or written.
+        self._start = None if config.start is None else self._weights_of(config.start)
+
+    def _weights_of(self, name: str) -> Weights:
+        start = open_bandit(name)
+        check_fits(start, self.env, self.env_params, self.config.environment)
+        if start.weight_shapes() != self.bandit.weight_shapes():
+            raise UserError(
+                f"{name} has other layer sizes than the bandit to discover: start from one whose hidden_size is "
+                f"{self.config.bandit.hidden_size}."
+            )
+        return start.default_params.weights
 
     def initial_solution(self, key: jax.Array) -> Weights:
-        if self.config.start is not None:
-            start = open_bandit(self.config.start)
-            check_fits(start, self.env, self.env_params, self.config.environment)
-            if start.weight_shapes() != self.bandit.weight_shapes():
-                raise UserError(
-                    f"{self.config.start} has other layer sizes than the bandit to discover: start from one whose "
-                    f"hidden_size is {self.config.bandit.hidden_size}."
-                )
-            return start.default_params.weights
+        if self._start is not None:
+            return self._start
         if self.config.init == "random":
             return self.bandit.init_weights(key)
         return self._expert_fit

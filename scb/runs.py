@@ -11,6 +11,7 @@ runs/NAME/checkpoints/      orbax
 import hashlib
 import json
 import os
+import shlex
 import shutil
 import time
 from collections.abc import Mapping
@@ -141,6 +142,16 @@ def read_config(folder: str | Path) -> dict[str, Any]:
         raise UserError(
             f"{folder} is not a run (no readable config.json): give the folder of a run that was started with --out."
         ) from error
+
+
+def command_of(program: str, settings: Mapping[str, Any]) -> str:
+    """The command that starts a run with these settings afresh, however it was typed or resumed."""
+    flags = [
+        f"--{name.replace('_', '-')}" if value is True else f"--{name.replace('_', '-')}={value}"
+        for name, value in settings.items()
+        if name != "command" and value is not None and value is not False
+    ]
+    return shlex.join([program, str(settings["command"]), *flags])
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:

@@ -6,6 +6,7 @@ import gymnax
 from gymnax.environments import environment
 
 from scb.environments.brax import BRAX_NAMES, BraxEnvironment
+from scb.environments.zoo import load_bandit
 from scb.errors import UserError, unknown_name
 
 
@@ -18,13 +19,16 @@ def make(name: str, **arguments: Any) -> tuple[environment.Environment[Any, Any]
     """An environment and its default parameters.
 
     Args:
-      name: "Synthetic-Pendulum-v1", "CartPole-v1", "hopper", ...
+      name: "Synthetic-Pendulum-v1", "CartPole-v1", "hopper", ..., or a bandit's file.npz.
       arguments: for the environment's constructor; Brax takes `backend="generalized" | "positional"
         | "spring"`.
 
     Raises:
       UserError: unknown name (with near matches), or arguments that the environment doesn't take.
     """
+    if name.endswith(".npz"):
+        bandit = load_bandit(name)
+        return bandit, bandit.default_params
     try:
         if name in BRAX_NAMES:
             env = BraxEnvironment(name, **arguments)

@@ -30,6 +30,15 @@ def zoo_names() -> list[str]:
     return sorted(p.name.removesuffix(".npz") for p in folder.iterdir() if p.name.endswith(".npz"))
 
 
+def home_of(name: str) -> str | None:
+    """The evaluation environment of a bandit's name or file; None where it isn't a bandit's.
+
+    "Synthetic-Pendulum-v1" and "runs/mine/Synthetic-Pendulum-v1.npz" stand for "Pendulum-v1".
+    """
+    stem = Path(name).name.removesuffix(".npz")
+    return stem.removeprefix(PREFIX) if stem.startswith(PREFIX) else None
+
+
 def register_zoo() -> None:
     """Registers every bandit of the zoo, so that `gymnax.make("Synthetic-Pendulum-v1")` works."""
     for name in zoo_names():

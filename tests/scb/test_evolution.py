@@ -19,9 +19,11 @@ from hypothesis import strategies as st
 import scb
 from scb.errors import UserError
 from scb.evolution import (
+    COMBINATIONS,
     STRATEGIES,
     EnvironmentSteps,
     EvolutionConfig,
+    combine_tasks,
     config_dict,
     evolve,
     map_population,
@@ -185,6 +187,52 @@ def test_the_best_mean_is_the_one_that_was_judged_best():
     assert 0 < outcome.best_mean_generation < 30
     assert -(distance(outcome.best_mean) ** 2) == pytest.approx(max(judged), rel=1e-5)
     assert distance(outcome.mean) > 2 * distance(outcome.best_mean)
+
+
+# -- several tasks ------------------------------------------------------------------------------------
+
+# Three candidates on two tasks, the second of which scatters a hundred times more.
+TASKS = np.array([[1.0, 100.0], [2.0, 300.0], [3.0, 200.0]])
+
+
+def test_tasks_are_combined_by_their_mean():
+    np.testing.assert_allclose(combine_tasks(TASKS, "mean"), [50.5, 151.0, 101.5])
+
+
+def test_tasks_are_combined_by_ranks_whatever_their_scale():
+    # Ranks 1 2 3 and 1 3 2: means 1, 2.5, 2.5. A tie shares its ranks: 1.5 1.5 3.
+    np.testing.assert_allclose(combine_tasks(TASKS, "ranks"), [1.0, 2.5, 2.5])
+    np.testing.assert_allclose(combine_tasks(TASKS * [1.0, -1e6], "ranks"), [2.0, 1.5, 2.5])
+    np.testing.assert_allclose(combine_tasks(np.array([[1.0], [1], [2]]), "ranks"), [1.5, 1.5, 3])
+
+
+@pytest.mark.parametrize("how", COMBINATIONS)
+@pytest.mark.parametrize("broken", [np.nan, np.inf, -np.inf])
+def test_a_candidate_that_failed_on_one_task_failed(how, broken):
+    tasks = TASKS.copy()
+    tasks[0, 1] = broken
+    combined = combine_tasks(tasks, how)
+    np.testing.assert_array_equal(np.isfinite(combined), [False, True, True])
+    assert rank_failed_last(combined)[0].argmin() == 0
+
+
+class Vote(Parabola):
+    """Two tasks want x0 to grow; a third wants it to shrink, a thousand times louder."""
+
+    def evaluate(self, candidate, key, generation):
+        x0 = candidate["x"][0]
+        return {"fitness": x0 * jnp.array([1.0, 1.0, -1000.0]), "x0": x0}
+
+
+def test_the_search_follows_the_mean_or_the_majority_of_tasks_and_logs_the_mean():
+    ranks, mean = (
+        evolve(Vote(), replace(CONFIG, combine=how), quiet=True) for how in ("ranks", "mean")
+    )
+    assert ranks.mean["x"][0] > 0.3 > -0.3 > mean.mean["x"][0]
+    # Both start from the same candidates, whose logged fitness is -998/3 x0 either way.
+    first = ranks.metrics[0]
+    assert first["fitness/max"] == mean.metrics[0]["fitness/max"]
+    assert first["fitness/mean"] == pytest.approx(-998 / 3 * first["candidates/x0"], rel=1e-4)
 
 
 # -- candidates that fail -----------------------------------------------------------------------------
@@ -489,6 +537,7 @@ def test_progress_says_fitness_failures_and_time_left(capsys):
         ({"strategy": "SNESS"}, "unknown evolution strategy 'SNESS': did you mean SNES or"),
         ({"strategy": "open_es"}, "unknown evolution strategy 'open_es': did you mean Open_ES"),
         ({"strategy": "RandomSearch"}, "unknown evolution strategy 'RandomSearch'"),
+        ({"combine": "rank"}, "unknown combination of tasks 'rank': did you mean ranks"),
         ({"population_size": 1}, "population_size is 1: .* at least 2"),
         ({"population_size": 5, "strategy": "Open_ES"}, "population_size is 5: .* must be even"),
         ({"num_generations": 0}, "num_generations is 0: it must be at least 1"),

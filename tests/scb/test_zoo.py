@@ -16,6 +16,7 @@ from scb.environments.synthetic import BanditConfig, BanditParams, SyntheticBand
 from scb.environments.zoo import (
     PREFIX,
     bandit_metadata,
+    bandit_metadata,
     load_bandit,
     open_bandit,
     save_bandit,
@@ -171,5 +172,11 @@ def test_every_bandit_of_the_zoo_says_what_it_is_worth_and_how_it_was_found():
         assert result["low"] <= result["value"] <= result["high"]
         assert metadata["command"].startswith("scb discover")
         assert metadata["config"]["evaluation_environment"] == name.removeprefix(PREFIX)
-        seeds = metadata["seeds"]
-        assert seeds["reporting"] != seeds["discovery"]
+        assert metadata["seeds"]["reporting"] != metadata["seeds"]["discovery"]
+
+
+def test_the_metadata_of_a_bandit_is_read_by_name_or_file(tmp_path):
+    path, _ = saved(tmp_path, BANDITS["box"])
+    assert bandit_metadata(str(path))["command"] == "scb discover"
+    for name in zoo_names():
+        assert bandit_metadata(name)["name"] == name
