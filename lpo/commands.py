@@ -33,7 +33,7 @@ from scb.runs import Run, command_of, settle, write_json
 from scb.statistics import estimate
 
 META_TRAINING_PRESETS: dict[str, dict[str, Any]] = {
-    "quick": {"population_size": 32, "generations": 50},
+    "quick": {"population_size": 32, "generations": 30},
     "paper": {"population_size": 64, "generations": 512},
 }
 
@@ -105,7 +105,7 @@ def meta_train_command(
 
     Args:
       environment: where the inner loop trains: Synthetic-Pendulum-v1, Pendulum-v1, hopper, ...
-      preset: quick (50 generations of 32) or paper (512 of 64); single flags override it.
+      preset: quick (30 generations of 32) or paper (512 of 64); single flags override it.
       seed: decides everything.
       out: folder to write; must be new or empty.
       resume: a run folder to continue; its settings apply, and a flag that contradicts them is an

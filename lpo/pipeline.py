@@ -45,7 +45,7 @@ PRESETS: dict[str, dict[str, Any]] = {
     },
     "quick": {
         "population_size": 32,
-        "generations": 50,
+        "generations": 30,
         "agents_per_candidate": 4,
         "evaluations": [
             {"environment": "Pendulum-v1", "backend": None, "seeds": 10, "steps": 150_000},

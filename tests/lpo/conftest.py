@@ -1,39 +1,17 @@
-"""A small bandit, a small agent and a small learned objective, which the tests of `lpo` share."""
+"""A small agent and a small learned objective, which the tests of `lpo` share."""
 
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 
-import gymnax
 import jax
-import jax.numpy as jnp
 import pytest
-from gymnax.environments import spaces
 
 from lpo.drift import LearnedDrift
 from lpo.objectives import save_objective
 from scb.agents.ppo import PPOConfig
-from scb.environments.synthetic import BanditConfig, SyntheticBandit
 
 # What an artefact must say beside its weights.
 METADATA = {"config": {}, "seeds": {}, "results": {}, "cost": {}, "command": "a test"}
-
-
-def random_bandit(name: str, seed: int = 0) -> SyntheticBandit:
-    """A bandit of Pendulum's shapes whose weights were never evolved."""
-    action_space = spaces.Box(-2.0, 2.0, (1,), jnp.float32)
-    shape = SyntheticBandit(3, action_space, BanditConfig(hidden_size=4))
-    weights = shape.init_weights(jax.random.key(seed))
-    return SyntheticBandit(3, action_space, shape.config, weights, name)
-
-
-@pytest.fixture(scope="session")
-def bandit_name() -> str:
-    """Pendulum's bandit: the one that ships, or one of random weights under its name."""
-    name = "Synthetic-Pendulum-v1"
-    if name not in gymnax.registered_envs:
-        gymnax.register(name, partial(random_bandit, name))
-    return name
 
 
 @pytest.fixture(scope="session")

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shlex
 import subprocess
 import sys
 from dataclasses import replace
@@ -17,6 +18,7 @@ import lpo
 from lpo import cli, commands
 from lpo.drift import NoDrift
 from lpo.generalization import LearningCurves
+from lpo.meta_training import MetaTrainingConfig
 from lpo.objectives import Objective, load_objective
 from scb.environments.synthetic import BanditConfig, SyntheticBandit
 from scb.environments.zoo import save_bandit
@@ -26,7 +28,7 @@ PROGRAMS = {"lpo": cli.main, "scb": cli.scb_main}
 
 
 @pytest.fixture(autouse=True)
-def working_folder(tmp_path, monkeypatch, bandit_name) -> Path:
+def working_folder(tmp_path, monkeypatch) -> Path:
     """Where default outputs such as runs/quick would go."""
     monkeypatch.chdir(tmp_path)
     return tmp_path
@@ -476,6 +478,7 @@ def test_meta_train_writes_an_objective_that_loads(
         "generations": 2,
         "agents-per-candidate": 1,
         "evaluation-episodes": 2,
+        "fitness": "transfer",
         "seed": 4,
         "out": "learned",
     }
@@ -495,10 +498,22 @@ def test_meta_train_writes_an_objective_that_loads(
     figure = working_folder / "learned" / "figures" / "meta_training.png"
     assert figure.read_bytes().startswith(b"\x89PNG")
 
+    # The command that the artefact holds asks for the same again.
+    def interrupt(*arguments):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(commands, "evolve", interrupt)
+    program, *again = shlex.split(objective.metadata["command"])
+    assert program == "lpo"
+    assert cli.main([*again, "--out", "again"]) == 130
+    configs = [working_folder / name / "config.json" for name in ("learned", "again")]
+    assert configs[0].read_bytes() == configs[1].read_bytes()
+
 
 def test_flags_of_meta_train_reach_the_configuration():
     flags = {
         "environment": "Pendulum-v1",
+        "fitness": "area",
         "reward_noise": 1.5,
         "base": "none",
         "strategy": "SNES",
@@ -514,12 +529,15 @@ def test_flags_of_meta_train_reach_the_configuration():
     }
     config = commands.meta_training_config(flags)
     evolution = config.evolution
-    # An environment that is no bandit has nothing to transfer to.
-    assert (config.environment, config.fitness) == ("Pendulum-v1", "return")
+    assert (config.environment, config.fitness) == ("Pendulum-v1", "area")
     assert (config.reward_noise, config.drift.base, config.contexts) == (1.5, "none", 40)
     assert (config.agents_per_candidate, config.evaluation_episodes) == (3, 8)
     assert (config.backend, evolution.strategy, evolution.seed) == ("spring", "SNES", 9)
     assert (evolution.population_size, evolution.num_generations) == (6, 7)
     assert (evolution.sigma, evolution.learning_rate) == (0.2, 0.3)
     # And what is left out keeps its default.
-    assert commands.meta_training_config({}).fitness == "transfer"
+    default = MetaTrainingConfig()
+    unset = commands.meta_training_config(dict.fromkeys(flags))
+    assert replace(unset, evolution=default.evolution) == default
+    for name in ("strategy", "sigma", "learning_rate", "mean_evaluations"):
+        assert getattr(unset.evolution, name) == getattr(default.evolution, name)

@@ -135,6 +135,16 @@ def test_features_are_those_of_the_list_in_its_order():
     assert named == pytest.approx(expected, abs=1e-5)
 
 
+def test_a_network_by_hand_charges_beyond_xi_and_nothing_within():
+    # One unit that sees log r alone: f = relu(tanh(log r) - xi), xi = 0.01.
+    drift = LearnedDrift(base="none", hidden_size=1, xi=0.01)
+    seen = jnp.zeros((len(FEATURES), 1)).at[FEATURES.index("log r"), 0].set(1.0)
+    parameters = {"hidden": seen, "output": jnp.ones((1, 1))}
+    charged = drift(parameters, batch(0.1, 0.005, -0.1), batch(1, 1, 1), batch(0, 0, 0))
+    # tanh(0.1) = 0.099668; tanh(0.005) < 0.01; tanh(-0.1) < 0.
+    np.testing.assert_allclose(charged, [0.089668, 0.0, 0.0], atol=1e-6)
+
+
 def random_weights(seed: int, scale: float) -> dict[str, jax.Array]:
     rng = np.random.default_rng(seed)
     shapes = LearnedDrift(hidden_size=HIDDEN).weight_shapes()

@@ -116,12 +116,17 @@ def test_training_setting_is_the_environments_own_but_for_the_steps():
 
 
 @pytest.fixture(scope="module")
-def arguments(bandit_name, tiny_agent):
+def arguments(tiny_agent):
     # Seven batches of eight contexts.
     setting = Setting(
         replace(tiny_agent, total_steps=56), PPOHyperparameters(learning_rate=0.03), "a test"
     )
-    return {"environment": bandit_name, "seeds": SEEDS, "setting": setting, "points": 3}
+    return {
+        "environment": "Synthetic-Pendulum-v1",
+        "seeds": SEEDS,
+        "setting": setting,
+        "points": 3,
+    }
 
 
 @pytest.fixture(scope="module")
@@ -168,12 +173,12 @@ def test_the_same_seeds_and_objective_give_the_same_curves(trained, arguments, o
     np.testing.assert_array_equal(again.returns, trained["ppo"].returns)
 
 
-def test_training_is_rounded_up_to_a_multiple_of_the_points(trained, bandit_name):
+def test_training_is_rounded_up_to_a_multiple_of_the_points(trained):
     # 7 batches of 8 have no divisor near 3 points: 9 batches are trained, 3 for each point.
     curve = trained["ppo"]
     assert curve.steps.tolist() == [0, 24, 48, 72]
     assert curve.returns.shape == (len(SEEDS), 4)
-    assert (curve.environment, curve.backend) == (bandit_name, None)
+    assert (curve.environment, curve.backend) == ("Synthetic-Pendulum-v1", None)
     assert (curve.seeds, curve.episodes, curve.mode_actions) == (list(SEEDS), 20, True)
 
 

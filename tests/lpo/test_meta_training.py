@@ -11,6 +11,7 @@ from gymnax.environments import spaces
 from lpo import meta_training
 from lpo.drift import LearnedDrift
 from lpo.meta_training import MetaTraining, MetaTrainingConfig, inner_loop, meta_train
+from scb.agents.hyperparameters import environment_setting
 from scb.agents.ppo import PPOConfig
 from scb.environments.synthetic import BanditConfig, SyntheticBandit
 from scb.errors import UserError
@@ -22,9 +23,9 @@ EVOLUTION = EvolutionConfig(
 
 
 @pytest.fixture(scope="module")
-def config(bandit_name, tiny_agent, tiny_drift) -> MetaTrainingConfig:
+def config(tiny_agent, tiny_drift) -> MetaTrainingConfig:
     return MetaTrainingConfig(
-        environment=bandit_name,
+        environment="Synthetic-Pendulum-v1",
         drift=tiny_drift,
         fitness="return",
         agent=tiny_agent,
@@ -126,10 +127,11 @@ def test_the_inner_loop_on_a_bandit_keeps_the_number_of_updates():
         assert getattr(here, name) == getattr(there, name)
 
 
-def test_hyperparameters_are_the_environments_own_and_the_papers_on_a_bandit(config):
-    on_bandit = MetaTraining(replace(config, reward_noise=0.0)).base_hyperparameters
-    on_pendulum = MetaTraining(replace(config, environment="Pendulum-v1")).base_hyperparameters
-    assert (on_bandit.discount, on_pendulum.discount) == (0.99, 0.995)
+@pytest.mark.parametrize("environment", ["Synthetic-Pendulum-v1", "Pendulum-v1"])
+def test_hyperparameters_are_the_evaluation_environments_own(config, environment):
+    # An objective is learned under the learning rate under which it will be used.
+    problem = MetaTraining(replace(config, environment=environment, reward_noise=0.0))
+    assert problem.base_hyperparameters == environment_setting("Pendulum-v1").hyperparameters
 
 
 # -- what it costs ------------------------------------------------------------------------------
@@ -144,6 +146,9 @@ def test_hyperparameters_are_the_environments_own_and_the_papers_on_a_bandit(con
         ({"fitness": "return"}, 72, 15),
         # 3 batches, evaluated before the first and after each: 3 x 4 points x 5.
         ({"fitness": "area"}, 72, 60),
+        # Left open, it is 50 episodes of one step, or 20 of more: 3 x 50 x 1 and 3 x 20 x 200.
+        ({"fitness": "return", "evaluation_episodes": None}, 72, 150),
+        ({"fitness": "transfer", "evaluation_episodes": None}, 72, 12_000),
         ({"environment": "Pendulum-v1", "fitness": "return"}, 72, 3000),
         ({"environment": "Pendulum-v1", "fitness": "area"}, 72, 12_000),
         # Pendulum's image on the bandit: 3 agents x 15 batches of 50.
@@ -246,15 +251,13 @@ def test_physics_go_to_the_environment_and_not_to_its_bandit(
     [
         ({"fitness": "retrun"}, "unknown fitness 'retrun': did you mean return"),
         (
-            {"environment": "Pendulum-v1"},
+            {"environment": "Pendulum-v1", "fitness": "transfer"},
             "fitness 'transfer' asks for a bandit, and 'Pendulum-v1' is none: use 'return' or "
             "'area', or train on 'Synthetic-Pendulum-v1'.",
         ),
         ({"agents_per_candidate": 0}, "agents_per_candidate is 0: it must be at least 1."),
         ({"evaluation_episodes": -1}, "evaluation_episodes is -1: it must be at least 1."),
         ({"contexts": 0}, "contexts is 0: it must be at least 1."),
-        ({"learning_rates": ()}, "learning_rates is empty: give at least one value."),
-        ({"entropy_coefficients": ()}, "entropy_coefficients is empty: give at least one value."),
         ({"reward_noise": -0.1}, "reward_noise is -0.1: it must be 0 or larger, and finite."),
         ({"reward_noise": float("nan")}, "reward_noise is nan"),
         ({"reward_noise": float("inf")}, "reward_noise is inf"),
@@ -279,9 +282,8 @@ def test_an_environment_that_cannot_be_is_refused(config, changes, message, one_
     assert message in one_sentence(str(error.value))
 
 
-def test_defaults_are_a_bandit_with_noise_judged_by_transfer():
-    # What the library recommends: README and the shipped objective rest on it.
+def test_defaults_take_a_bandit_with_noise():
+    # What the library recommends: documentation and the shipped objective rest on it.
     default = MetaTrainingConfig()
-    assert (default.environment, default.fitness) == ("Synthetic-Pendulum-v1", "transfer")
-    assert (default.reward_noise, default.drift) == (5.0, LearnedDrift(base="ppo"))
-    assert default.evolution.strategy == "Open_ES"
+    assert (default.environment, default.reward_noise) == ("Synthetic-Pendulum-v1", 5.0)
+    assert (default.drift, default.evolution.strategy) == (LearnedDrift(base="ppo"), "Open_ES")

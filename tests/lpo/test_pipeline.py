@@ -14,7 +14,7 @@ from scb.agents.ppo import PPOConfig, PPOHyperparameters
 
 
 @pytest.fixture(scope="module", autouse=True)
-def small(bandit_name, tiny_agent, tiny_drift):
+def small(tiny_agent, tiny_drift):
     """The preset "tiny" with smaller networks, fewer contexts and steps than any preset has."""
     on_bandit, on_environment = pipeline.pipeline_config, pipeline.training_setting
 
@@ -24,6 +24,7 @@ def small(bandit_name, tiny_agent, tiny_drift):
             default,
             agent=tiny_agent,
             drift=tiny_drift,
+            fitness="transfer",
             evaluation_episodes=2,
             evolution=replace(default.evolution, population_size=2, mean_evaluations=2),
         )

@@ -27,10 +27,9 @@ METADATA = {"seeds": {}, "results": {}, "cost": {}, "command": "scb discover", "
 TINY = PPOConfig(
     num_envs=2, num_steps=8, num_epochs=1, num_minibatches=1, total_steps=16, hidden_sizes=(4,)
 )
-DISCOVER = (
-    "discover --environment CartPole-v1 --init random --generations 2 --population-size 4 "
-    "--agents-per-candidate 2 --evaluation-episodes 1 --seed 7 --activation relu --latent uniform"
-).split()
+DISCOVER = ["discover", "--environment", "CartPole-v1", "--init", "random", "--generations", "2"]
+DISCOVER += ["--population-size", "4", "--agents-per-candidate", "2", "--evaluation-episodes", "1"]
+DISCOVER += ["--seed", "7", "--activation", "relu", "--latent", "uniform"]
 
 
 def call(*arguments):
@@ -84,7 +83,7 @@ def test_a_discovery_says_what_its_bandit_is_worth_and_where_it_lies(discovered)
 
 
 def test_a_discovery_leaves_a_bandit_with_its_story(discovered):
-    folder, result = discovered
+    folder, _ = discovered
     bandit = load_bandit(folder / "Synthetic-CartPole-v1.npz")
     assert bandit.config == BanditConfig(
         hidden_size=32, activation="relu", latent="uniform", latent_size=4
