@@ -68,7 +68,7 @@ class DiscoveryConfig:
     init: str = "expert"
     start: str | None = None
     warm_start: WarmStartConfig = field(default_factory=WarmStartConfig)
-    evolution: EvolutionConfig = field(default_factory=EvolutionConfig)
+    evolution: EvolutionConfig = field(default_factory=lambda: EvolutionConfig(combine="ranks"))
 
     def __post_init__(self) -> None:
         if self.init not in INITS:
@@ -258,14 +258,13 @@ def judge(
     """[num_agents] mean returns in the evaluation environment of agents trained in the bandit."""
     key_draw, key_agents = jax.random.split(jax.random.key(seed))
     returns = map_population(
-        lambda hyperparameters, key: training.returns(
+        lambda weights, hyperparameters, key: training.returns(
             BanditParams(weights=weights), hyperparameters, key, num_episodes, mode
         ).mean(),
         num_agents,
-        (0, 0),
+        (None, 0, 0),
     )
-    return np.asarray(
-        returns(
-            training.hyperparameters(key_draw, num_agents), jax.random.split(key_agents, num_agents)
-        )
-    )
+    hyperparameters = training.hyperparameters(key_draw, num_agents)
+    keys = jax.random.split(key_agents, num_agents)
+    # The weights are an argument: as constants they would make another program of every bandit.
+    return np.asarray(returns(weights, hyperparameters, keys))

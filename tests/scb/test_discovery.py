@@ -6,7 +6,12 @@ import numpy as np
 import pytest
 from gymnax.environments import spaces
 
-from scb.agents.hyperparameters import environment_setting, inner_loop_config, inner_loop_lists
+from scb.agents.hyperparameters import (
+    Setting,
+    environment_setting,
+    inner_loop_config,
+    inner_loop_lists,
+)
 from scb.agents.ppo import PPOConfig, PPOHyperparameters
 from scb.discovery import (
     BanditDiscovery,
@@ -181,8 +186,10 @@ def test_a_random_start_is_drawn_from_the_key():
     assert (flat(start) != flat(problem.initial_solution(jax.random.key(4)))).any()
 
 
-def test_an_expert_start_is_fitted_once_and_from_the_seed_alone():
-    warm = WarmStartConfig(num_experts=2, expert_steps=100, num_states=16, horizon=3, fit_steps=20)
+def test_an_expert_start_is_fitted_once_and_from_the_seed_alone(monkeypatch):
+    setting = Setting(TINY, PPOHyperparameters(), source="this test")
+    monkeypatch.setattr("scb.discovery.expert_setting", lambda name, steps: setting)
+    warm = WarmStartConfig(num_experts=2, num_states=16, horizon=3, fit_steps=20)
     problem = BanditDiscovery(replace(CONFIG, init="expert", warm_start=warm))
     start = problem.initial_solution(jax.random.key(3))
     assert shapes(start) == problem.bandit.weight_shapes()
@@ -190,9 +197,9 @@ def test_an_expert_start_is_fitted_once_and_from_the_seed_alone():
     assert problem.initial_solution(jax.random.key(4)) is start
     report = problem.warm_start_report
     assert set(report) == {"expert_return", "environment_steps", "reward_r2", "energy_distance"}
-    # Two experts of one batch of 10 x 100 steps, 256 trajectories of 200 steps, and 16 states with 2
+    # Two experts of two batches of 2 x 8 steps, 256 trajectories of 200 steps, and 16 states with 2
     # actions of 3 steps.
-    assert report["environment_steps"] == 2 * 1000 + 256 * 200 + 16 * 2 * 3
+    assert report["environment_steps"] == 2 * 2 * 16 + 256 * 200 + 16 * 2 * 3
     assert 8 <= report["expert_return"] <= 500
 
 
