@@ -49,7 +49,15 @@ PRESETS: dict[str, dict[str, Any]] = {
         "agents_per_candidate": 4,
         "evaluations": [
             {"environment": "Pendulum-v1", "backend": None, "seeds": 10, "steps": 150_000},
-            {"environment": "hopper", "backend": "spring", "seeds": 4, "steps": 500_000},
+            # Ten episodes of up to 1000 steps at ten points: more would take as long as the training.
+            {
+                "environment": "hopper",
+                "backend": "spring",
+                "seeds": 4,
+                "steps": 500_000,
+                "points": 10,
+                "episodes": 10,
+            },
         ],
     },
     "paper": {
@@ -257,6 +265,8 @@ def _compare(
             seeds,
             setting=training_setting(evaluation["environment"], evaluation["steps"]),
             backend=evaluation["backend"],
+            points=evaluation.get("points", 15),
+            episodes=evaluation.get("episodes", 20),
         )
         write_json(path, result.as_dict())
         curves.append(result)
