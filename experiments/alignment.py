@@ -41,7 +41,7 @@ def main() -> int:
     import jax
     import numpy as np
 
-    from lpo.drift import ClipDrift, Drift, DPODrift, NoDrift
+    from lpo.drift import ClipDrift, DPODrift, Drift, NoDrift
     from lpo.generalization import learning_curves
     from lpo.meta_training import MetaTraining, MetaTrainingConfig
     from lpo.objectives import Objective

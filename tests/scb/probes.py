@@ -22,7 +22,8 @@ class CorridorParams(environment.EnvParams):
 
     Attributes:
       rewards: [C, A] reward of an action in a cell.
-      last: the cell after which the episode terminates; C or more for a corridor that goes on from cell 0.
+      last: the cell after which the episode terminates; C or more for a corridor that goes on from
+        cell 0.
       random_start: 1 to start in a uniformly random cell (up to `last`), 0 to start in cell 0.
     """
 

@@ -69,7 +69,8 @@ def bandit_file(tmp_path_factory):
     return save_bandit(path, bandit, bandit.init_weights(jax.random.key(0)), METADATA)
 
 
-# -- discover -----------------------------------------------------------------------------------------
+# -- discover
+# -----------------------------------------------------------------------------------------
 
 
 def test_a_discovery_says_what_its_bandit_is_worth_and_where_it_lies(discovered):
@@ -95,7 +96,8 @@ def test_a_discovery_leaves_a_bandit_with_its_story(discovered):
     for actions in ("sampled_actions", "mode_actions"):
         estimate = metadata["results"]["PPO"][actions]
         assert estimate["n"] == 20 and estimate["low"] <= estimate["value"] <= estimate["high"]
-    # 2 generations of 4 candidates with 2 agents each: 16 training steps, 500 evaluation steps at most.
+    # 2 generations of 4 candidates with 2 agents each: 16 training steps, 500 evaluation steps at
+    # most.
     assert metadata["cost"]["environment_steps_training"] == 2 * 4 * 2 * 16
     assert metadata["cost"]["environment_steps_evaluation"] == 2 * 4 * 2 * 500
     assert metadata["cost"]["seconds"] > 0
@@ -155,7 +157,8 @@ def test_a_refused_discovery_leaves_no_folder_behind(tmp_path):
         assert not (tmp_path / "run").exists()
 
 
-# -- train and list -----------------------------------------------------------------------------------
+# -- train and list
+# -----------------------------------------------------------------------------------
 
 
 def test_training_prints_the_sorted_returns_and_their_mean(bandit_file):
@@ -181,7 +184,8 @@ def test_listing_names_every_bandit_of_the_zoo():
     assert zoo_names() and all(name in table for name in zoo_names())
 
 
-# -- errors -------------------------------------------------------------------------------------------
+# -- errors
+# -------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

@@ -61,13 +61,15 @@ def shapes(weights):
     }
 
 
-# -- a bandit that stands for an environment ----------------------------------------------------------
+# -- a bandit that stands for an environment
+# ----------------------------------------------------------
 
 
 def two_cell_bandit():
     """Contexts are the two cells, one-hot; action 1 pays 1 in cell 0 and action 0 in cell 1.
 
-    initial_state: the identity of a categorical latent. reward: relu(c0 + a1 - 1) + relu(c1 + a0 - 1).
+    initial_state: the identity of a categorical latent. reward: relu(c0 + a1 - 1) + relu(c1 + a0 -
+      1).
     """
     weights = {
         "initial_state": {
@@ -87,8 +89,8 @@ def two_cell_bandit():
 
 
 def test_agents_trained_in_a_bandit_do_in_the_environment_what_the_bandit_rewards():
-    # A corridor of two cells where action 1 pays 1 in cell 0 and action 0 in cell 1: the bandit's own
-    # optimum earns 2, that of the bandit with its sign turned 0, and chance 1.
+    # A corridor of two cells where action 1 pays 1 in cell 0 and action 0 in cell 1: the bandit's
+    # own optimum earns 2, that of the bandit with its sign turned 0, and chance 1.
     bandit = two_cell_bandit()
     good = bandit.default_params.weights
     turned = {**good["reward"]["Dense_1"], "kernel": -good["reward"]["Dense_1"]["kernel"]}
@@ -123,7 +125,8 @@ def test_a_bandit_of_the_zoo_is_worth_what_it_says(name):
     assert claimed["low"] - width < measured < claimed["high"] + width
 
 
-# -- a discovery --------------------------------------------------------------------------------------
+# -- a discovery
+# --------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -159,7 +162,8 @@ def test_a_candidate_is_judged_by_the_return_of_every_agent(discovered):
 
 
 def test_environment_steps_of_a_candidate(discovered):
-    # 3 agents; 20 steps are rounded up to two batches of 2 x 8; 2 episodes of at most 500 steps each.
+    # 3 agents; 20 steps are rounded up to two batches of 2 x 8; 2 episodes of at most 500 steps
+    # each.
     steps = discovered[0].steps()
     assert (steps.training, steps.evaluation) == (3 * 2 * 16, 3 * 2 * 500)
 
@@ -175,7 +179,8 @@ def test_judging_takes_new_agents_for_another_seed(discovered):
     assert (a != c).any() and len(set(a)) > 1
 
 
-# -- where a discovery starts -------------------------------------------------------------------------
+# -- where a discovery starts
+# -------------------------------------------------------------------------
 
 
 def test_a_random_start_is_drawn_from_the_key():
@@ -246,7 +251,8 @@ def test_a_bandit_fits_the_environments_of_its_shapes_only():
         check_fits(box, *make("MountainCar-v0"), "MountainCar-v0")
 
 
-# -- configuration ------------------------------------------------------------------------------------
+# -- configuration
+# ------------------------------------------------------------------------------------
 
 
 def test_hyperparameters_are_drawn_from_the_papers_lists_or_fixed():

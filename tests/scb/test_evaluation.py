@@ -33,8 +33,8 @@ def outcomes(episodes):
 
 
 def test_an_episode_earns_until_it_ends_and_nothing_after(corridor):
-    # From cell 0: 1 + 10 + 100 in three steps; from cell 1: 110 in two; from cell 2: 100 in one. The
-    # corridor itself would go on from cell 0 and pay again.
+    # From cell 0: 1 + 10 + 100 in three steps; from cell 1: 110 in two; from cell 2: 100 in one.
+    # The corridor itself would go on from cell 0 and pay again.
     assert outcomes(corridor(PAYING, 100)) == {(111.0, 3), (110.0, 2), (100.0, 1)}
 
 
@@ -66,9 +66,9 @@ def test_a_reward_that_is_not_finite_after_the_end_does_no_harm(corridor):
 
 
 def test_every_episode_and_step_has_its_own_randomness():
-    # Coin flips in an endless corridor that pays the action: the returns of 10 steps are binomial, with
-    # mean 5 and deviation 1.58; equal keys in all steps would leave only 0 and 10, equal keys in all
-    # episodes only one value.
+    # Coin flips in an endless corridor that pays the action: the returns of 10 steps are binomial,
+    # with mean 5 and deviation 1.58; equal keys in all steps would leave only 0 and 10, equal keys
+    # in all episodes only one value.
     params = CorridorParams(rewards=jnp.tile(jnp.array([0.0, 1.0]), (3, 1)), last=1000)
 
     def flip(observation, key):

@@ -51,7 +51,8 @@ def distance(solution):
     return float(np.linalg.norm(solution["x"] - 3.0))
 
 
-# -- what evolution achieves --------------------------------------------------------------------------
+# -- what evolution achieves
+# --------------------------------------------------------------------------
 
 START = math.sqrt(2 * 3.0**2)  # distance of (0, 0) from (3, 3)
 
@@ -120,7 +121,8 @@ def test_sigma_decays_down_to_its_limit():
     np.testing.assert_allclose(deviations, expected, rtol=0.15)
 
 
-# -- what a candidate is given ------------------------------------------------------------------------
+# -- what a candidate is given
+# ------------------------------------------------------------------------
 
 
 class Draw(Parabola):
@@ -189,7 +191,8 @@ def test_the_best_mean_is_the_one_that_was_judged_best():
     assert distance(outcome.mean) > 2 * distance(outcome.best_mean)
 
 
-# -- several tasks ------------------------------------------------------------------------------------
+# -- several tasks
+# ------------------------------------------------------------------------------------
 
 # Three candidates on two tasks, the second of which scatters a hundred times more.
 TASKS = np.array([[1.0, 100.0], [2.0, 300.0], [3.0, 200.0]])
@@ -235,7 +238,8 @@ def test_the_search_follows_the_mean_or_the_majority_of_tasks_and_logs_the_mean(
     assert first["fitness/mean"] == pytest.approx(-998 / 3 * first["candidates/x0"], rel=1e-4)
 
 
-# -- candidates that fail -----------------------------------------------------------------------------
+# -- candidates that fail
+# -----------------------------------------------------------------------------
 
 
 def test_failed_candidates_rank_below_the_worst():
@@ -313,7 +317,8 @@ def test_a_generation_that_fails_altogether_leaves_the_mean_where_it_was(strateg
     assert column(outcome, "failed") == 8 * [8]
 
 
-# -- devices ------------------------------------------------------------------------------------------
+# -- devices
+# ------------------------------------------------------------------------------------------
 
 
 def test_the_tests_run_on_two_devices():
@@ -361,7 +366,8 @@ def test_a_population_that_the_devices_do_not_divide_evolves_as_on_one_device(mo
         np.testing.assert_allclose(column(on_two, name), column(on_one, name), rtol=1e-4)
 
 
-# -- interruption -------------------------------------------------------------------------------------
+# -- interruption
+# -------------------------------------------------------------------------------------
 
 
 class Killed(BaseException):
@@ -518,7 +524,8 @@ def test_a_process_that_was_killed_mid_way_is_resumed_to_the_same_bytes(tmp_path
     assert resumed == fingerprint(whole, evolve_in(whole, config))
 
 
-# -- what the user is told ----------------------------------------------------------------------------
+# -- what the user is told
+# ----------------------------------------------------------------------------
 
 
 def test_progress_says_fitness_failures_and_time_left(capsys):

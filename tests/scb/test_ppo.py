@@ -25,7 +25,8 @@ from tests.scb.probes import Corridor, CorridorParams, context_bandit
 
 NUM_SEEDS = 64
 
-# -- advantages ---------------------------------------------------------------------------------------
+# -- advantages
+# ---------------------------------------------------------------------------------------
 
 
 def test_advantages_of_three_steps_by_hand():
@@ -57,8 +58,8 @@ def test_advantages_of_three_steps_by_hand():
 @settings(deadline=None, max_examples=20)
 @given(discount=st.floats(0.0, 1.0), gae_lambda=st.floats(0.0, 1.0))
 def test_bandit_advantage_is_reward_minus_value(discount, gae_lambda):
-    # One-step episodes: nothing to bootstrap. A = r - V(s) = 3 - 1 = 2 and -1 - 4 = -5, whatever gamma
-    # and lambda are, and whatever value the next observation has.
+    # One-step episodes: nothing to bootstrap. A = r - V(s) = 3 - 1 = 2 and -1 - 4 = -5, whatever
+    # gamma and lambda are, and whatever value the next observation has.
     ends = jnp.ones((2, 1), bool)
     advantages = generalized_advantages(
         jnp.array([[3.0], [-1.0]]),
@@ -78,7 +79,8 @@ def test_advantages_of_unequal_shapes_are_refused_not_broadcast():
         generalized_advantages(x, x, x[:, :1], x == 0, x == 0, 0.9, 0.9)
 
 
-# -- the drift ----------------------------------------------------------------------------------------
+# -- the drift
+# ----------------------------------------------------------------------------------------
 
 
 def ppo_minimum(ratio, advantage, clip):
@@ -144,7 +146,8 @@ def test_an_agent_refuses_a_drift_of_another_shape():
         )
 
 
-# -- configuration ------------------------------------------------------------------------------------
+# -- configuration
+# ------------------------------------------------------------------------------------
 
 
 def test_steps_are_rounded_up_to_whole_batches():
@@ -170,7 +173,8 @@ def test_impossible_configurations_are_refused(arguments, message):
         PPOConfig(**arguments)
 
 
-# -- minibatches --------------------------------------------------------------------------------------
+# -- minibatches
+# --------------------------------------------------------------------------------------
 
 
 # 70 000 > 2^16: the range that falls back to jax.random.permutation.
@@ -182,8 +186,8 @@ def test_random_order_is_a_permutation(size):
 
 
 def test_every_number_is_equally_likely_in_every_place():
-    # 8000 permutations of 8: each number is expected 1000 times in each place. Chi-square per place;
-    # the smallest of 8 p-values is below 1e-4 once in 1250 tries of a correct shuffle.
+    # 8000 permutations of 8: each number is expected 1000 times in each place. Chi-square per
+    # place; the smallest of 8 p-values is below 1e-4 once in 1250 tries of a correct shuffle.
     keys = jax.random.split(jax.random.key(0), 8000)
     orders = np.asarray(jax.vmap(lambda key: random_order(key, 8))(keys))
     counts = np.stack([np.bincount(place, minlength=8) for place in orders.T])
@@ -193,7 +197,8 @@ def test_every_number_is_equally_likely_in_every_place():
     assert stats.chisquare(pairs[~np.eye(8, dtype=bool)]).pvalue > 1e-4
 
 
-# -- learning -----------------------------------------------------------------------------------------
+# -- learning
+# -----------------------------------------------------------------------------------------
 
 LEARNING = PPOConfig(
     num_envs=4,
@@ -238,8 +243,8 @@ def bandit_agents():
 
 @pytest.mark.parametrize("one_batch", [True, False])
 def test_the_best_action_of_a_bandit_is_learned(bandit_agents, one_batch):
-    # The reward is -|a - c|, c uniform in [0, 1]: the best action is the context. An agent that ignores
-    # the context is off by 0.25 at best.
+    # The reward is -|a - c|, c uniform in [0, 1]: the best action is the context. An agent that
+    # ignores the context is off by 0.25 at best.
     actions = np.asarray(bandit_agents[0][one_batch][2])
     error = np.abs(actions - np.asarray(CONTEXTS)[:, 0]).mean(axis=1)
     assert np.median(error) < 0.1
@@ -314,9 +319,9 @@ def test_the_value_of_a_step_before_is_discounted(corridor_agents):
 
 def test_truncated_episodes_are_bootstrapped_from_where_they_were_cut(corridor_agents):
     # An endless corridor of 3 cells of which cell 1 pays 1, at discount 1/2, cut every 2 steps:
-    # V(1) = 1 + V(1) / 8 = 8/7, V(0) = V(1) / 2 = 4/7, V(2) = V(1) / 4 = 2/7. With no bootstrapping at
-    # the cut V(2) would be 0, since cell 1 is two steps away; and bootstrapping from the next episode's
-    # random first cell would draw the three together.
+    # V(1) = 1 + V(1) / 8 = 8/7, V(0) = V(1) / 2 = 4/7, V(2) = V(1) / 4 = 2/7. With no bootstrapping
+    # at the cut V(2) would be 0, since cell 1 is two steps away; and bootstrapping from the next
+    # episode's random first cell would draw the three together.
     values, _ = corridor_agents["cell 1 pays, no end"]
     np.testing.assert_allclose(values, [4 / 7, 8 / 7, 2 / 7], atol=0.05)
 
@@ -327,7 +332,8 @@ def test_the_best_discrete_actions_are_learned(corridor_agents):
     np.testing.assert_array_equal(returns, 3.0)
 
 
-# -- the mechanics of a training ----------------------------------------------------------------------
+# -- the mechanics of a training
+# ----------------------------------------------------------------------
 
 SMALL = PPOConfig(
     num_envs=2, num_steps=8, num_epochs=2, num_minibatches=2, total_steps=64, hidden_sizes=(4,)
@@ -345,8 +351,8 @@ def small():
     return PPO(Corridor(), SMALL), CorridorParams(rewards=jnp.array([[1.0, 0], [0, 1.0], [1.0, 0]]))
 
 
-# Each differs from the defaults in one number. A norm of 1e-4 is far below any gradient's, and Adam's epsilon of 1e-5
-# makes even a common factor felt.
+# Each differs from the defaults in one number. A norm of 1e-4 is far below any gradient's, and
+# Adam's epsilon of 1e-5 makes even a common factor felt.
 CHANGED = {
     "learning_rate": 0.001,
     "discount": 0.1,
@@ -401,7 +407,8 @@ def test_a_member_of_a_population_is_the_agent_that_is_trained_alone(population,
 
 def test_evaluations_happen_before_the_first_and_after_every_nth_iteration(watched):
     state, outcomes = watched(PPOHyperparameters())
-    # 64 steps in batches of 16 are 4 iterations: evaluated at 0, 2 and 4, each time with another key.
+    # 64 steps in batches of 16 are 4 iterations: evaluated at 0, 2 and 4, each time with another
+    # key.
     np.testing.assert_array_equal(outcomes["iteration"], [0, 2, 4])
     assert len(np.unique(outcomes["key"], axis=0)) == 3
     assert state.iteration == 4
@@ -465,8 +472,8 @@ def test_each_networks_gradient_is_clipped_by_its_global_norm(one_update):
 
 
 def test_annealing_goes_linearly_to_zero(one_update):
-    # 4 iterations: the k-th update is 1 - k/4 of what it would be, so 1, 1/2 (k = 2), 1/4 for the last
-    # one (k = 3), and nothing at the end of the training (k = 4).
+    # 4 iterations: the k-th update is 1 - k/4 of what it would be, so 1, 1/2 (k = 2), 1/4 for the
+    # last one (k = 3), and nothing at the end of the training (k = 4).
     _, start, iterate = one_update
     moved = {
         k: displacement(
@@ -483,8 +490,8 @@ def test_annealing_goes_linearly_to_zero(one_update):
 def test_statistics_are_those_of_all_observations_and_an_update_starts_from_the_policy_that_acted(
     one_update,
 ):
-    # Three cells, one-hot, 5 steps and again 5: 0 1 2 0 1 | 2 0 1 2 0 in both environments. Cell 0 is
-    # seen in 4 of 10 steps, the others in 3; the variance of a one-hot entry is p (1 - p).
+    # Three cells, one-hot, 5 steps and again 5: 0 1 2 0 1 | 2 0 1 2 0 in both environments. Cell 0
+    # is seen in 4 of 10 steps, the others in 3; the variance of a one-hot entry is p (1 - p).
     _, start, iterate = one_update
     state = iterate(iterate(start, PPOHyperparameters()), PPOHyperparameters())
     share = np.array([0.4, 0.3, 0.3])
@@ -492,12 +499,14 @@ def test_statistics_are_those_of_all_observations_and_an_update_starts_from_the_
     np.testing.assert_allclose(state.statistics.mean, share, atol=1e-6)
     np.testing.assert_allclose(state.statistics.squares / 20, share * (1 - share), atol=1e-6)
     # The second batch was collected and learned under the same statistics: had they been updated in
-    # between, the ratio would not be 1 at its first update, and the drift above would have made NaN.
+    # between, the ratio would not be 1 at its first update, and the drift above would have made
+    # NaN.
     assert np.isfinite(displacement(start.params, state.params)).all()
 
 
 def test_evaluation_normalises_by_the_frozen_statistics(one_update):
-    # mean 0.3 and variance 4: the cell's observation 1 becomes (1 - 0.3) / 2 = 0.35, 0 becomes -0.15.
+    # mean 0.3 and variance 4: the cell's observation 1 becomes (1 - 0.3) / 2 = 0.35, 0 becomes
+    # -0.15.
     agent, start, _ = one_update
     statistics = RunningStatistics(jnp.float32(10.0), jnp.full(3, 0.3), jnp.full(3, 40.0))
     state = start.replace(statistics=statistics)

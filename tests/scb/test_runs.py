@@ -21,7 +21,8 @@ def lines(run, name="metrics.jsonl"):
     return (run.folder / name).read_text().splitlines()
 
 
-# -- opening ------------------------------------------------------------------------------------------
+# -- opening
+# ------------------------------------------------------------------------------------------
 
 
 def test_a_new_run_stores_its_config(run):
@@ -94,7 +95,8 @@ def test_logging_to_wandb_needs_its_package(tmp_path, monkeypatch):
         Run.open(tmp_path / "run", CONFIG, wandb_project="bandits")
 
 
-# -- logs ---------------------------------------------------------------------------------------------
+# -- logs
+# ---------------------------------------------------------------------------------------------
 
 
 def test_a_logged_generation_is_one_line_of_json_without_clocks(run):
@@ -148,7 +150,8 @@ def test_rewinding_a_run_without_logs_is_nothing(run):
     assert not (run.folder / "metrics.jsonl").exists()
 
 
-# -- settings -----------------------------------------------------------------------------------------
+# -- settings
+# -----------------------------------------------------------------------------------------
 
 PRESETS = {"quick": {"generations": 3, "population": 8}, "paper": {"generations": 1000}}
 
@@ -176,7 +179,8 @@ def test_a_resumed_run_keeps_its_settings_and_a_contradicting_flag_is_found(tmp_
             Run.open(run.folder, settings, resume=True)
 
 
-# -- checkpoints --------------------------------------------------------------------------------------
+# -- checkpoints
+# --------------------------------------------------------------------------------------
 
 
 def state(value):
@@ -257,7 +261,8 @@ def test_where_all_checkpoints_are_damaged_none_is_restored(tmp_path):
     again.close()
 
 
-# -- small things -------------------------------------------------------------------------------------
+# -- small things
+# -------------------------------------------------------------------------------------
 
 
 def test_json_is_replaced_whole(tmp_path):

@@ -49,7 +49,8 @@ def mlp(layers, inputs, activation):
     return hidden @ np.asarray(layers["Dense_1"]["kernel"]) + layers["Dense_1"]["bias"]
 
 
-# -- contexts and rewards -----------------------------------------------------------------------------
+# -- contexts and rewards
+# -----------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("activation", ACTIVATIONS)
@@ -101,15 +102,16 @@ def test_a_continuous_action_beyond_its_bounds_is_the_action_at_the_bound():
 
 
 def test_the_reward_by_hand():
-    # The probe's reward is -|action - context|: -|0.75 - 0.25| = -0.5, and the action 5 is cut to 2:
-    # -|2 - 0.25| = -1.75.
+    # The probe's reward is -|action - context|: -|0.75 - 0.25| = -0.5, and the action 5 is cut to
+    # 2: -|2 - 0.25| = -1.75.
     bandit = context_bandit()
     for action, expected in [(0.25, 0.0), (0.75, -0.5), (-0.25, -0.5), (5.0, -1.75)]:
         reward = bandit.mean_reward(jnp.array([0.25]), jnp.array([action]), bandit.default_params)
         assert reward == expected
 
 
-# -- the environment ----------------------------------------------------------------------------------
+# -- the environment
+# ----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("space", SPACES.values(), ids=SPACES)
@@ -199,8 +201,8 @@ def test_noise_levels_can_be_mapped_over():
 
 def test_reward_scale_is_the_deviation_over_contexts_and_actions():
     # r = -|a - c|, c uniform in [0, 1], a in [-1, 2]. With d = |a - c|: E d = the mean over c of
-    # ((1 + c)^2 + (2 - c)^2) / 6 = (7/3 + 7/3) / 6 = 7/9, E d^2 = Var a + Var c = 9/12 + 1/12 = 5/6 (the
-    # means are equal), so Var r = 5/6 - 49/81 = 0.2284 and the deviation 0.4779.
+    # ((1 + c)^2 + (2 - c)^2) / 6 = (7/3 + 7/3) / 6 = 7/9, E d^2 = Var a + Var c = 9/12 + 1/12 = 5/6
+    # (the means are equal), so Var r = 5/6 - 49/81 = 0.2284 and the deviation 0.4779.
     bandit = context_bandit()
     scale = bandit.reward_scale(
         bandit.default_params.replace(reward_noise=100.0), jax.random.key(0), num_samples=20_000
@@ -208,7 +210,8 @@ def test_reward_scale_is_the_deviation_over_contexts_and_actions():
     assert float(scale) == pytest.approx(0.4779, rel=0.02)
 
 
-# -- latents ------------------------------------------------------------------------------------------
+# -- latents
+# ------------------------------------------------------------------------------------------
 
 
 def latents(name, size, count=20_000):
@@ -254,7 +257,8 @@ def test_contexts_are_drawn_through_the_configured_latent(name):
     )
 
 
-# -- shapes and errors --------------------------------------------------------------------------------
+# -- shapes and errors
+# --------------------------------------------------------------------------------
 
 
 def test_weight_shapes_are_those_of_the_weights():

@@ -29,7 +29,8 @@ def normal(seed, size, shift=0.0):
     return jax.random.normal(jax.random.key(seed), (size, 2)) + shift
 
 
-# -- the distance between two samples -----------------------------------------------------------------
+# -- the distance between two samples
+# -----------------------------------------------------------------
 
 
 def test_energy_distance_by_hand():
@@ -62,7 +63,8 @@ def test_energy_distance_has_a_finite_gradient_where_points_coincide():
     assert np.isfinite(gradient).all()
 
 
-# -- reward targets -----------------------------------------------------------------------------------
+# -- reward targets
+# -----------------------------------------------------------------------------------
 
 
 def target(construction, discrete, action, q, expert_action):
@@ -79,8 +81,8 @@ def test_the_q_construction_is_q_standardised():
 
 
 def test_the_advantage_construction_is_q_below_each_states_best():
-    # Q - max: -1 0 | -3 0, mean -1, variance (0 + 1 + 4 + 1) / 4 = 1.5. The best action of every state
-    # has reward 0, however good the state is.
+    # Q - max: -1 0 | -3 0, mean -1, variance (0 + 1 + 4 + 1) / 4 = 1.5. The best action of every
+    # state has reward 0, however good the state is.
     actual = target("advantage", True, [[0, 1], [0, 1]], [[1.0, 2.0], [3.0, 6.0]], [1, 1])
     np.testing.assert_allclose(actual, np.array([[-1, 0], [-3, 0]]) / np.sqrt(1.5), rtol=1e-5)
 
@@ -99,7 +101,8 @@ def test_the_action_distance_of_continuous_actions_is_euclidean():
     np.testing.assert_allclose(actual, -np.array([[0, 5], [1, 2]]) / np.sqrt(3.5), rtol=1e-5)
 
 
-# -- the expert's dataset -----------------------------------------------------------------------------
+# -- the expert's dataset
+# -----------------------------------------------------------------------------
 
 
 def untrained(env, env_params):
@@ -122,9 +125,10 @@ def corridor_dataset():
 
 
 def test_q_values_are_those_of_acting_once_and_then_following_the_expert(corridor_dataset):
-    # The expert takes 0 everywhere. V(2) = 4, V(1) = 2 + 4/2 = 4, V(0) = 1 + 4/2 = 3; the first action's
-    # own reward in front: Q(2, .) = 4 40, Q(1, .) = 2 + V(2)/2 = 4 and 20 + 2 = 22, Q(0, .) = 1 + V(1)/2 = 3
-    # and 10 + 2 = 12. Nothing is earned after the end, though the corridor would go on.
+    # The expert takes 0 everywhere. V(2) = 4, V(1) = 2 + 4/2 = 4, V(0) = 1 + 4/2 = 3; the first
+    # action's own reward in front: Q(2, .) = 4 40, Q(1, .) = 2 + V(2)/2 = 4 and 20 + 2 = 22, Q(0,
+    # .) = 1 + V(1)/2 = 3 and 10 + 2 = 12. Nothing is earned after the end, though the corridor
+    # would go on.
     dataset, _, _ = corridor_dataset
     by_hand = np.array([[3.0, 12.0], [4.0, 22.0], [4.0, 40.0]])
     cell = dataset.observation.argmax(axis=1)
@@ -170,7 +174,8 @@ def test_continuous_actions_are_the_experts_and_random_ones_within_the_bounds(ba
     )
 
 
-# -- the fit ------------------------------------------------------------------------------------------
+# -- the fit
+# ------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -229,12 +234,13 @@ def test_a_discrete_bandit_is_fitted_too(corridor_dataset):
         assert bandit.mean_reward(context, 0, params) > bandit.mean_reward(context, 1, params)
 
 
-# -- the expert ---------------------------------------------------------------------------------------
+# -- the expert
+# ---------------------------------------------------------------------------------------
 
 
 def test_the_expert_is_the_best_of_those_that_were_trained():
-    # Ten cells, in each of which action 1 pays 1: agents after one batch earn about 5, give or take 1.6,
-    # and the best of sixteen earns more than the first of them.
+    # Ten cells, in each of which action 1 pays 1: agents after one batch earn about 5, give or take
+    # 1.6, and the best of sixteen earns more than the first of them.
     env, key = Corridor(cells=10), jax.random.key(0)
     params = CorridorParams(rewards=jnp.tile(jnp.array([0.0, 1.0]), (10, 1)), last=9)
     setting = Setting(TINY, PPOHyperparameters(), source="this test")
@@ -247,7 +253,8 @@ def test_the_expert_is_the_best_of_those_that_were_trained():
     assert sum(map(int, actions)) == best.mean_return
 
 
-# -- configuration ------------------------------------------------------------------------------------
+# -- configuration
+# ------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

@@ -135,7 +135,8 @@ def test_a_bandit_opens_by_file_or_by_name(tmp_path):
         open_bandit("Pendulum")
 
 
-# -- what ships ---------------------------------------------------------------------------------------
+# -- what ships
+# ---------------------------------------------------------------------------------------
 
 
 def test_the_pendulum_bandit_ships():
