@@ -6,7 +6,8 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
-PYTEST := $(BIN)/python -m pytest -q --cov --cov-report=term --cov-fail-under=90
+# One process a core, a file at a time each: files share what they compile.
+PYTEST := $(BIN)/python -m pytest -q -n auto --dist loadfile --cov --cov-report=term --cov-fail-under=90
 
 .DEFAULT_GOAL := help
 .PHONY: help run test test-all lint format bench clean
