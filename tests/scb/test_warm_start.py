@@ -239,15 +239,15 @@ def test_a_discrete_bandit_is_fitted_too(corridor_dataset):
 
 
 def test_the_expert_is_the_best_of_those_that_were_trained():
-    # Ten cells, in each of which action 1 pays 1: agents after one batch earn about 5, give or take
-    # 1.6, and the best of sixteen earns more than the first of them.
+    # Ten cells, in each of which action 1 pays 1: an agent after one batch earns 5, give or take 1.6.
+    # One in six earns 7 or more, but of 32 all but one in 400 times somebody does.
     env, key = Corridor(cells=10), jax.random.key(0)
     params = CorridorParams(rewards=jnp.tile(jnp.array([0.0, 1.0]), (10, 1)), last=9)
     setting = Setting(TINY, PPOHyperparameters(), source="this test")
-    first, best = (train_expert(env, params, setting, key, number) for number in (1, 16))
-    assert best.mean_return > first.mean_return
-    # 16 agents with one batch of 2 x 8 steps.
-    assert best.environment_steps == 16 * 16
+    best = train_expert(env, params, setting, key, 32)
+    assert best.mean_return >= 7
+    # 32 agents with one batch of 2 x 8 steps.
+    assert best.environment_steps == 32 * 16
     # The agent that is handed out earns what it says.
     actions = [best.agent.act(best.state, cell, key, params, mode=True) for cell in jnp.eye(10)]
     assert sum(map(int, actions)) == best.mean_return
