@@ -15,7 +15,7 @@ PYTEST := $(BIN)/python -m pytest -q -n auto --dist loadfile --cov --cov-report=
 help: ## list the commands
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-9s %s\n", $$1, $$2 }' Makefile
 
-run: $(INSTALLED) ## learn an objective, train PPO with it, judge it: runs/quick/report.html (15 minutes)
+run: $(INSTALLED) ## learn an objective, train PPO with it, judge it: runs/quick/report.html
 	@$(BIN)/lpo run --preset quick $(if $(wildcard runs/quick/config.json),--resume,--out) runs/quick
 
 test: $(INSTALLED) ## the tests, without the slow ones, and their coverage

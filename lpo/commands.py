@@ -61,7 +61,7 @@ def run(
     figures and results.json.
 
     Args:
-      preset: quick (a quarter of an hour on two cores) or paper (the paper's sizes; hours).
+      preset: quick (eight minutes on two cores) or paper (the paper's sizes; hours).
       seed: decides everything; the seeds that report are apart from those that learn.
       out: folder to write; must be new or empty.
       resume: a folder that an earlier, interrupted `lpo run` wrote: do what is missing there.
