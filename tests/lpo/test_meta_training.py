@@ -15,6 +15,7 @@ from scb.agents.hyperparameters import environment_setting
 from scb.agents.ppo import PPOConfig
 from scb.environments.synthetic import BanditConfig, SyntheticBandit
 from scb.errors import UserError
+from scb.evaluation import Episodes
 from scb.evolution import EvolutionConfig
 
 EVOLUTION = EvolutionConfig(
@@ -132,6 +133,30 @@ def test_hyperparameters_are_the_evaluation_environments_own(config, environment
     # An objective is learned under the learning rate under which it will be used.
     problem = MetaTraining(replace(config, environment=environment, reward_noise=0.0))
     assert problem.base_hyperparameters == environment_setting("Pendulum-v1").hyperparameters
+
+
+def test_inner_agents_draw_from_the_lists_or_take_the_settings_own(config):
+    class Echo:
+        """An agent whose return is the sum of what it was trained with."""
+
+        def train(self, key, hyperparameters, env_params):
+            return hyperparameters
+
+        def evaluate(self, state, *arguments, **named):
+            total = state.learning_rate + state.entropy_coefficient
+            return Episodes(jnp.array([total]), jnp.array([1]))
+
+    def worth(**lists):
+        problem = MetaTraining(replace(config, reward_noise=0.0, **lists))
+        problem.agent = Echo()
+        return jax.vmap(lambda key: problem.train_one({}, key))(
+            jax.random.split(jax.random.key(0), 50)
+        )
+
+    both = worth(learning_rates=(1.0, 2.0), entropy_coefficients=(10.0, 20.0))
+    assert set(both.tolist()) == {11.0, 12.0, 21.0, 22.0}
+    # Pendulum's setting has a learning rate of 0.001 and an entropy coefficient of 0.01.
+    np.testing.assert_allclose(worth(), 0.011, rtol=1e-6)
 
 
 # -- what it costs ------------------------------------------------------------------------------
