@@ -22,9 +22,13 @@ def main() -> int:
     parser.add_argument("--folder", type=Path, default=Path("lpo/zoo"))
     arguments = parser.parse_args()
 
+    from lpo.drift import LearnedDrift
     from lpo.objectives import load_objective, save_objective
+    from scb.errors import UserError
 
     objective = load_objective(arguments.objective)
+    if not isinstance(objective.drift, LearnedDrift):
+        raise UserError(f"{objective.name} is a closed form: the zoo holds learned objectives.")
     metadata: dict[str, Any] = dict(objective.metadata)
     results = dict(metadata["results"])
     reporting_seeds = {}

@@ -337,29 +337,78 @@ def test_help_names_the_flags(program, arguments, mentioned, capsys):
         assert name in text
 
 
-def test_a_process_exits_with_two_and_shows_no_traceback(working_folder):
-    root = str(Path(lpo.__file__).parents[1])
-    finished = subprocess.run(
-        [sys.executable, "-m", "lpo.cli", "train", "--environment", "Pendulm-v1"],
-        capture_output=True,
-        text=True,
-        check=False,
-        env={**os.environ, "PYTHONPATH": root},
-        cwd=working_folder,
-    )
+# -- processes of its own -----------------------------------------------------------------------
+
+
+@pytest.fixture
+def python(working_folder):
+    """Runs Python with arguments, and with environment variables changed or (None) left out."""
+
+    def run(*arguments: str, **changes: str | None) -> subprocess.CompletedProcess[str]:
+        variables = {**os.environ, "PYTHONPATH": str(Path(lpo.__file__).parents[1]), **changes}
+        return subprocess.run(
+            [sys.executable, *arguments],
+            capture_output=True,
+            text=True,
+            check=False,
+            env={name: value for name, value in variables.items() if value is not None},
+            cwd=working_folder,
+        )
+
+    return run
+
+
+def test_a_process_exits_with_two_and_shows_no_traceback(python):
+    finished = python("-m", "lpo.cli", "train", "--environment", "Pendulm-v1")
     assert finished.returncode == 2
     assert finished.stdout == ""
     assert finished.stderr.startswith("lpo: unknown environment 'Pendulm-v1': did you mean ")
     assert finished.stderr.count("\n") == 1
 
 
-def test_importing_the_packages_does_not_import_jax(working_folder):
+def test_importing_the_packages_does_not_import_jax(python):
     # The command line has to set the number of devices before anything starts JAX.
-    root = str(Path(lpo.__file__).parents[1])
     code = "import sys, lpo, lpo.cli; sys.exit('jax' in sys.modules)"
-    environment = {**os.environ, "PYTHONPATH": root}
-    finished = subprocess.run([sys.executable, "-c", code], env=environment, cwd=working_folder)
-    assert finished.returncode == 0
+    assert python("-c", code).returncode == 0
+
+
+CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+CONFIGURED = """
+from lpo.cli import configure_jax
+configure_jax()
+import jax
+print(jax.device_count("cpu"), jax.config.values["jax_compilation_cache_dir"])
+"""
+
+
+@pytest.mark.parametrize(
+    ("devices", "cache", "expected"),
+    [
+        (None, None, f"{CORES} home/lpo/jax"),
+        ("3", "elsewhere", "3 elsewhere"),
+    ],
+)
+def test_jax_gets_a_device_a_core_and_a_cache_unless_told_otherwise(
+    python, devices, cache, expected
+):
+    finished = python(
+        "-c",
+        CONFIGURED,
+        JAX_NUM_CPU_DEVICES=devices,
+        JAX_COMPILATION_CACHE_DIR=cache,
+        XLA_FLAGS=None,
+        XDG_CACHE_HOME="home",
+    )
+    assert finished.stdout.strip() == expected
+
+
+def test_a_caller_that_has_used_jax_keeps_its_devices(monkeypatch):
+    before = jax.device_count()
+    monkeypatch.delenv("JAX_NUM_CPU_DEVICES", raising=False)
+    cores = set(range(before + 1))
+    monkeypatch.setattr(os, "sched_getaffinity", lambda process: cores, raising=False)
+    cli.configure_jax()
+    assert jax.device_count() == before
 
 
 def test_every_public_name_is_there():
