@@ -33,7 +33,7 @@ format: $(INSTALLED) ## put every file into the project's format
 	@$(BIN)/ruff check --fix-only
 	@$(BIN)/ruff format
 
-bench: $(INSTALLED) .venv-rejax/.installed ## time PPO in the bandit beside rejax's
+bench: $(INSTALLED) .venv-rejax/.installed ## train agents in the bandits beside rejax's: time and return
 	@$(BIN)/python -m experiments.benchmark --rejax-python .venv-rejax/bin/python
 
 # rejax needs a gymnax that this project doesn't run on, so it gets an environment of its own.

@@ -1,29 +1,94 @@
-"""How long PPO takes in the bandit: this project against rejax, in one go on one machine.
+"""How long training in a bandit takes and what it yields: this project against rejax, in one go on one machine.
 
     make bench
 
-Both train a population of 32 PPO agents for 10 000 steps in the shipped Pendulum bandit with the
-paper's inner-loop configuration. rejax needs an older gymnax, so it runs in a virtual environment
-of its own (`make bench` makes it). Timings are of the machine that runs them: compare the ratio.
+Populations train for 10 000 steps with the paper's inner-loop configuration at its fixed (underlined)
+hyperparameters: PPO, SAC, TD3 and DDPG in the Pendulum bandit, DQN and discrete SAC in the CartPole
+bandit. Where the bandit is a discovered one, every agent is then evaluated for 20 episodes in the
+real environment; a randomly initialised bandit, which stands in for CartPole's while none ships, says
+nothing about the real one and is timed only.
+
+rejax needs an older gymnax, so it runs in a virtual environment of its own (`make bench` makes it)
+and evaluates in that gymnax's Pendulum-v1 and CartPole-v1: same dynamics, start states and episode
+lengths as in the gymnax used here. Its settings are derived from this project's; what still differs
+is the algorithms' own:
+
+- SAC: rejax fills the buffer with its untrained policy's actions, this project with uniform ones.
+- DDPG: rejax has none; it is rejax's TD3 without delay and target noise, reduced to one critic.
+- TD3: rejax's policy follows the mean of two critics, this project's the first. In one-step
+  episodes this project leaves out the second one, and all that serves only bootstrapping.
+- Batches: rejax draws them without replacement, this project with.
+- Gradients: rejax clips every element, this project the norm; SAC's are not clipped.
+
+Timings are of the machine that runs them: compare the ratio. Both may use all of its cores; this
+project deals its population out to them, rejax leaves that to XLA.
 """
 
 import argparse
 import json
 import subprocess
 import sys
+import tempfile
 import time
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-POPULATION = 32
-REPEATS = 5
-PEER = Path(__file__).with_name("rejax_peer.py")
+EPISODES = 20
+STEPS = 10_000
+THIS, PEER = "this project", "rejax 0.1.3"
+PEER_SCRIPT = Path(__file__).with_name("rejax_peer.py")
 
 
-def time_this_project() -> list[float]:
-    """Seconds an agent of each repeat, after one run that compiles. Runs in a process of its own."""
+@dataclass(frozen=True)
+class Task:
+    algorithm: str
+    environment: str
+    population: int = 8
+    repeats: int = 2
+
+
+TASKS = {
+    "ppo": Task("ppo", "Pendulum-v1", population=32, repeats=5),
+    "sac": Task("sac", "Pendulum-v1"),
+    "td3": Task("td3", "Pendulum-v1"),
+    "ddpg": Task("ddpg", "Pendulum-v1"),
+    "dqn": Task("dqn", "CartPole-v1"),
+    "sac-discrete": Task("sac", "CartPole-v1"),
+}
+
+
+def bandit_of(environment: str) -> tuple[Any, bool]:
+    """The environment's bandit, and whether it is a discovered one or only randomly initialised."""
+    import jax
+
+    import scb
+    from scb.environments.synthetic import BanditConfig, SyntheticBandit, bandit_for
+    from scb.environments.zoo import PREFIX, open_bandit, zoo_names
+
+    name = PREFIX + environment
+    if name in zoo_names():
+        return open_bandit(name), True
+    shapes = bandit_for(*scb.make(environment), BanditConfig(), name)
+    weights = shapes.init_weights(jax.random.key(0))
+    space = shapes.action_space()
+    return SyntheticBandit(shapes.observation_size, space, shapes.config, weights, name), False
+
+
+def inner_loop_of(task: Task, bandit: Any, steps: int) -> Any:
+    from scb.agents.hyperparameters import inner_loop
+
+    inner = inner_loop(task.algorithm, task.environment, bandit.action_space(), sampled=False)
+    return replace(inner, config=replace(inner.config, total_steps=steps))
+
+
+def measure_this_project(task: Task, steps: int) -> dict[str, list[float]]:
+    """Seconds an agent of each repeat, after one run that compiles, and the agents' mean returns.
+
+    Runs in a process of its own.
+    """
     from lpo.cli import configure_jax
 
     configure_jax()
@@ -32,70 +97,225 @@ def time_this_project() -> list[float]:
     import scb
     from scb.evolution import map_population
 
-    env, params = scb.make("Synthetic-Pendulum-v1")
-    agent = scb.PPO(env, scb.PPOConfig(activation="relu"))
-    train = map_population(
-        lambda key: agent.train(key, scb.PPOHyperparameters(), params).params, POPULATION, (0,)
-    )
-    seconds = []
-    for repeat in range(REPEATS + 1):
-        keys = jax.random.split(jax.random.key(repeat), POPULATION)
+    bandit, discovered = bandit_of(task.environment)
+    params = bandit.default_params
+    inner = inner_loop_of(task, bandit, steps)
+    agent = inner.agent(bandit)
+    env, env_params = scb.make(task.environment)
+
+    def train(key: jax.Array) -> Any:
+        state = agent.train(key, inner.hyperparameters, params)
+        # What acting takes no part in stays behind.
+        unused = {"optimizer", "environment", "buffer", "key"} & set(state.__dataclass_fields__)
+        return replace(state, **dict.fromkeys(unused))
+
+    def evaluate(state: Any, key: jax.Array) -> jax.Array:
+        return agent.evaluate(state, key, EPISODES, env, env_params).returns.mean()
+
+    train_all = map_population(train, task.population, (0,))
+    evaluate_all = map_population(evaluate, task.population, (0, 0))
+    seconds: list[float] = []
+    returns: list[float] = []
+    for repeat in range(task.repeats + 1):
+        keys = jax.random.split(jax.random.key(repeat), task.population)
         start = time.perf_counter()
-        train(keys)
-        seconds.append((time.perf_counter() - start) / POPULATION)
-    return seconds[1:]
+        states = train_all(keys)
+        if repeat == 0:
+            continue
+        seconds.append((time.perf_counter() - start) / task.population)
+        if discovered:
+            keys = jax.random.split(jax.random.fold_in(jax.random.key(repeat), 1), task.population)
+            returns += evaluate_all(states, keys).tolist()
+    return {"seconds": seconds, "returns": returns}
 
 
-def bandit_arrays(path: Path) -> None:
-    """Writes the shipped bandit's weights where the peer, which can't import this project, finds them."""
+def write_rejax_job(folder: Path, task: Task, steps: int) -> Path:
+    """Writes the bandit and rejax's settings where the peer, which can't import this project, finds them."""
     from scb.artefacts import flatten
-    from scb.environments.zoo import open_bandit
+    from scb.environments.zoo import space_description
 
-    bandit = open_bandit("Synthetic-Pendulum-v1")
-    weights = flatten({k: dict(v) for k, v in bandit.default_params.weights.items()})
-    arrays: dict[str, Any] = {"activation": bandit.config.activation, **weights}
-    np.savez(path, **arrays)
+    bandit, discovered = bandit_of(task.environment)
+    inner = inner_loop_of(task, bandit, steps)
+    algorithm, settings = rejax_settings(task.algorithm, inner, bandit.action_space())
+    weights = folder / "bandit.npz"
+    arrays: dict[str, Any] = {
+        **flatten({k: dict(v) for k, v in bandit.default_params.weights.items()})
+    }
+    np.savez(weights, **arrays)
+    job = {
+        "bandit": {
+            "weights": str(weights),
+            "activation": bandit.config.activation,
+            "latent": bandit.config.latent,
+            "action_space": space_description(bandit.action_space()),
+        },
+        "algorithm": algorithm,
+        "settings": settings,
+        "population": task.population,
+        "repeats": task.repeats,
+        "environment": task.environment if discovered else None,
+        "episodes": EPISODES,
+    }
+    path = folder / "job.json"
+    path.write_text(json.dumps(job))
+    return path
+
+
+def rejax_settings(algorithm: str, inner: Any, space: Any) -> tuple[str, dict[str, Any]]:
+    """rejax's algorithm and its arguments for this project's configuration and hyperparameters."""
+    config, numbers = inner.config, inner.hyperparameters
+    activation = {"activation": config.activation}
+    settings: dict[str, Any] = {
+        "num_envs": config.num_envs,
+        "total_timesteps": config.total_steps,
+        "learning_rate": numbers.learning_rate,
+        "gamma": numbers.discount,
+    }
+    if hasattr(numbers, "max_grad_norm"):
+        settings["max_grad_norm"] = numbers.max_grad_norm
+    if algorithm == "ppo":
+        return "PPO", settings | {
+            "agent_kwargs": {**activation, "hidden_layer_sizes": config.hidden_sizes},
+            "num_steps": config.num_steps,
+            "num_epochs": config.num_epochs,
+            "num_minibatches": config.num_minibatches,
+            "gae_lambda": numbers.gae_lambda,
+            "clip_eps": numbers.drift,
+            "ent_coef": numbers.entropy_coefficient,
+            "vf_coef": numbers.value_coefficient,
+        }
+    settings |= {
+        "buffer_size": config.buffer_size,
+        "fill_buffer": config.prefill,
+        "batch_size": config.batch_size,
+        "num_epochs": config.gradient_steps,
+    }
+    if algorithm == "sac":
+        return "SAC", settings | {
+            "agent_kwargs": activation,
+            "hidden_layer_sizes": config.hidden_sizes,
+            "polyak": numbers.polyak,
+            "target_entropy_ratio": numbers.target_entropy_ratio,
+        }
+    # The networks of rejax's DQN and TD3 are fixed.
+    if config.hidden_sizes != (64, 64):
+        raise ValueError(f"rejax's {algorithm} has hidden layers of (64, 64) only.")
+    if algorithm == "dqn":
+        return "DQN", settings | {
+            "agent_kwargs": activation,
+            "ddqn": bool(numbers.double > 0.5),
+            "eps_start": numbers.epsilon_start,
+            "eps_end": numbers.epsilon_end,
+            "exploration_fraction": numbers.epsilon_decay,
+            "target_update_freq": config.target_update_every,
+            "polyak": 0.0,  # a copy
+        }
+    half_width = (float(np.max(space.high)) - float(np.min(space.low))) / 2  # rejax's unit is 1
+    return "TD3" if config.num_critics == 2 else "DDPG", settings | {
+        "actor_kwargs": activation,
+        "critic_kwargs": activation,
+        "num_critics": config.num_critics,
+        "policy_delay": config.policy_delay,
+        "polyak": numbers.polyak,
+        "exploration_noise": numbers.exploration_noise * half_width,
+        "target_noise": numbers.target_noise * half_width,
+        "target_noise_clip": numbers.target_noise_clip * half_width,
+    }
+
+
+def summary(
+    task: Task, discovered: bool, measured: dict[str, dict[str, list[float]]]
+) -> dict[str, Any]:
+    """What is written for an algorithm. Agents whose return is no number are counted and left out."""
+    from scb.statistics import estimate
+
+    result: dict[str, Any] = {
+        "environment": task.environment,
+        "bandit": "discovered" if discovered else "randomly initialised",
+        "population": task.population,
+        "seconds_per_agent": {who: values["seconds"] for who, values in measured.items()},
+        "return": {},
+    }
+    for who, values in measured.items():
+        returns = np.asarray(values["returns"])
+        finite = returns[np.isfinite(returns)]
+        if returns.size:
+            iqm = estimate(finite).as_dict() if finite.size else None
+            result["return"][who] = {"iqm": iqm, "diverged": returns.size - finite.size}
+    if PEER in measured:
+        medians = {who: float(np.median(values["seconds"])) for who, values in measured.items()}
+        result["ratio"] = medians[PEER] / medians[THIS]
+    return result
+
+
+def row(name: str, result: dict[str, Any]) -> str:
+    from scb.statistics import Estimate
+
+    seconds, returns = [], []
+    for who in (THIS, PEER):
+        times = result["seconds_per_agent"].get(who)
+        seconds.append("-" if times is None else f"{np.median(times):.4f}")
+        outcome = result["return"].get(who)
+        if outcome is None:
+            returns.append("-")
+            continue
+        text = "none" if outcome["iqm"] is None else str(Estimate(**outcome["iqm"]))
+        returns.append(text + (f", {outcome['diverged']} diverged" if outcome["diverged"] else ""))
+    ratio = f"{result['ratio']:.2f}" if "ratio" in result else "-"
+    return line(name, *seconds, ratio, *returns)
+
+
+def line(*cells: str) -> str:
+    widths = (13, 13, 12, 7, 35, 35)
+    return "".join(cell.ljust(width) for cell, width in zip(cells, widths, strict=True)).rstrip()
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument(
         "--rejax-python", type=Path, help="python of an environment with rejax 0.1.3, gymnax 0.0.9"
     )
+    parser.add_argument(
+        "--algorithms", default=",".join(TASKS), help="some of them, comma-separated: %(default)s"
+    )
     parser.add_argument("--out", type=Path, default=Path("runs/benchmark.json"))
-    parser.add_argument("--only-this", action="store_true", help=argparse.SUPPRESS)
+    parser.add_argument("--steps", type=int, default=STEPS, help=argparse.SUPPRESS)
+    parser.add_argument("--only-this", choices=TASKS, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.only_this:
-        print(json.dumps(time_this_project()))
+        print(json.dumps(measure_this_project(TASKS[arguments.only_this], arguments.steps)))
         return 0
+    names = arguments.algorithms.split(",")
+    if unknown := [name for name in names if name not in TASKS]:
+        parser.error(f"unknown algorithm {', '.join(unknown)}: choose from {', '.join(TASKS)}.")
     arguments.out.parent.mkdir(parents=True, exist_ok=True)
-    result: dict[str, Any] = {"population": POPULATION, "steps": 10_000, "seconds_per_agent": {}}
-    result["seconds_per_agent"]["this project"] = _json_of(
-        [sys.executable, "-m", "experiments.benchmark", "--only-this"]
-    )
-    if arguments.rejax_python is not None:
-        weights = arguments.out.with_name("benchmark_bandit.npz")
-        bandit_arrays(weights)
-        result["seconds_per_agent"]["rejax 0.1.3"] = _json_of(
-            [str(arguments.rejax_python), str(PEER), str(weights), str(POPULATION), str(REPEATS)]
-        )
-    for name, seconds in result["seconds_per_agent"].items():
-        print(
-            f"{name:14} {np.median(seconds):.4f} s an agent (of {', '.join(f'{s:.4f}' for s in seconds)})"
-        )
-    medians = [float(np.median(s)) for s in result["seconds_per_agent"].values()]
-    if len(medians) == 2:
-        result["ratio"] = medians[1] / medians[0]
-        print(f"rejax takes {result['ratio']:.2f} times as long")
-    else:
-        print("rejax was not timed: `make bench` does that.")
-    arguments.out.write_text(json.dumps(result, indent=2) + "\n")
+    print(f"Training for {arguments.steps} steps in the bandit; median seconds an agent.")
+    print(f"Return in the real environment: IQM [95 %] of agents, {EPISODES} episodes each.\n")
+    print(line("algorithm", THIS, PEER, "ratio", f"return, {THIS}", f"return, {PEER}"), flush=True)
+    results: dict[str, Any] = {}
+    for name in names:
+        this = [sys.executable, "-m", "experiments.benchmark", "--only-this", name]
+        measured = {THIS: _json_of([*this, "--steps", str(arguments.steps)])}
+        if arguments.rejax_python is not None:
+            with tempfile.TemporaryDirectory() as folder:
+                job = write_rejax_job(Path(folder), TASKS[name], arguments.steps)
+                peer = [str(arguments.rejax_python), str(PEER_SCRIPT), str(job)]
+                measured[PEER] = _json_of(peer)
+        _, discovered = bandit_of(TASKS[name].environment)
+        results[name] = summary(TASKS[name], discovered, measured)
+        print(row(name, results[name]), flush=True)
+    if arguments.rejax_python is None:
+        print("\nrejax was not measured: `make bench` does that.")
+    report = {"steps": arguments.steps, "episodes": EPISODES, "algorithms": results}
+    arguments.out.write_text(json.dumps(report, indent=2) + "\n")
     return 0
 
 
-def _json_of(command: list[str]) -> list[float]:
+def _json_of(command: list[str]) -> dict[str, list[float]]:
     completed = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)
-    return list(json.loads(completed.stdout.strip().splitlines()[-1]))
+    return dict(json.loads(completed.stdout.strip().splitlines()[-1]))
 
 
 if __name__ == "__main__":

@@ -13,8 +13,8 @@ import jax
 import numpy as np
 
 from lpo.objectives import Objective
-from scb.agents.hyperparameters import Setting, environment_setting
 from scb.agents.ppo import PPO, PPOConfig
+from scb.agents.settings import Setting, environment_setting
 from scb.environments.registry import make
 from scb.errors import UserError
 from scb.evolution import map_population

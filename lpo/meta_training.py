@@ -17,8 +17,8 @@ import jax
 import jax.numpy as jnp
 
 from lpo.drift import LearnedDrift
-from scb.agents.hyperparameters import environment_setting
 from scb.agents.ppo import PPO, PPOConfig, PPOState
+from scb.agents.settings import environment_setting
 from scb.environments.registry import make
 from scb.environments.synthetic import SyntheticBandit
 from scb.environments.zoo import home_of

@@ -6,22 +6,38 @@ Importing the package registers the bandits that ship with it:
     env, params = gymnax.make("Synthetic-Pendulum-v1")
 """
 
+from scb.agents.dqn import DQN, DQNConfig, DQNHyperparameters
 from scb.agents.ppo import PPO, PPOConfig, PPOHyperparameters
+from scb.agents.sac import SAC, SACConfig, SACHyperparameters
+from scb.agents.td3 import TD3, TD3Config, TD3Hyperparameters, ddpg_config
 from scb.environments.registry import make
 from scb.environments.synthetic import BanditConfig, BanditParams, SyntheticBandit
+from scb.environments.synthetic_mdp import MDPConfig, SyntheticMDP
 from scb.environments.zoo import load_bandit, register_zoo, save_bandit
 from scb.errors import UserError
 
 register_zoo()
 
 __all__ = [
+    "DQN",
     "PPO",
+    "SAC",
+    "TD3",
     "BanditConfig",
     "BanditParams",
+    "DQNConfig",
+    "DQNHyperparameters",
+    "MDPConfig",
     "PPOConfig",
     "PPOHyperparameters",
+    "SACConfig",
+    "SACHyperparameters",
     "SyntheticBandit",
+    "SyntheticMDP",
+    "TD3Config",
+    "TD3Hyperparameters",
     "UserError",
+    "ddpg_config",
     "load_bandit",
     "make",
     "save_bandit",

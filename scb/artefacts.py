@@ -28,7 +28,7 @@ import numpy as np
 from scb.errors import UserError, unknown_name
 
 SCHEMA_VERSION = 1
-KINDS = ("bandit", "drift")
+KINDS = ("bandit", "drift", "synthetic_mdp")
 
 # numpy.ndarray leaves under any depth of dictionaries: {"reward": {"Dense_0": {"kernel": ...}}}.
 ArrayTree: TypeAlias = "dict[str, np.ndarray | ArrayTree]"
@@ -130,32 +130,42 @@ def save(path: str | Path, arrays: Mapping[str, Any], metadata: Mapping[str, Any
     return npz_path
 
 
-def load(path: str | Path, kind: str) -> Artefact:
+def load(path: str | Path, *kinds: str) -> Artefact:
     """Reads and checks an artefact.
 
     Args:
       path: NAME, NAME.npz or NAME.json.
-      kind: "bandit" or "drift", what the caller can use.
+      kinds: of `KINDS`, what the caller can use.
 
     Raises:
       UserError: one sentence that says which file is missing, damaged, changed since it was saved,
         of another kind or a newer schema, or holds something other than finite numbers.
     """
-    if kind not in KINDS:
-        raise unknown_name("kind of artefact", kind, KINDS)
+    for kind in kinds:
+        if kind not in KINDS:
+            raise unknown_name("kind of artefact", kind, KINDS)
     npz_path, json_path = _paths(path)
     # The bytes that are checked are the bytes that are used: each file is read once.
     data, text = _read(npz_path), _read(json_path)
     metadata = _parse_metadata(json_path, text)
     _check_metadata(json_path, metadata)
-    if metadata["kind"] != kind:
-        raise UserError(f"{npz_path} is a {metadata['kind']}: give a {kind} here.")
+    if metadata["kind"] not in kinds:
+        raise UserError(f"{npz_path} is a {metadata['kind']}: give a {' or '.join(kinds)} here.")
     if hashlib.sha256(data).hexdigest() != metadata["sha256"]:
         raise UserError(
             f"{npz_path} is not the file that {json_path.name} describes (its SHA-256 differs): it "
             "was changed, or saving it was interrupted; fetch or save both again."
         )
     return Artefact(metadata["name"], unflatten(npz_path, _parse_npz(npz_path, data)), metadata)
+
+
+def read_arrays(path: Path) -> dict[str, np.ndarray]:
+    """Arrays by flat name from any .npz of finite numbers; no .json is looked for, no pickle is run.
+
+    Raises:
+      UserError: the file cannot be read, is damaged, or holds something other than finite numbers.
+    """
+    return _parse_npz(path, _read(path))
 
 
 def expect_shapes(artefact: Artefact, shapes: Mapping[str, Sequence[int]]) -> None:

@@ -1,42 +1,52 @@
 """Discover a synthetic contextual bandit: evolve one so that agents trained in it do well in a real environment.
 
-Liesen et al. (2024). The inner loop trains PPO agents in the candidate, with hyperparameters drawn
-from the paper's lists so that the bandit suits any of them; the fitness is their return in the
-evaluation environment.
+Liesen et al. (2024). The inner loop trains agents of several algorithms in the candidate, with
+hyperparameters drawn from the paper's lists so that the bandit suits any of them; the fitness is
+their return in the evaluation environment. The same search finds the paper's fully synthetic MDPs.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from gymnax.environments import environment
+from jax.typing import ArrayLike
 
 from scb.agents.hyperparameters import (
-    Setting,
-    environment_setting,
-    inner_loop_config,
-    inner_loop_lists,
-    sample_hyperparameters,
+    InnerLoop,
+    Lists,
+    algorithms_for,
+    check_algorithms,
+    check_lists,
+    inner_loop,
 )
-from scb.agents.ppo import PPO, PPOConfig, PPOHyperparameters
+from scb.curriculum import CurriculumConfig, check_curriculum, horizon, with_limit
 from scb.environments.registry import make
 from scb.environments.synthetic import (
     BanditConfig,
-    BanditParams,
     SyntheticBandit,
     Weights,
     bandit_for,
 )
+from scb.environments.synthetic_mdp import PARAMETERIZATIONS, SyntheticMDP, synthetic_for
 from scb.environments.zoo import open_bandit
 from scb.errors import UserError, unknown_name
 from scb.evolution import EnvironmentSteps, EvolutionConfig, Outcome, evolve, map_population
 from scb.runs import Run
-from scb.warm_start import WarmStartConfig, expert_dataset, fit_bandit, train_expert
+from scb.warm_start import (
+    WarmStartConfig,
+    expert_dataset,
+    expert_setting,
+    find_expert,
+    fit_bandit,
+)
 
 INITS = ("random", "expert")
+MODES = ("all", "sequential")
 
 
 @dataclass(frozen=True)
@@ -45,13 +55,21 @@ class DiscoveryConfig:
 
     Attributes:
       environment: the evaluation environment's name.
-      bandit: the bandit's networks and latent.
-      agent: PPO's static configuration in the inner loop; None takes the paper's table.
-      sampled_hyperparameters: draw PPO's from the paper's lists for each agent, or keep the
+      backend: Brax's physics; None for its default, and for other environments.
+      parameterization: "I", the bandit; "TI" or "T", the paper's fully synthetic MDPs.
+      max_steps: a synthetic MDP's maximum episode length; None for the environment's own.
+      bandit: the networks and the latent.
+      algorithms: of the inner loop; empty for the paper's for the action space. In the mode
+        "sequential" a name may stand several times, and its algorithm then has that many turns.
+      mode: "all" trains every algorithm in every candidate; "sequential" one a generation, in turn.
+      sampled_hyperparameters: draw them from the paper's lists for each agent, or keep the
         underlined ones.
-      agents_per_candidate: agents whose mean return is a candidate's fitness.
+      lists: {algorithm: {hyperparameter: values}} to draw from instead of the paper's.
+      configs: {algorithm: static configuration} instead of the paper's.
+      agents_per_candidate: agents of each algorithm that is trained.
       evaluation_episodes: episodes of each agent in the evaluation environment.
       mode_actions: evaluate the most likely actions rather than sampled ones.
+      curriculum: of the evaluation episodes' length; None for the environment's own throughout.
       init: "random", or "expert" for the warm start.
       start: a bandit (name or file) whose weights to start from instead.
       warm_start: its configuration.
@@ -59,12 +77,19 @@ class DiscoveryConfig:
     """
 
     environment: str = "Pendulum-v1"
+    backend: str | None = None
+    parameterization: str = "I"
+    max_steps: int | None = None
     bandit: BanditConfig = field(default_factory=BanditConfig)
-    agent: PPOConfig | None = None
+    algorithms: tuple[str, ...] = ("ppo",)
+    mode: str = "all"
     sampled_hyperparameters: bool = True
+    lists: Mapping[str, Lists] = field(default_factory=dict)
+    configs: Mapping[str, Any] = field(default_factory=dict)
     agents_per_candidate: int = 4
     evaluation_episodes: int = 16
     mode_actions: bool = False
+    curriculum: CurriculumConfig | None = None
     init: str = "expert"
     start: str | None = None
     warm_start: WarmStartConfig = field(default_factory=WarmStartConfig)
@@ -73,69 +98,153 @@ class DiscoveryConfig:
     def __post_init__(self) -> None:
         if self.init not in INITS:
             raise unknown_name("initialisation", self.init, INITS)
+        if self.mode not in MODES:
+            raise unknown_name("mode", self.mode, MODES)
+        if self.parameterization not in PARAMETERIZATIONS:
+            raise unknown_name("parameterization", self.parameterization, PARAMETERIZATIONS)
+        if self.parameterization != "I" and self.init == "expert" and self.start is None:
+            raise UserError(
+                f"a synthetic MDP ({self.parameterization}) cannot be fitted to an expert: use init random."
+            )
+        if self.parameterization != "I" and self.start is not None:
+            raise UserError("a synthetic MDP cannot start from a bandit: leave the start out.")
+        if self.lists and not self.sampled_hyperparameters:
+            raise UserError(
+                "fixed hyperparameters are not drawn from lists: leave out the lists, or draw."
+            )
         for name in ("agents_per_candidate", "evaluation_episodes"):
             if getattr(self, name) < 1:
                 raise UserError(f"{name} is {getattr(self, name)}: it must be at least 1.")
 
 
-class BanditTraining:
-    """Trains one agent in a bandit and evaluates it in the evaluation environment.
+class SyntheticTraining:
+    """Trains one agent in a synthetic environment and evaluates it in the evaluation environment.
 
     Args:
-      bandit: the bandit, whose weights are given at each call.
+      synthetic: the bandit or MDP, whose weights are given at each call.
       env, env_params: the evaluation environment.
-      config: PPO's static configuration.
-      lists: hyperparameters to draw from; None for the defaults.
+      inner: the algorithm, its configuration and hyperparameter lists.
     """
 
     def __init__(
         self,
-        bandit: SyntheticBandit,
+        synthetic: SyntheticBandit | SyntheticMDP,
         env: environment.Environment[Any, Any],
         env_params: Any,
-        config: PPOConfig,
-        lists: Mapping[str, Sequence[float]] | None,
+        inner: InnerLoop,
     ) -> None:
-        self.agent = PPO(bandit, config)
-        self.env, self.env_params, self.lists = env, env_params, lists
+        self.synthetic, self.inner = synthetic, inner
+        self.agent = inner.agent(synthetic)
+        self.env, self.env_params = env, env_params
+        self._populations: dict[tuple[int, int, tuple[bool, ...]], Callable[..., Any]] = {}
 
-    def hyperparameters(self, key: jax.Array, number: int) -> PPOHyperparameters:
-        """[N] hyperparameters for N agents."""
-        return sample_hyperparameters(key, self.lists or {}, number)
+    def population(
+        self, num_agents: int, num_episodes: int, modes: tuple[bool, ...]
+    ) -> Callable[..., Any]:
+        """(weights, [N] hyperparameters, [N] keys) -> [N] mean returns with each of `modes`, compiled once."""
 
-    def returns(
+        def returns(weights: Weights, hyperparameters: Any, key: jax.Array) -> list[jax.Array]:
+            key_train, key_evaluate = jax.random.split(key)
+            state = self.train(weights, hyperparameters, key_train)
+            return [self.evaluate(state, key_evaluate, num_episodes, m).mean() for m in modes]
+
+        size = (num_agents, num_episodes, modes)
+        if size not in self._populations:
+            # The weights are an argument: as constants they would make another program of every
+            # bandit.
+            self._populations[size] = map_population(returns, num_agents, (None, 0, 0))
+        return self._populations[size]
+
+    def train(self, weights: Weights, hyperparameters: Any, key: jax.Array) -> Any:
+        """An agent trained in the synthetic environment with these weights."""
+        return self.agent.train(key, hyperparameters, self.synthetic.params(weights))
+
+    def evaluate(
         self,
-        params: BanditParams,
-        hyperparameters: PPOHyperparameters,
+        state: Any,
         key: jax.Array,
         num_episodes: int,
         mode: bool,
+        limit: ArrayLike | None = None,
+        longest: int | None = None,
     ) -> jax.Array:
-        """[E] returns in the evaluation environment of one agent trained in the bandit."""
-        key_train, key_evaluate = jax.random.split(key)
-        state = self.agent.train(key_train, hyperparameters, params)
+        """[E] returns of a trained agent in the evaluation environment.
+
+        Args:
+          mode: the most likely actions instead of sampled ones.
+          limit: steps after which an episode is cut; traced. None: the environment's own.
+          longest: an upper bound of `limit` that may exceed the environment's own limit.
+        """
+        env_params = self.env_params if longest is None else with_limit(self.env_params, longest)
         return self.agent.evaluate(
-            state, key_evaluate, num_episodes, self.env, self.env_params, mode=mode
+            state, key, num_episodes, self.env, env_params, mode=mode, horizon=limit
         ).returns
+
+    def returns(
+        self,
+        weights: Weights,
+        hyperparameters: Any,
+        key: jax.Array,
+        num_episodes: int,
+        mode: bool,
+        limit: ArrayLike | None = None,
+        longest: int | None = None,
+    ) -> jax.Array:
+        """[E] returns of one agent: `train`, then `evaluate`."""
+        key_train, key_evaluate = jax.random.split(key)
+        state = self.train(weights, hyperparameters, key_train)
+        return self.evaluate(state, key_evaluate, num_episodes, mode, limit, longest)
 
 
 class BanditDiscovery:
-    """The evolution problem: a candidate is a bandit's weights."""
+    """The evolution problem: a candidate is a synthetic environment's weights."""
 
     def __init__(self, config: DiscoveryConfig) -> None:
-        self.config = config
-        self.env, self.env_params = make(config.environment)
-        name = f"Synthetic-{config.environment}"
-        self.bandit = bandit_for(self.env, self.env_params, config.bandit, name)
-        self.agent_config = config.agent or inner_loop_config(config.environment)
+        arguments = {} if config.backend is None else {"backend": config.backend}
+        self.env, self.env_params = make(config.environment, **arguments)
         space = self.env.action_space(self.env_params)
-        lists = inner_loop_lists(space) if config.sampled_hyperparameters else None
-        self.training = BanditTraining(
-            self.bandit, self.env, self.env_params, self.agent_config, lists
+        if not config.algorithms:
+            config = replace(config, algorithms=algorithms_for(space))
+        check_algorithms(config.algorithms, space)
+        unused = [name for name in config.lists if name not in config.algorithms]
+        if len(unused) == len(config.lists) > 0:
+            raise UserError(
+                f"there are hyperparameter lists for {', '.join(unused)}, but the inner loop trains "
+                f"{', '.join(config.algorithms)}: give lists for that."
+            )
+        if config.init == "expert" and config.start is None:
+            expert_setting(config.environment, space, config.warm_start)
+        self.config = config
+        self.bandit = synthetic_for(
+            self.env,
+            self.env_params,
+            config.parameterization,
+            config.bandit,
+            f"Synthetic-{config.environment}",
+            config.max_steps,
         )
+        self.trainings = {
+            name: SyntheticTraining(
+                self.bandit, self.env, self.env_params, self._inner_loop(name, space)
+            )
+            for name in dict.fromkeys(config.algorithms)
+        }
+        self._horizon, self._longest = None, None
+        if config.curriculum is not None:
+            limit = int(self.env_params.max_steps_in_episode)
+            check_curriculum(config.curriculum, limit, config.environment)
+            self._horizon, self._longest = horizon(config.curriculum), config.curriculum.longest
         self.warm_start_report: dict[str, float] = {}
         # Read now, so that a wrong name is told before anything is computed or written.
         self._start = None if config.start is None else self._weights_of(config.start)
+
+    def _inner_loop(self, name: str, space: Any) -> InnerLoop:
+        config = self.config
+        inner = inner_loop(name, config.environment, space, config.sampled_hyperparameters)
+        if name in config.lists:
+            check_lists(config.lists[name], inner.hyperparameters)
+            inner = replace(inner, lists=config.lists[name])
+        return replace(inner, config=config.configs.get(name, inner.config))
 
     def _weights_of(self, name: str) -> Weights:
         start = open_bandit(name)
@@ -156,14 +265,14 @@ class BanditDiscovery:
 
     @cached_property
     def _expert_fit(self) -> Weights:
+        assert isinstance(self.bandit, SyntheticBandit)
         # Of the seed alone, so that a resumed run starts from the same fit.
         key_expert, key_data, key_fit = jax.random.split(
             jax.random.fold_in(jax.random.key(self.config.evolution.seed), 1), 3
         )
         warm = self.config.warm_start
-        setting = expert_setting(self.config.environment, warm.expert_steps)
-        expert = train_expert(self.env, self.env_params, setting, key_expert, warm.num_experts)
-        dataset, dataset_steps = expert_dataset(expert, self.env_params, key_data, warm)
+        expert = find_expert(self.config.environment, self.env, self.env_params, key_expert, warm)
+        dataset, dataset_steps = expert_dataset(expert, self.env, self.env_params, key_data, warm)
         weights, report = fit_bandit(self.bandit, dataset, key_fit, warm)
         self.warm_start_report = {
             "expert_return": expert.mean_return,
@@ -176,58 +285,83 @@ class BanditDiscovery:
         self, candidate: Weights, key: jax.Array, generation: jax.Array
     ) -> dict[str, jax.Array]:
         config = self.config
-        params = BanditParams(weights=candidate)
-        key_draw, key_agents = jax.random.split(key)
-        number = config.agents_per_candidate
-        returns = jax.vmap(
-            lambda h, k: self.training.returns(
-                params, h, k, config.evaluation_episodes, config.mode_actions
-            ).mean()
-        )(self.training.hyperparameters(key_draw, number), jax.random.split(key_agents, number))
-        return {"fitness": returns}
+        limit = None if self._horizon is None else self._horizon(generation)
+
+        def returns_of(name: str, key: jax.Array) -> jax.Array:
+            training = self.trainings[name]
+            key_draw, key_agents = jax.random.split(key)
+            number = config.agents_per_candidate
+            return jax.vmap(
+                lambda h, k: training.returns(
+                    candidate,
+                    h,
+                    k,
+                    config.evaluation_episodes,
+                    config.mode_actions,
+                    limit,
+                    self._longest,
+                ).mean()
+            )(training.inner.sample(key_draw, number), jax.random.split(key_agents, number))
+
+        names = list(self.trainings)
+        if config.mode == "all":
+            returns = {
+                name: returns_of(name, key if i == 0 else jax.random.fold_in(key, i))
+                for i, name in enumerate(names)
+            }
+            means = {f"fitness/{name}": r.mean() for name, r in returns.items()}
+            return {"fitness": jnp.concatenate(list(returns.values())), **means}
+        # The generation is no member of the population, so this stays a branch and trains one
+        # algorithm only.
+        turns = jnp.asarray([names.index(name) for name in config.algorithms])
+        turn = turns[generation % len(config.algorithms)]
+        branches = [lambda key, name=name: returns_of(name, key) for name in names]
+        fitness = jax.lax.switch(turn, branches, key)
+        logged = {
+            f"fitness/{name}": jnp.where(turn == i, fitness.mean(), jnp.nan)
+            for i, name in enumerate(names)
+        }
+        return {"fitness": fitness, **logged}
 
     def evaluate_mean(self, candidate: Weights, key: jax.Array) -> dict[str, jax.Array]:
-        key_draw, key_agent = jax.random.split(key)
-        hyperparameters = jax.tree.map(lambda x: x[0], self.training.hyperparameters(key_draw, 1))
-        returns = self.training.returns(
-            BanditParams(weights=candidate),
-            hyperparameters,
-            key_agent,
-            self.config.evaluation_episodes,
-            self.config.mode_actions,
-        )
-        return {"fitness": returns.mean()}
+        results = {}
+        for i, (name, training) in enumerate(self.trainings.items()):
+            key_draw, key_agent = jax.random.split(key if i == 0 else jax.random.fold_in(key, i))
+            hyperparameters = jax.tree.map(lambda x: x[0], training.inner.sample(key_draw, 1))
+            results[f"fitness/{name}"] = training.returns(
+                candidate,
+                hyperparameters,
+                key_agent,
+                self.config.evaluation_episodes,
+                self.config.mode_actions,
+            ).mean()
+        return {"fitness": jnp.stack(list(results.values())).mean(), **results}
 
     def steps(self) -> EnvironmentSteps:
-        agents = self.config.agents_per_candidate
+        """Of one candidate; in the mode "sequential" the mean over the algorithms' turns."""
+        config = self.config
+        agents = config.agents_per_candidate
+        if config.mode == "all":
+            training = sum(t.inner.steps for t in self.trainings.values())
+            evaluations = len(self.trainings)
+        else:
+            turns = [self.trainings[name].inner.steps for name in config.algorithms]
+            training, evaluations = sum(turns) // len(turns), 1
+        limit = self._longest or int(self.env_params.max_steps_in_episode)
         return EnvironmentSteps(
-            training=agents * self.agent_config.num_iterations * self.agent_config.batch_size,
-            evaluation=agents
-            * self.config.evaluation_episodes
-            * int(self.env_params.max_steps_in_episode),
+            training=agents * training,
+            evaluation=agents * evaluations * config.evaluation_episodes * limit,
         )
-
-
-def expert_setting(name: str, steps: int | None) -> Setting:
-    """PPO's setting for training an expert: the environment's, but a discount at which Pendulum is easy."""
-    setting = environment_setting(name)
-    config = setting.config if steps is None else replace(setting.config, total_steps=steps)
-    hyperparameters = setting.hyperparameters
-    if name == "Pendulum-v1":
-        # Episodes without end and a reward at every step: a short horizon learns the swing-up
-        # several times faster.
-        hyperparameters = replace(hyperparameters, discount=0.95)
-    return replace(setting, config=config, hyperparameters=hyperparameters)
 
 
 def check_fits(
-    bandit: SyntheticBandit,
+    bandit: SyntheticBandit | SyntheticMDP,
     env: environment.Environment[Any, Any],
     env_params: Any,
     environment_name: str,
 ) -> None:
     """Raises a UserError where a bandit has other observation or action shapes than an environment."""
-    other = bandit_for(env, env_params, bandit.config, environment_name)
+    other = bandit_for(env, env_params, BanditConfig(), environment_name)
     ours, theirs = (
         f"{b.observation_size} observations and {b.num_actions} "
         + ("discrete actions" if b.discrete else "action dimensions")
@@ -248,23 +382,28 @@ def discover(
 
 
 def judge(
-    training: BanditTraining,
+    training: SyntheticTraining,
     weights: Weights,
     seed: int,
     num_agents: int = 20,
     num_episodes: int = 50,
-    mode: bool = False,
-) -> np.ndarray:
-    """[num_agents] mean returns in the evaluation environment of agents trained in the bandit."""
+    mode: bool | None = None,
+) -> dict[str, np.ndarray]:
+    """[num_agents] mean returns in the evaluation environment of agents trained in a synthetic one.
+
+    Args:
+      weights: the synthetic environment's.
+      seed: decides hyperparameters, training and evaluation.
+
+    Returns:
+      {"sampled_actions": [N], "mode_actions": [N]} of the same agents; with `mode` given, only that
+      one.
+    """
     key_draw, key_agents = jax.random.split(jax.random.key(seed))
-    returns = map_population(
-        lambda weights, hyperparameters, key: training.returns(
-            BanditParams(weights=weights), hyperparameters, key, num_episodes, mode
-        ).mean(),
-        num_agents,
-        (None, 0, 0),
-    )
-    hyperparameters = training.hyperparameters(key_draw, num_agents)
+    names = {False: "sampled_actions", True: "mode_actions"}
+    modes = tuple(names) if mode is None else (mode,)
+    hyperparameters = training.inner.sample(key_draw, num_agents)
     keys = jax.random.split(key_agents, num_agents)
-    # The weights are an argument: as constants they would make another program of every bandit.
-    return np.asarray(returns(weights, hyperparameters, keys))
+    population = training.population(num_agents, num_episodes, modes)
+    returns = population(weights, hyperparameters, keys)
+    return {names[m]: np.asarray(x) for m, x in zip(modes, returns, strict=True)}

@@ -25,6 +25,7 @@ from scipy.stats import rankdata
 
 from scb.errors import UserError, unknown_name
 from scb.runs import Checkpoints, Run, Stopwatch
+from scb.statistics import iqm
 
 # These take constructor arguments of their own that no common configuration can supply.
 _UNSUPPORTED = {"RandomSearch", "SV_CMA_ES", "SV_Open_ES"}
@@ -152,8 +153,8 @@ class Outcome:
 
     Attributes:
       mean: the mean of the final search distribution.
-      best_mean: the mean at that generation whose evaluation (`evaluate_mean`) was best. Chosen
-        under noise: report it on fresh seeds only.
+      best_mean: the mean at that generation whose evaluation (`evaluate_mean`, interquartile mean)
+        was best. Chosen under noise: report it on fresh seeds only.
       best_mean_generation: which one that was.
       metrics: the run's log.
       seconds: wall-clock of all generations.
@@ -365,12 +366,18 @@ def evolve(
         # The same seeds at every judgement: means of different generations are then compared in
         # pairs.
         keys = jax.random.split(key_mean, config.mean_evaluations)
-        outcome = {name: float(np.mean(v)) for name, v in evaluate_mean(mean, keys).items()}
-        if outcome["fitness"] > float(state["best_mean_fitness"]):
+        judged = evaluate_mean(mean, keys)
+        outcome = {name: float(np.mean(v)) for name, v in judged.items()}
+        # The interquartile mean too: of agents with random hyperparameters a few fail far below the rest.
+        middles = {
+            f"{name}_iqm": float(iqm(v)) for name, v in judged.items() if np.isfinite(v).all()
+        }
+        score = middles.get("fitness_iqm", -np.inf)
+        if score > float(state["best_mean_fitness"]):
             state["best_mean"] = mean
-            state["best_mean_fitness"] = jnp.float32(outcome["fitness"])
+            state["best_mean_fitness"] = jnp.float32(score)
             state["best_mean_generation"] = jnp.int32(generation)
-        return {f"mean/{name}": value for name, value in outcome.items()}
+        return {f"mean/{name}": value for name, value in {**outcome, **middles}.items()}
 
     with _progress(console, config.num_generations, first) as advance:
         for generation in range(first, config.num_generations):
@@ -403,7 +410,12 @@ def evolve(
                 "steps/training": done * steps.training,
                 "steps/evaluation": done * steps.evaluation,
                 "steps/total": done * steps.total,
-                **{f"candidates/{name}": np.nanmean(value) for name, value in results.items()},
+                # What has no number in this generation (an algorithm whose turn it wasn't) is left out.
+                **{
+                    f"candidates/{name}": np.nanmean(value)
+                    for name, value in results.items()
+                    if not np.all(np.isnan(value))
+                },
             }
             last = generation + 1 == config.num_generations
             if last:

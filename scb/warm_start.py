@@ -5,7 +5,8 @@ expert's states, has the expert's policy as its optimum. Regression finds such a
 what it cannot know is which of them *trains* well, and that is what evolution is for.
 """
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import jax
@@ -14,11 +15,14 @@ import numpy as np
 import optax
 from gymnax.environments import environment, spaces
 
-from scb.agents.hyperparameters import Setting
-from scb.agents.ppo import PPO, PPOState
+from scb.agents.hyperparameters import ALGORITHMS, check_algorithms
+from scb.agents.settings import Setting, environment_setting, environment_settings
+from scb.curriculum import paper_curriculum
 from scb.environments.synthetic import BanditParams, SyntheticBandit, Weights
 from scb.errors import UserError, unknown_name
+from scb.experts import Expert, PolicySearchConfig, evolve_expert, train_expert
 
+EXPERTS = ("auto", "evolution", *ALGORITHMS)
 CONSTRUCTIONS = ("advantage", "q", "action_distance")
 
 
@@ -30,8 +34,16 @@ class WarmStartConfig:
       construction: the reward's target. "advantage": (Q(s, a) - max_a Q(s, a)) / std; "q": (Q -
         mean) / std; "action_distance": -||a - a*|| (discrete: 1 where a = a*), a* the expert's mode
         action.
+      expert: the algorithm that finds it: one of the agents' ("ppo", "sac", ...), or "evolution" of a
+        small policy network. "auto" takes PPO where the environment has a setting of its own for
+        it, and evolution elsewhere.
       num_experts: agents trained on the environment; the best of them is the expert.
       expert_steps: environment steps of each; the environment's own setting where None.
+      expert_generations: of the evolution, where that finds the expert.
+      min_spread: entries of the observation whose standard deviation is smaller are stretched about
+        their mean until they have it, and the expert says what it does there; 0 for the states as
+        they are. Agents learn little from an entry as small as a car's velocity. For
+        "action_distance" only: Q-values cannot be simulated from states that don't exist.
       discount: of the Q-function.
       num_states, num_actions: states that the dataset holds, and actions tried in each.
       horizon: steps after which a Monte-Carlo return is cut off.
@@ -39,8 +51,11 @@ class WarmStartConfig:
     """
 
     construction: str = "action_distance"
+    expert: str = "auto"
     num_experts: int = 8
     expert_steps: int | None = None
+    expert_generations: int = 80
+    min_spread: float = 0.0
     discount: float = 0.95
     num_states: int = 4096
     num_actions: int = 16
@@ -50,16 +65,25 @@ class WarmStartConfig:
     def __post_init__(self) -> None:
         if self.construction not in CONSTRUCTIONS:
             raise unknown_name("warm-start construction", self.construction, CONSTRUCTIONS)
-        for field in ("num_experts", "num_states", "num_actions", "horizon", "fit_steps"):
+        if self.expert not in EXPERTS:
+            raise unknown_name("expert", self.expert, EXPERTS)
+        if not 0 <= self.min_spread < np.inf:
+            raise UserError(f"min_spread is {self.min_spread}: it must be 0 or larger, and finite.")
+        if self.min_spread > 0 and self.construction != "action_distance":
+            raise UserError(
+                f"min_spread is {self.min_spread}, which the construction {self.construction} cannot use: "
+                "take action_distance, or a min_spread of 0."
+            )
+        for field in (
+            "num_experts",
+            "num_states",
+            "num_actions",
+            "horizon",
+            "fit_steps",
+            "expert_generations",
+        ):
             if getattr(self, field) < 1:
                 raise UserError(f"{field} is {getattr(self, field)}: it must be at least 1.")
-
-
-class Expert(NamedTuple):
-    agent: PPO
-    state: PPOState
-    mean_return: float
-    environment_steps: int
 
 
 class ExpertDataset(NamedTuple):
@@ -67,35 +91,67 @@ class ExpertDataset(NamedTuple):
 
     observation: jax.Array  # [S, O]
     action: jax.Array  # [S, K, ...]
-    q: jax.Array  # [S, K]
+    q: jax.Array  # [S, K]; zeros for "action_distance", which needs none
     expert_action: jax.Array  # [S, ...]
 
 
-def train_expert(
+def expert_setting(
+    name: str, space: spaces.Box | spaces.Discrete, config: WarmStartConfig
+) -> Setting | None:
+    """How the expert of an environment is trained; None where evolution finds it.
+
+    Raises:
+      UserError: an algorithm that doesn't fit the action space, or steps that it can't be trained
+        for.
+    """
+    algorithm = config.expert
+    if algorithm == "auto":
+        algorithm = "ppo" if name in environment_settings("ppo") else "evolution"
+    if algorithm == "evolution":
+        if config.expert_steps is not None:
+            raise UserError(
+                f"expert_steps is {config.expert_steps}, but evolution finds the expert of {name} and trains no "
+                "agent: leave it out, or choose an algorithm for the expert."
+            )
+        return None
+    check_algorithms([algorithm], space)
+    setting = environment_setting(name, algorithm)
+    if config.expert_steps is not None:
+        setting = replace(setting, config=replace(setting.config, total_steps=config.expert_steps))
+    if name == "Pendulum-v1" and algorithm == "ppo":
+        # Episodes without end and a reward at every step: a short horizon learns the swing-up
+        # several times faster.
+        short = replace(setting.hyperparameters, discount=0.95)
+        setting = replace(setting, hyperparameters=short)
+    return setting
+
+
+def find_expert(
+    name: str,
     env: environment.Environment[Any, Any],
     env_params: Any,
-    setting: Setting,
     key: jax.Array,
-    num_experts: int,
+    config: WarmStartConfig,
 ) -> Expert:
-    """The best of `num_experts` PPO agents trained on the environment itself, by 20 episodes of mode actions."""
-    agent = PPO(env, setting.config)
-
-    @jax.jit
-    def train(key: jax.Array) -> tuple[PPOState, jax.Array]:
-        key_train, key_evaluate = jax.random.split(key)
-        state = agent.train(key_train, setting.hyperparameters, env_params)
-        episodes = agent.evaluate(state, key_evaluate, 20, env_params=env_params, mode=True)
-        return state, episodes.returns.mean()
-
-    states, returns = jax.vmap(train)(jax.random.split(key, num_experts))
-    best = int(jnp.argmax(returns))
-    steps = setting.config.num_iterations * setting.config.batch_size * num_experts
-    return Expert(agent, jax.tree.map(lambda x: x[best], states), float(returns[best]), steps)
+    """An expert for an environment, by name as `scb.make` takes it."""
+    setting = expert_setting(name, env.action_space(env_params), config)
+    if setting is None:
+        search = PolicySearchConfig()
+        search = replace(
+            search,
+            curriculum=paper_curriculum(name, config.expert_generations),
+            evolution=replace(search.evolution, num_generations=config.expert_generations),
+        )
+        return evolve_expert(env, env_params, search, key)
+    return train_expert(env, env_params, setting, key, config.num_experts)
 
 
 def expert_dataset(
-    expert: Expert, env_params: Any, key: jax.Array, config: WarmStartConfig
+    expert: Expert,
+    env: environment.Environment[Any, Any],
+    env_params: Any,
+    key: jax.Array,
+    config: WarmStartConfig,
 ) -> tuple[ExpertDataset, int]:
     """Q-values by simulation: from a stored state take an action once, then follow the expert.
 
@@ -106,12 +162,11 @@ def expert_dataset(
     Returns:
       (the dataset, environment steps it took).
     """
-    env = expert.agent.env
     space = env.action_space(env_params)
-    key_roll, key_pick, key_action, key_q = jax.random.split(key, 4)
+    key_roll, key_pick, _, key_q = jax.random.split(key, 4)
 
     def expert_policy(observation: jax.Array) -> jax.Array:
-        return expert.agent.act(expert.state, observation, key, env_params, mode=True)
+        return expert.policy(jnp.ravel(observation))
 
     num_envs = 256
     num_steps = min(200, int(env_params.max_steps_in_episode))
@@ -166,14 +221,33 @@ def expert_dataset(
         else:
             random = jax.vmap(space.sample)(jax.random.split(key_random, config.num_actions - 1))
             actions = jnp.concatenate([best[None], random])
-        q = jax.vmap(q_value, in_axes=(None, 0, None))(env_state, actions, key_follow)
+        if config.construction == "action_distance":
+            q = jnp.zeros(actions.shape[0])  # it only asks what the expert does
+        else:
+            q = jax.vmap(q_value, in_axes=(None, 0, None))(env_state, actions, key_follow)
         return actions, q, best
 
     actions, q, best = label(env_states, observations, jax.random.split(key_q, config.num_states))
-    del key_action
+    if config.min_spread > 0:
+        observations, best = _stretched(observations, config.min_spread, expert_policy)
+        best = jnp.reshape(best, (config.num_states, *space.shape))
+        if not isinstance(space, spaces.Discrete):
+            actions = actions.at[:, 0].set(best)
     dataset = ExpertDataset(jnp.reshape(observations, (config.num_states, -1)), actions, q, best)
-    steps = num_envs * num_steps + config.num_states * actions.shape[1] * config.horizon
+    steps = num_envs * num_steps
+    if config.construction != "action_distance":
+        steps += config.num_states * actions.shape[1] * config.horizon
     return dataset, steps
+
+
+def _stretched(
+    observations: jax.Array, min_spread: float, policy: Callable[[jax.Array], jax.Array]
+) -> tuple[jax.Array, jax.Array]:
+    """[S, O] states whose every entry has at least this standard deviation, and what the expert does there."""
+    flat = jnp.reshape(observations, (observations.shape[0], -1))
+    mean, std = flat.mean(axis=0), flat.std(axis=0)
+    stretched = mean + (flat - mean) * jnp.maximum(1.0, min_spread / (std + 1e-8))
+    return stretched, jax.jit(jax.vmap(policy))(stretched)
 
 
 def reward_targets(dataset: ExpertDataset, construction: str, discrete: bool) -> jax.Array:

@@ -62,3 +62,58 @@ class ValueNetwork(nn.Module):
     def __call__(self, observation: jax.Array) -> jax.Array:
         """[..., O] -> [...] value."""
         return MLP(self.hidden_sizes, 1, self.activation)(observation)[..., 0]
+
+
+class QNetwork(nn.Module):
+    """Q-values of all discrete actions."""
+
+    num_actions: int
+    hidden_sizes: tuple[int, ...]
+    activation: str
+
+    @nn.compact
+    def __call__(self, observation: jax.Array) -> jax.Array:
+        """[..., O] -> [..., n]."""
+        return MLP(self.hidden_sizes, self.num_actions, self.activation)(observation)
+
+
+class Critic(nn.Module):
+    """Q-value of a continuous action."""
+
+    hidden_sizes: tuple[int, ...]
+    activation: str
+
+    @nn.compact
+    def __call__(self, observation: jax.Array, action: jax.Array) -> jax.Array:
+        """[..., O], [..., A] -> [...]."""
+        inputs = jnp.concatenate([observation, action], axis=-1)
+        return MLP(self.hidden_sizes, 1, self.activation)(inputs)[..., 0]
+
+
+class DeterministicPolicy(nn.Module):
+    """An action in [-1, 1] per dimension, by a tanh."""
+
+    action_size: int
+    hidden_sizes: tuple[int, ...]
+    activation: str
+
+    @nn.compact
+    def __call__(self, observation: jax.Array) -> jax.Array:
+        """[..., O] -> [..., A]."""
+        return jnp.tanh(MLP(self.hidden_sizes, self.action_size, self.activation)(observation))
+
+
+class SquashedGaussianPolicy(nn.Module):
+    """A Gaussian, both of whose moments depend on the observation, to be squashed by a tanh."""
+
+    action_size: int
+    hidden_sizes: tuple[int, ...]
+    activation: str
+
+    @nn.compact
+    def __call__(self, observation: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """[..., O] -> ([..., A] mean, [..., A] standard deviation), before the tanh."""
+        outputs = MLP(self.hidden_sizes, 2 * self.action_size, self.activation)(observation)
+        mean, log_std = jnp.split(outputs, 2, axis=-1)
+        # The usual bounds: below, the density overflows; above, the tanh saturates.
+        return mean, jnp.exp(jnp.clip(log_std, -10.0, 2.0))

@@ -18,13 +18,13 @@ import jax.numpy as jnp
 import optax
 from flax import linen as nn
 from flax import struct
-from gymnax.environments import environment, spaces
+from gymnax.environments import spaces
 from jax.typing import ArrayLike
 
 from scb.agents import networks
+from scb.agents.agent import Agent, clip_to_space
 from scb.agents.normalization import RunningStatistics, normalize, update_statistics
 from scb.errors import UserError, unknown_name
-from scb.evaluation import Episodes, evaluate
 
 DriftFunction: TypeAlias = Callable[[Any, jax.Array, jax.Array, jax.Array], jax.Array]
 
@@ -176,7 +176,7 @@ def generalized_advantages(
 
 
 @dataclass(frozen=True, eq=False)
-class PPO:
+class PPO(Agent):
     """PPO in one environment with one drift; every method is pure, and to be jitted and vmapped by the caller.
 
     Args:
@@ -185,13 +185,12 @@ class PPO:
       drift: (parameters, log_ratio [B], advantage [B], progress [B]) -> penalty [B].
     """
 
-    env: environment.Environment[Any, Any]
     config: PPOConfig
     drift: DriftFunction = clipped_surrogate_drift
 
     @property
     def one_step(self) -> bool:
-        return self.config.one_batch_contexts and getattr(self.env, "one_step", False)
+        return self.config.one_batch_contexts and super().one_step
 
     def _networks(self, env_params: Any) -> tuple[Any, Any]:
         # Any: flax types `apply` as a union with mutated collections, which these never have.
@@ -211,9 +210,7 @@ class PPO:
         """A fresh agent, its environments at their first observation."""
         key_policy, key_value, key_reset, key_train = jax.random.split(key, 4)
         policy, value = self._networks(env_params)
-        size = 1
-        for dimension in self.env.observation_space(env_params).shape:
-            size *= dimension
+        size = self.observation_size(env_params)
         params = {
             "policy": policy.init(key_policy, jnp.zeros(size)),
             "value": value.init(key_value, jnp.zeros(size)),
@@ -233,101 +230,11 @@ class PPO:
             key=key_train,
         )
 
-    def train(
-        self, key: jax.Array, hyperparameters: PPOHyperparameters, env_params: Any
-    ) -> PPOState:
-        """Initialises and trains for `config.num_iterations`."""
-        state = self.init(key, hyperparameters, env_params)
-        return self.train_iterations(state, hyperparameters, env_params, self.config.num_iterations)
-
-    def train_iterations(
-        self,
-        state: PPOState,
-        hyperparameters: PPOHyperparameters,
-        env_params: Any,
-        num_iterations: int,
-    ) -> PPOState:
-        """`num_iterations` times: collect a batch, update on it. A segment of a longer training."""
-
-        def iteration(state: PPOState, _: None) -> tuple[PPOState, None]:
-            return self._iteration(state, hyperparameters, env_params), None
-
-        state, _ = jax.lax.scan(iteration, state, None, num_iterations)
-        return state
-
-    def train_with_evaluations(
-        self,
-        key: jax.Array,
-        hyperparameters: PPOHyperparameters,
-        env_params: Any,
-        evaluation: Callable[[PPOState, jax.Array], Any],
-        every: int,
-    ) -> tuple[PPOState, Any]:
-        """Trains, and evaluates before the first and after every `every`-th iteration.
-
-        Args:
-          evaluation: (state, key) -> pytree of what is wanted of the agent at that point.
-          every: iterations between evaluations; must divide `config.num_iterations`.
-
-        Returns:
-          The trained agent, and the evaluations stacked along a new first axis of num_iterations /
-          every + 1 entries.
-        """
-        if every < 1 or self.config.num_iterations % every:
-            raise UserError(
-                f"evaluation every {every} iterations does not divide {self.config.num_iterations} iterations: "
-                "choose a divisor."
-            )
-        key_train, key_evaluate = jax.random.split(key)
-        state = self.init(key_train, hyperparameters, env_params)
-
-        def segment(state: PPOState, key: jax.Array) -> tuple[PPOState, Any]:
-            outcome = evaluation(state, key)
-            return self.train_iterations(state, hyperparameters, env_params, every), outcome
-
-        keys = jax.random.split(key_evaluate, self.config.num_iterations // every + 1)
-        state, outcomes = jax.lax.scan(segment, state, keys[:-1])
-        last = evaluation(state, keys[-1])
-        return state, jax.tree.map(lambda a, b: jnp.concatenate([a, b[None]]), outcomes, last)
-
-    def act(
-        self,
-        state: PPOState,
-        observation: jax.Array,
-        key: jax.Array,
-        env_params: Any = None,
-        mode: bool = False,
+    def choose(
+        self, state: PPOState, observation: jax.Array, key: jax.Array, env_params: Any, mode: bool
     ) -> jax.Array:
-        """The agent's action for one observation, within the action space's bounds.
-
-        Args:
-          mode: the most likely action instead of a sampled one.
-        """
-        env_params = self.env.default_params if env_params is None else env_params
-        distribution = self._policy(state, jnp.ravel(observation), env_params)
-        action = distribution.mode() if mode else distribution.sample(seed=key)
-        return self._to_environment(action, env_params)
-
-    def evaluate(
-        self,
-        state: PPOState,
-        key: jax.Array,
-        num_episodes: int,
-        env: environment.Environment[Any, Any] | None = None,
-        env_params: Any = None,
-        mode: bool = False,
-        horizon: ArrayLike | None = None,
-    ) -> Episodes:
-        """Episodes of the frozen agent, in its own environment or in another of the same shapes."""
-        env = self.env if env is None else env
-        env_params = env.default_params if env_params is None else env_params
-
-        def policy(observation: jax.Array, key: jax.Array) -> jax.Array:
-            distribution = self._policy(state, jnp.ravel(observation), env_params)
-            action = distribution.mode() if mode else distribution.sample(seed=key)
-            return _clip_to_space(action, env.action_space(env_params))
-
-        return evaluate(env, env_params, policy, key, num_episodes, horizon)
+        distribution = self._policy(state, observation, env_params)
+        return distribution.mode() if mode else distribution.sample(seed=key)
 
     def _inputs(self, state: PPOState, observation: jax.Array) -> jax.Array:
         if self.config.normalize_observations:
@@ -344,10 +251,7 @@ class PPO:
         _, value = self._networks(env_params)
         return cast(jax.Array, value.apply(state.params["value"], self._inputs(state, observation)))
 
-    def _to_environment(self, action: jax.Array, env_params: Any) -> jax.Array:
-        return _clip_to_space(action, self.env.action_space(env_params))
-
-    def _iteration(
+    def iterate(
         self, state: PPOState, hyperparameters: PPOHyperparameters, env_params: Any
     ) -> PPOState:
         key, key_collect, key_update = jax.random.split(state.key, 3)
@@ -366,6 +270,7 @@ class PPO:
     def _collect_contexts(self, state: PPOState, key: jax.Array, env_params: Any) -> Batch:
         """One batch of independent one-step episodes: nothing to bootstrap, A = r - V(s)."""
         size = self.config.batch_size
+        space = self.env.action_space(env_params)
         key_reset, key_act, key_step = jax.random.split(key, 3)
         observation, env_state = jax.vmap(self.env.reset_env, in_axes=(0, None))(
             jax.random.split(key_reset, size), env_params
@@ -376,7 +281,7 @@ class PPO:
         _, _, reward, _, _ = jax.vmap(self.env.step_env, in_axes=(0, 0, 0, None))(
             jax.random.split(key_step, size),
             env_state,
-            jax.vmap(lambda a: self._to_environment(a, env_params))(action),
+            jax.vmap(lambda a: clip_to_space(a, space))(action),
             env_params,
         )
         advantage = reward - self._value(state, observation, env_params)
@@ -390,6 +295,7 @@ class PPO:
         env_params: Any,
     ) -> tuple[PPOState, Batch]:
         num_envs, num_steps = self.config.num_envs, self.config.num_steps
+        space = self.env.action_space(env_params)
 
         def flat(observation: jax.Array) -> jax.Array:
             return jnp.reshape(observation, (num_envs, -1))
@@ -404,7 +310,7 @@ class PPO:
             )(
                 jax.random.split(key_step, num_envs),
                 env_state,
-                jax.vmap(lambda a: self._to_environment(a, env_params))(action),
+                jax.vmap(lambda a: clip_to_space(a, space))(action),
                 env_params,
             )
             transition = {
@@ -529,9 +435,3 @@ def _optimizer(hyperparameters: PPOHyperparameters) -> optax.GradientTransformat
         optax.clip_by_global_norm(hyperparameters.max_grad_norm),
         optax.adam(hyperparameters.learning_rate, eps=1e-5),
     )
-
-
-def _clip_to_space(action: jax.Array, space: spaces.Box | spaces.Discrete) -> jax.Array:
-    if isinstance(space, spaces.Discrete):
-        return action
-    return jnp.reshape(jnp.clip(action, space.low, space.high), space.shape)

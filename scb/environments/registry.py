@@ -1,4 +1,4 @@
-"""Environments by name: synthetic bandits, gymnax's and Brax's, all behind gymnax 1.x's interface."""
+"""Environments by name: synthetic ones, gymnax's and Brax's, all behind gymnax 1.x's interface."""
 
 from typing import Any
 
@@ -6,7 +6,7 @@ import gymnax
 from gymnax.environments import environment
 
 from scb.environments.brax import BRAX_NAMES, BraxEnvironment
-from scb.environments.zoo import load_bandit
+from scb.environments.zoo import load
 from scb.errors import UserError, unknown_name
 
 
@@ -19,7 +19,8 @@ def make(name: str, **arguments: Any) -> tuple[environment.Environment[Any, Any]
     """An environment and its default parameters.
 
     Args:
-      name: "Synthetic-Pendulum-v1", "CartPole-v1", "hopper", ..., or a bandit's file.npz.
+      name: "Synthetic-Pendulum-v1", "CartPole-v1", "hopper", ..., or the file.npz of a bandit or of a
+        synthetic MDP.
       arguments: for the environment's constructor; Brax takes `backend="generalized" | "positional"
         | "spring"`.
 
@@ -27,8 +28,8 @@ def make(name: str, **arguments: Any) -> tuple[environment.Environment[Any, Any]
       UserError: unknown name (with near matches), or arguments that the environment doesn't take.
     """
     if name.endswith(".npz"):
-        bandit = load_bandit(name)
-        return bandit, bandit.default_params
+        synthetic = load(name)
+        return synthetic, synthetic.default_params
     try:
         if name in BRAX_NAMES:
             env = BraxEnvironment(name, **arguments)

@@ -62,7 +62,9 @@ class BanditParams(environment.EnvParams):
     max_steps_in_episode: int = 1
 
 
-class _TwoLayers(nn.Module):
+class TwoLayers(nn.Module):
+    """[..., N] -> [..., output_size]: Dense, activation, Dense; what every learned function here is."""
+
     hidden_size: int
     output_size: int
     activation: str
@@ -120,10 +122,10 @@ class SyntheticBandit(environment.Environment[BanditState, BanditParams]):
         self._action_space = action_space
         self._name = name
         self.discrete = isinstance(action_space, spaces.Discrete)
-        self._action_size = action_space.n if self.discrete else max(1, _size(action_space.shape))
+        self._action_size = encoded_size(action_space)
         self.latent_size = self.config.latent_size or observation_size
         network = partial(
-            _TwoLayers, hidden_size=self.config.hidden_size, activation=self.config.activation
+            TwoLayers, hidden_size=self.config.hidden_size, activation=self.config.activation
         )
         self._initial_state = network(output_size=observation_size)
         self._reward = network(output_size=1)
@@ -145,6 +147,10 @@ class SyntheticBandit(environment.Environment[BanditState, BanditParams]):
             )
         return BanditParams(weights=self._weights)
 
+    def params(self, weights: Weights) -> BanditParams:
+        """These weights, without reward noise."""
+        return BanditParams(weights=weights)
+
     def init_weights(self, key: jax.Array) -> Weights:
         """Random weights (Flax's default initialisation), the start of the paper's evolution."""
         key_state, key_reward = jax.random.split(key)
@@ -158,9 +164,7 @@ class SyntheticBandit(environment.Environment[BanditState, BanditParams]):
 
     def weight_shapes(self) -> dict[str, tuple[int, ...]]:
         """{"reward/Dense_0/kernel": (O + A, hidden), ...}: what an artefact of this bandit must hold."""
-        shapes = jax.eval_shape(self.init_weights, jax.random.key(0))
-        flat = jax.tree_util.tree_flatten_with_path(shapes)[0]
-        return {"/".join(str(part.key) for part in path): leaf.shape for path, leaf in flat}
+        return shapes_of(self.init_weights)
 
     def context(self, latent: jax.Array, params: BanditParams) -> jax.Array:
         """[L] latent -> [O] observation."""
@@ -169,12 +173,7 @@ class SyntheticBandit(environment.Environment[BanditState, BanditParams]):
 
     def mean_reward(self, context: jax.Array, action: ArrayLike, params: BanditParams) -> jax.Array:
         """[O] context, action -> [] reward without noise: the bandit's Q-function."""
-        if self.discrete:
-            encoded = jax.nn.one_hot(action, self._action_size)
-        else:
-            clipped = jnp.clip(jnp.asarray(action), self._action_space.low, self._action_space.high)
-            encoded = jnp.reshape(clipped, (self._action_size,))
-        inputs = jnp.concatenate([context, encoded])
+        inputs = jnp.concatenate([context, encode_action(action, self._action_space)])
         reward = self._reward.apply({"params": params.weights["reward"]}, inputs)
         return cast(jax.Array, reward)[0]
 
@@ -218,16 +217,36 @@ class SyntheticBandit(environment.Environment[BanditState, BanditParams]):
         return jnp.std(jax.vmap(sample)(jax.random.split(key, num_samples)))
 
 
-def _size(shape: tuple[int, ...]) -> int:
+def flat_size(shape: tuple[int, ...]) -> int:
+    """Number of entries of an array of this shape; 1 for ()."""
     size = 1
     for dimension in shape:
         size *= dimension
     return size
 
 
+def encoded_size(space: spaces.Box | spaces.Discrete) -> int:
+    """A, the size of `encode_action`."""
+    return int(space.n) if isinstance(space, spaces.Discrete) else max(1, flat_size(space.shape))
+
+
+def encode_action(action: ArrayLike, space: spaces.Box | spaces.Discrete) -> jax.Array:
+    """An action as networks take it: [A], a discrete one one-hot, a continuous one clipped to its bounds."""
+    if isinstance(space, spaces.Discrete):
+        return jax.nn.one_hot(action, encoded_size(space))
+    return jnp.reshape(jnp.clip(jnp.asarray(action), space.low, space.high), (encoded_size(space),))
+
+
+def shapes_of(init_weights: Callable[[jax.Array], Weights]) -> dict[str, tuple[int, ...]]:
+    """{"reward/Dense_0/kernel": (O + A, hidden), ...} of what `init_weights(key)` returns."""
+    shapes = jax.eval_shape(init_weights, jax.random.key(0))
+    flat = jax.tree_util.tree_flatten_with_path(shapes)[0]
+    return {"/".join(str(part.key) for part in path): leaf.shape for path, leaf in flat}
+
+
 def bandit_for(
     env: environment.Environment[Any, Any], env_params: Any, config: BanditConfig, name: str
 ) -> SyntheticBandit:
     """An untrained bandit with the (flattened) observation and action shapes of an evaluation environment."""
-    observation_size = _size(env.observation_space(env_params).shape)
+    observation_size = flat_size(env.observation_space(env_params).shape)
     return SyntheticBandit(observation_size, env.action_space(env_params), config, name=name)

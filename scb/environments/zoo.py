@@ -1,9 +1,11 @@
-"""Bandits as files, and the ones that ship with the library.
+"""Synthetic environments as files, and the bandits that ship with the library.
 
-A bandit is NAME.npz (its weights) with NAME.json (its shapes, how it was found, what it is worth).
-Those in `scb/zoo` are registered with gymnax when `scb` is imported, and read when one is made.
+A bandit is NAME.npz (its weights) with NAME.json (its shapes, how it was found, what it is worth),
+and so is a synthetic MDP. The bandits in `scb/zoo` are registered with gymnax when `scb` is
+imported, and read when one is made.
 """
 
+import dataclasses
 from collections.abc import Mapping
 from functools import partial
 from importlib import resources
@@ -14,13 +16,16 @@ import gymnax
 import jax
 import jax.numpy as jnp
 import numpy as np
-from gymnax.environments import spaces
+from gymnax.environments import environment, spaces
 
 from scb import artefacts
+from scb.environments.brax import BraxEnvironment
 from scb.environments.synthetic import BanditConfig, SyntheticBandit, Weights
+from scb.environments.synthetic_mdp import MDPConfig, SyntheticMDP
 from scb.errors import UserError, unknown_name
 
 KIND = "bandit"
+MDP_KIND = "synthetic_mdp"
 PREFIX = "Synthetic-"
 
 
@@ -61,7 +66,10 @@ def bandit_metadata(name: str) -> Mapping[str, Any]:
 
 def load_bandit(path: str | Path) -> SyntheticBandit:
     """A bandit from its file; a UserError says what is wrong with it."""
-    artefact = artefacts.load(path, KIND)
+    return _bandit(artefacts.load(path, KIND), path)
+
+
+def _bandit(artefact: artefacts.Artefact, path: str | Path) -> SyntheticBandit:
     config = artefact.metadata["config"]
     try:
         bandit = SyntheticBandit(
@@ -78,6 +86,41 @@ def load_bandit(path: str | Path) -> SyntheticBandit:
         ) from error
     artefacts.expect_shapes(artefact, shapes)
     return bandit
+
+
+def load(path: str | Path) -> SyntheticBandit | SyntheticMDP:
+    """A bandit or a synthetic MDP from its file; a UserError says what is wrong with it.
+
+    An MDP that starts in its evaluation environment's start states makes that environment by name.
+    """
+    artefact = artefacts.load(path, KIND, MDP_KIND)
+    if artefact.metadata["kind"] == KIND:
+        return _bandit(artefact, path)
+    config = artefact.metadata["config"]
+    try:
+        mdp_config = MDPConfig(**config["mdp"])
+        start = _made(config["start"]) if mdp_config.parameterization == "T" else (None, None)
+        mdp = SyntheticMDP(
+            config["observation_size"],
+            _space(config["action_space"]),
+            mdp_config,
+            jax.tree.map(jnp.asarray, dict(artefact.arrays)),
+            artefact.name,
+            *start,
+        )
+        shapes = mdp.weight_shapes()
+    except (KeyError, TypeError) as error:
+        raise UserError(
+            f"{path} does not describe a synthetic MDP: its .json lacks or garbles a config entry ({error})."
+        ) from error
+    artefacts.expect_shapes(artefact, shapes)
+    return mdp
+
+
+def _made(start: Mapping[str, Any]) -> tuple[environment.Environment[Any, Any], Any]:
+    from scb.environments.registry import make  # which imports this module, to open files
+
+    return make(start["environment"], **start["arguments"])
 
 
 def open_bandit(name: str) -> SyntheticBandit:
@@ -113,6 +156,50 @@ def save_bandit(
     }
     full = {**metadata, "kind": KIND, "config": config}
     return artefacts.save(path, jax.device_get(weights), full)
+
+
+def save_synthetic_mdp(
+    path: str | Path, mdp: SyntheticMDP, weights: Weights, metadata: Mapping[str, Any]
+) -> Path:
+    """Writes a synthetic MDP.
+
+    Args:
+      path: NAME.npz; NAME.json is written beside it, and NAME is the MDP's name.
+      mdp: whose shapes, parameterisation and maximum episode length are stored.
+      weights: as in `MDPParams.weights`.
+      metadata: as for `save_bandit`; `config["evaluation_environment"]` is the name by which to make
+        the environment in whose start states a "T" starts, where it isn't the environment's own.
+
+    Raises:
+      UserError: a "T" whose evaluation environment would not come back the same.
+    """
+    config = {
+        **metadata.get("config", {}),
+        "observation_size": mdp.observation_size,
+        "action_space": space_description(mdp.action_space()),
+        "mdp": {**dataclasses.asdict(mdp.config), "latent_size": mdp.latent_size},
+    }
+    if mdp.env is not None:
+        name = config.setdefault("evaluation_environment", mdp.env.name)
+        brax = isinstance(mdp.env, BraxEnvironment)
+        config["start"] = {
+            "environment": name,
+            "arguments": {"backend": mdp.env.backend} if brax else {},
+        }
+        made, params = _made(config["start"])
+        if type(made) is not type(mdp.env) or not _equal(params, mdp.env_params):
+            raise UserError(
+                f"{path} was not written, since {name!r} by its name is not the environment that the MDP "
+                "starts in: give its own name and default parameters."
+            )
+    full = {**metadata, "kind": MDP_KIND, "config": config}
+    return artefacts.save(path, jax.device_get(weights), full)
+
+
+def _equal(params: Any, others: Any) -> bool:
+    leaves, others_leaves = jax.tree.leaves(params), jax.tree.leaves(others)
+    same_type = type(params) is type(others) and len(leaves) == len(others_leaves)
+    return same_type and all(map(np.array_equal, leaves, others_leaves))
 
 
 def space_description(space: spaces.Box | spaces.Discrete) -> dict[str, Any]:

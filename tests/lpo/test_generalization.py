@@ -19,7 +19,7 @@ from lpo.generalization import (
     training_setting,
 )
 from lpo.objectives import Objective, load_objective
-from scb.agents.hyperparameters import Setting
+from scb.agents.settings import Setting
 from scb.agents.ppo import PPOHyperparameters
 from scb.errors import UserError
 

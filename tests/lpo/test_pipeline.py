@@ -9,7 +9,7 @@ import pytest
 
 from lpo import cli, pipeline
 from lpo.objectives import load_objective
-from scb.agents.hyperparameters import Setting
+from scb.agents.settings import Setting
 from scb.agents.ppo import PPOConfig, PPOHyperparameters
 
 

@@ -25,11 +25,13 @@ class CorridorParams(environment.EnvParams):
       last: the cell after which the episode terminates; C or more for a corridor that goes on from
         cell 0.
       random_start: 1 to start in a uniformly random cell (up to `last`), 0 to start in cell 0.
+      single_step: 1 for an episode to terminate after its first step, wherever that is.
     """
 
     rewards: Any = struct.field(default_factory=lambda: jnp.ones((3, 2)))
     last: Any = 2
     random_start: Any = 0
+    single_step: Any = 0
     max_steps_in_episode: Any = 100
 
 
@@ -58,10 +60,13 @@ class Corridor(environment.Environment[CorridorState, CorridorParams]):
     def step_env(
         self, key: jax.Array, state: CorridorState, action: jax.Array, params: CorridorParams
     ) -> tuple[jax.Array, CorridorState, jax.Array, jax.Array, dict[str, Any]]:
-        reward = params.rewards[state.cell, action]
-        terminated = state.cell >= params.last
+        reward = self.reward(state, action, params)
+        terminated = (state.cell >= params.last) | (jnp.asarray(params.single_step) > 0)
         state = CorridorState(time=state.time + 1, cell=(state.cell + 1) % self.cells)
         return self.get_obs(state), state, reward, terminated, {}
+
+    def reward(self, state: CorridorState, action: jax.Array, params: CorridorParams) -> jax.Array:
+        return params.rewards[state.cell, action]
 
     def get_obs(self, state: CorridorState, params: Any = None, key: Any = None) -> jax.Array:
         return jax.nn.one_hot(state.cell, self.cells)
@@ -71,6 +76,27 @@ class Corridor(environment.Environment[CorridorState, CorridorParams]):
 
     def observation_space(self, params: CorridorParams | None = None) -> spaces.Box:
         return spaces.Box(0.0, 1.0, (self.cells,), jnp.float32)
+
+
+class ContinuousCorridor(Corridor):
+    """A corridor whose cells pay (height, curvature, target) = `rewards[cell]`: height - curvature * |a - target|^2.
+
+    Actions lie in [-1, 2], which is neither symmetric nor of width 2: what forgets to scale is found
+    out.
+    """
+
+    @property
+    def default_params(self) -> CorridorParams:
+        return CorridorParams(
+            rewards=jnp.tile(jnp.array([1.0, 1.0, 0.5]), (self.cells, 1)), last=self.cells - 1
+        )
+
+    def reward(self, state: CorridorState, action: jax.Array, params: CorridorParams) -> jax.Array:
+        height, curvature, target = params.rewards[state.cell]
+        return height - curvature * jnp.sum((action - target) ** 2)
+
+    def action_space(self, params: CorridorParams | None = None) -> spaces.Box:
+        return spaces.Box(-1.0, 2.0, (1,), jnp.float32)
 
 
 def context_bandit() -> SyntheticBandit:

@@ -6,27 +6,32 @@ import numpy as np
 import pytest
 from gymnax.environments import spaces
 
-from scb.agents.hyperparameters import (
-    Setting,
-    environment_setting,
-    inner_loop_config,
-    inner_loop_lists,
-)
-from scb.agents.ppo import PPOConfig, PPOHyperparameters
+from scb.agents.dqn import DQNConfig
+from scb.agents.hyperparameters import InnerLoop, algorithms_for, inner_loop
+from scb.agents.ppo import PPO, PPOConfig, PPOHyperparameters
+from scb.agents.settings import Setting
+from scb.curriculum import CurriculumConfig, paper_curriculum
 from scb.discovery import (
     BanditDiscovery,
-    BanditTraining,
     DiscoveryConfig,
+    SyntheticTraining,
     check_fits,
     discover,
-    expert_setting,
     judge,
 )
 from scb.environments.registry import make
-from scb.environments.synthetic import BanditConfig, BanditParams, SyntheticBandit, bandit_for
-from scb.environments.zoo import PREFIX, bandit_metadata, load_bandit, save_bandit, zoo_names
+from scb.environments.synthetic import BanditConfig, SyntheticBandit, bandit_for
+from scb.environments.zoo import (
+    PREFIX,
+    bandit_metadata,
+    load_bandit,
+    save_bandit,
+    save_synthetic_mdp,
+    zoo_names,
+)
 from scb.errors import UserError
-from scb.evolution import EvolutionConfig, map_population
+from scb.evolution import EvolutionConfig, config_dict, map_population
+from scb.runs import Run
 from scb.statistics import iqm
 from scb.warm_start import WarmStartConfig
 from tests.scb.probes import Corridor, CorridorParams
@@ -35,10 +40,14 @@ METADATA = {"seeds": {}, "results": {}, "cost": {}, "command": "scb discover", "
 TINY = PPOConfig(
     num_envs=2, num_steps=8, num_epochs=1, num_minibatches=1, total_steps=20, hidden_sizes=(4,)
 )
+# 8 random steps, then 4 of two environments side by side: 16.
+TINY_DQN = DQNConfig(
+    num_envs=2, buffer_size=16, prefill=8, batch_size=4, total_steps=16, hidden_sizes=(4,)
+)
 CONFIG = DiscoveryConfig(
     environment="CartPole-v1",
     bandit=BanditConfig(hidden_size=4),
-    agent=TINY,
+    configs={"ppo": TINY, "dqn": TINY_DQN},
     agents_per_candidate=3,
     evaluation_episodes=2,
     init="random",
@@ -97,12 +106,12 @@ def test_agents_trained_in_a_bandit_do_in_the_environment_what_the_bandit_reward
     bad = {**good, "reward": {**good["reward"], "Dense_1": turned}}
     corridor = CorridorParams(rewards=jnp.array([[0.0, 1.0], [1.0, 0.0]]), last=1)
     config = replace(TINY, num_steps=64, num_epochs=4, num_minibatches=4, total_steps=128 * 20)
-    training = BanditTraining(bandit, Corridor(cells=2), corridor, config, lists=None)
+    inner = InnerLoop("ppo", config, PPOHyperparameters(), lists={})
+    training = SyntheticTraining(bandit, Corridor(cells=2), corridor, inner)
 
     def returns(reward_weights, key):
         hyperparameters = PPOHyperparameters(learning_rate=0.02)
-        params = BanditParams(weights=reward_weights)
-        return training.returns(params, hyperparameters, key, 4, mode=True).mean()
+        return training.returns(reward_weights, hyperparameters, key, 4, mode=True).mean()
 
     population = map_population(returns, 8, (None, 0))
     keys = jax.random.split(jax.random.key(0), 8)
@@ -118,9 +127,10 @@ def test_a_bandit_of_the_zoo_is_worth_what_it_says(name):
     target = name.removeprefix(PREFIX)
     env, env_params = make(target)
     bandit, params = make(name)
-    lists = inner_loop_lists(bandit.action_space())
-    training = BanditTraining(bandit, env, env_params, inner_loop_config(target), lists)
-    measured = iqm(judge(training, params.weights, seed=123_456))
+    inner = inner_loop("ppo", target, bandit.action_space())
+    training = SyntheticTraining(bandit, env, env_params, inner)
+    returns = judge(training, params.weights, seed=123_456, mode=False)
+    measured = iqm(returns["sampled_actions"])
     width = claimed["high"] - claimed["low"]
     assert claimed["low"] - width < measured < claimed["high"] + width
 
@@ -170,13 +180,274 @@ def test_environment_steps_of_a_candidate(discovered):
 
 def test_judging_takes_new_agents_for_another_seed(discovered):
     problem, outcome = discovered
+    training = problem.trainings["ppo"]
     a, b, c = (
-        judge(problem.training, outcome.mean, seed, num_agents=5, num_episodes=2)
-        for seed in (1, 1, 2)
+        judge(training, outcome.mean, seed, num_agents=5, num_episodes=2) for seed in (1, 1, 2)
     )
-    assert a.shape == (5,)
-    np.testing.assert_array_equal(a, b)
-    assert (a != c).any() and len(set(a)) > 1
+    assert set(a) == {"sampled_actions", "mode_actions"}
+    for actions, returns in a.items():
+        assert returns.shape == (5,)
+        np.testing.assert_array_equal(returns, b[actions])
+        assert (returns != c[actions]).any() and len(set(returns)) > 1
+
+
+def test_judging_trains_once_and_evaluates_twice(discovered, monkeypatch):
+    problem, outcome = discovered
+    bandit, inner = problem.bandit, problem.trainings["ppo"].inner
+    training = SyntheticTraining(bandit, problem.env, problem.env_params, inner)
+    calls = []
+
+    def counted(name):
+        method = getattr(training, name)
+
+        def call(*arguments):
+            calls.append(name)
+            return method(*arguments)
+
+        monkeypatch.setattr(training, name, call)
+
+    counted("train")
+    counted("evaluate")
+    both = judge(training, outcome.mean, 1, num_agents=5, num_episodes=2)
+    assert calls == ["train", "evaluate", "evaluate"]
+    # Other agents in a program that is there already: nothing is traced again.
+    judge(training, outcome.mean, 2, num_agents=5, num_episodes=2)
+    assert len(calls) == 3
+    # The two evaluations are of the same agents: one alone says the same.
+    for mode, name in ((False, "sampled_actions"), (True, "mode_actions")):
+        alone = judge(training, outcome.mean, 1, num_agents=5, num_episodes=2, mode=mode)
+        assert alone.keys() == {name}
+        np.testing.assert_array_equal(alone[name], both[name])
+    assert (both["sampled_actions"] != both["mode_actions"]).any()
+
+
+# -- several algorithms
+# -------------------------------------------------------------------------------
+
+ALL = replace(CONFIG, algorithms=("ppo", "dqn"), mode="all")
+# Repetition gives turns: two of three generations are PPO's.
+SEQUENTIAL = replace(
+    CONFIG,
+    algorithms=("ppo", "dqn", "ppo"),
+    mode="sequential",
+    evolution=replace(
+        CONFIG.evolution, num_generations=5, evaluate_mean_every=10, checkpoint_every=2
+    ),
+)
+TURNS = ["ppo", "dqn", "ppo", "ppo", "dqn"]
+
+
+def candidates(line):
+    """{algorithm: mean return} that one generation's line of the log names."""
+    prefix = "candidates/fitness/"
+    return {k.removeprefix(prefix): v for k, v in line.items() if k.startswith(prefix)}
+
+
+@pytest.fixture(scope="module")
+def trained_by_all():
+    return discover(ALL, quiet=True)
+
+
+def test_in_the_mode_all_every_agent_of_every_algorithm_is_a_task(trained_by_all):
+    problem, outcome = trained_by_all
+    evaluate = jax.jit(problem.evaluate)
+    results = evaluate(outcome.mean, jax.random.key(0), jnp.int32(0))
+    # 3 agents of each of 2 algorithms; PPO's first.
+    assert results["fitness"].shape == (6,)
+    assert float(results["fitness/ppo"]) == pytest.approx(float(results["fitness"][:3].mean()))
+    assert float(results["fitness/dqn"]) == pytest.approx(float(results["fitness"][3:].mean()))
+    # As many agents of each: the whole mean is the mean of the two.
+    for line in outcome.metrics:
+        means = candidates(line)
+        assert means.keys() == {"ppo", "dqn"}
+        assert line["fitness/mean"] == pytest.approx(sum(means.values()) / 2, rel=1e-5)
+        judged = [line[f"mean/fitness{name}"] for name in ("", "/ppo", "/dqn")]
+        assert judged[0] == pytest.approx((judged[1] + judged[2]) / 2, rel=1e-5)
+
+
+def test_the_first_algorithms_agents_are_the_same_whoever_else_is_trained(trained_by_all):
+    problem, outcome = trained_by_all
+    alone = BanditDiscovery(CONFIG)
+    key = jax.random.key(4)
+    with_others, by_itself = (
+        jax.jit(p.evaluate)(outcome.mean, key, jnp.int32(0))["fitness"] for p in (problem, alone)
+    )
+    np.testing.assert_array_equal(with_others[:3], by_itself)
+
+
+@pytest.fixture(scope="module")
+def trained_in_turns(tmp_path_factory):
+    run = Run.open(tmp_path_factory.mktemp("sequential") / "run", config_dict(SEQUENTIAL))
+    return run.folder, *discover(SEQUENTIAL, run, quiet=True)
+
+
+def test_in_the_mode_sequential_a_generation_trains_the_algorithm_whose_turn_it_is(
+    trained_in_turns,
+):
+    _, problem, outcome = trained_in_turns
+    assert [list(candidates(line)) for line in outcome.metrics] == [[name] for name in TURNS]
+    for line, name in zip(outcome.metrics, TURNS, strict=True):
+        # Its agents are the only ones, so the fitness is their mean return.
+        assert candidates(line)[name] == pytest.approx(line["fitness/mean"], rel=1e-5)
+    # A generation does what a search with that algorithm alone does.
+    key, evaluate = jax.random.key(3), jax.jit(problem.evaluate)
+    for name, generation in (("dqn", 1), ("ppo", 2), ("dqn", 7)):
+        alone = BanditDiscovery(replace(CONFIG, algorithms=(name,)))
+        expected = jax.jit(alone.evaluate)(outcome.mean, key, jnp.int32(0))["fitness"]
+        assert expected.shape == (3,)
+        actual = evaluate(outcome.mean, key, jnp.int32(generation))["fitness"]
+        np.testing.assert_array_equal(actual, expected)
+
+
+def test_in_the_mode_sequential_the_others_are_not_run(trained_in_turns):
+    # The turn stays a branch over a population; as a choice of results it would run all of them.
+    _, problem, outcome = trained_in_turns
+    population = jax.tree.map(lambda x: jnp.stack([x, x]), outcome.mean)
+    evaluate = jax.vmap(problem.evaluate, in_axes=(0, None, None))
+    program = jax.make_jaxpr(evaluate)(population, jax.random.key(0), jnp.int32(0))
+    branches = [
+        equation.params["branches"]
+        for equation in program.eqns
+        if equation.primitive.name == "cond"
+    ]
+    # One for each algorithm, however many turns it has.
+    assert [len(of_turn) for of_turn in branches] == [2]
+
+
+def test_in_the_mode_sequential_the_mean_is_judged_by_every_algorithm(trained_in_turns):
+    judged = trained_in_turns[2].metrics[0]
+    both = judged["mean/fitness/ppo"] + judged["mean/fitness/dqn"]
+    assert judged["mean/fitness"] == pytest.approx(both / 2, rel=1e-5)
+
+
+class Killed(BaseException):
+    """A kill: nothing in the code may catch it."""
+
+
+class KilledRun(Run):
+    """Dies in generation 2, whose turn is PPO's second; generation 1 has the newest checkpoint."""
+
+    def log(self, generation, metrics, seconds):
+        super().log(generation, metrics, seconds)
+        if generation == 2:
+            raise Killed
+
+
+def test_a_resumed_sequential_search_ends_with_the_same_bytes(trained_in_turns, tmp_path):
+    whole, _, outcome = trained_in_turns
+    run = KilledRun.open(tmp_path / "run", config_dict(SEQUENTIAL))
+    with pytest.raises(Killed):
+        discover(SEQUENTIAL, run, quiet=True)
+    run.close()
+    run = Run.open(tmp_path / "run", config_dict(SEQUENTIAL), resume=True)
+    _, resumed = discover(SEQUENTIAL, run, quiet=True)
+    assert flat(resumed.mean).tobytes() == flat(outcome.mean).tobytes()
+    logs = [(folder / "metrics.jsonl").read_bytes() for folder in (whole, tmp_path / "run")]
+    assert logs[0] == logs[1]
+
+
+def test_the_steps_of_several_algorithms_are_counted():
+    # A PPO agent takes 2 batches of 2 x 8 = 32 steps, a DQN agent 16; each is evaluated for 2 episodes
+    # of at most 500. All: 3 agents of each. Sequential, with turns of PPO, DQN and PPO: 3 agents of
+    # (32 + 16 + 32) / 3 = 26 steps (rounded down).
+    steps = BanditDiscovery(ALL).steps()
+    assert (steps.training, steps.evaluation) == (3 * (32 + 16), 2 * 3 * 2 * 500)
+    steps = BanditDiscovery(SEQUENTIAL).steps()
+    assert (steps.training, steps.evaluation) == (3 * 26, 3 * 2 * 500)
+
+
+@pytest.mark.parametrize("environment", ["CartPole-v1", "Pendulum-v1", "MountainCarContinuous-v0"])
+def test_an_empty_list_stands_for_the_papers_algorithms(environment):
+    problem = BanditDiscovery(replace(CONFIG, environment=environment, algorithms=()))
+    expected = algorithms_for(problem.env.action_space(problem.env_params))
+    assert problem.config.algorithms == expected
+    assert tuple(problem.trainings) == expected
+
+
+# -- curricula
+# ----------------------------------------------------------------------------------------
+
+
+def test_a_curriculum_is_one_program_whose_horizon_is_traced():
+    # CartPole pays 1 a step and no pole falls within 3 steps, so a return is the horizon: linear
+    # from 1 to 3 within 2 generations.
+    config = replace(CONFIG, curriculum=CurriculumConfig("linear", 1, 3, begin=0, transition=2))
+    problem = BanditDiscovery(config)
+    traces = []
+
+    def evaluate(candidate, key, generation):
+        traces.append(generation)
+        return problem.evaluate(candidate, key, generation)["fitness"]
+
+    population = map_population(evaluate, 2, (0, None, None))
+    weights = problem.bandit.init_weights(jax.random.key(0))
+    weights = jax.tree.map(lambda x: jnp.stack([x, x]), weights)
+    for generation, expected in enumerate([1.0, 2.0, 3.0, 3.0]):
+        fitness = population(weights, jax.random.key(1), jnp.int32(generation))
+        np.testing.assert_array_equal(fitness, np.full((2, 3), expected))
+    assert len(traces) == 1
+    # Candidates are given 3 steps at most; the mean is judged in the environment as it is.
+    assert problem.steps().evaluation == 3 * 2 * 3
+    mean = jax.tree.map(lambda x: x[0], weights)
+    judged = jax.jit(problem.evaluate_mean)(mean, jax.random.key(2))
+    assert judged["fitness"] >= 8
+
+
+def test_the_papers_curriculum_raises_mountaincars_limit():
+    # MountainCar pays -1 a step until the goal. Who always pushes left never gets there: -200 within
+    # its own limit, -1000 within the curriculum's longest episodes, -600 half-way.
+    curriculum = paper_curriculum("MountainCar-v0")
+    problem = BanditDiscovery(replace(CONFIG, environment="MountainCar-v0", curriculum=curriculum))
+    assert problem.steps().evaluation == 3 * 2 * 1000
+    training = problem.trainings["ppo"]
+    assert isinstance(training.agent, PPO)
+    weights = problem.bandit.init_weights(jax.random.key(0))
+    state = training.agent.init(
+        jax.random.key(1), PPOHyperparameters(), problem.bandit.params(weights)
+    )
+    zeros = jax.tree.map(jnp.zeros_like, state.params["policy"])
+    state = state.replace(params={**state.params, "policy": zeros})
+    key = jax.random.key(2)
+    for limit in (1000, 600, 200):
+        returns = training.evaluate(state, key, 2, True, jnp.int32(limit), curriculum.longest)
+        np.testing.assert_array_equal(returns, -float(limit))
+    np.testing.assert_array_equal(training.evaluate(state, key, 2, True), -200.0)
+
+
+def test_a_curriculum_must_end_within_the_environments_limit():
+    beyond = CurriculumConfig("linear", 10, 501)
+    with pytest.raises(UserError, match=r"ends with episodes of 501 steps, .* at most 500"):
+        BanditDiscovery(replace(CONFIG, curriculum=beyond))
+
+
+# -- synthetic MDPs
+# ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("parameterization", ["T", "TI"])
+def test_a_synthetic_mdp_is_discovered_and_opens_as_an_environment(parameterization, tmp_path):
+    config = replace(CONFIG, parameterization=parameterization, max_steps=5)
+    problem, outcome = discover(config, quiet=True)
+    networks = {"reward", "transition", "termination"}
+    assert set(outcome.mean) == networks | (
+        {"initial_state"} if parameterization == "TI" else set()
+    )
+    assert [line["failed"] for line in outcome.metrics] == [0, 0]
+    # Something was learned: evolution moved the weights.
+    start = problem.initial_solution(jax.random.key(0))
+    assert shapes(outcome.mean) == shapes(start)
+    metadata = {**METADATA, "config": {"evaluation_environment": "CartPole-v1"}}
+    path = save_synthetic_mdp(tmp_path / "mdp.npz", problem.bandit, outcome.mean, metadata)
+    env, env_params = make(str(path))
+    assert env.config.parameterization == parameterization
+    assert env_params.max_steps_in_episode == 5
+    np.testing.assert_array_equal(flat(env_params.weights), flat(outcome.mean))
+    check_fits(env, problem.env, problem.env_params, "CartPole-v1")
+
+
+def test_a_synthetic_mdp_lasts_as_long_as_the_environment_where_nothing_is_said():
+    problem = BanditDiscovery(replace(CONFIG, parameterization="TI"))
+    assert problem.bandit.config.max_steps == 500
 
 
 # -- where a discovery starts
@@ -193,8 +464,10 @@ def test_a_random_start_is_drawn_from_the_key():
 
 def test_an_expert_start_is_fitted_once_and_from_the_seed_alone(monkeypatch):
     setting = Setting(TINY, PPOHyperparameters(), source="this test")
-    monkeypatch.setattr("scb.discovery.expert_setting", lambda name, steps: setting)
-    warm = WarmStartConfig(num_experts=2, num_states=16, horizon=3, fit_steps=20)
+    monkeypatch.setattr("scb.warm_start.environment_setting", lambda name, algorithm: setting)
+    warm = WarmStartConfig(
+        construction="q", expert="ppo", num_experts=2, num_states=16, horizon=3, fit_steps=20
+    )
     problem = BanditDiscovery(replace(CONFIG, init="expert", warm_start=warm))
     start = problem.initial_solution(jax.random.key(3))
     assert shapes(start) == problem.bandit.weight_shapes()
@@ -202,9 +475,9 @@ def test_an_expert_start_is_fitted_once_and_from_the_seed_alone(monkeypatch):
     assert problem.initial_solution(jax.random.key(4)) is start
     report = problem.warm_start_report
     assert set(report) == {"expert_return", "environment_steps", "reward_r2", "energy_distance"}
-    # Two experts of two batches of 2 x 8 steps, 256 trajectories of 200 steps, and 16 states with 2
-    # actions of 3 steps.
-    assert report["environment_steps"] == 2 * 2 * 16 + 256 * 200 + 16 * 2 * 3
+    # Two experts of two batches of 2 x 8 steps, each judged by 20 episodes of at most 500; 256
+    # trajectories of 200 steps, and 16 states with 2 actions of 3 steps.
+    assert report["environment_steps"] == 2 * (2 * 16 + 20 * 500) + 256 * 200 + 16 * 2 * 3
     assert 8 <= report["expert_return"] <= 500
 
 
@@ -257,9 +530,9 @@ def test_a_bandit_fits_the_environments_of_its_shapes_only():
 
 def test_hyperparameters_are_drawn_from_the_papers_lists_or_fixed():
     sampled, fixed = (
-        BanditDiscovery(replace(CONFIG, sampled_hyperparameters=yes)).training.hyperparameters(
-            jax.random.key(0), 5
-        )
+        BanditDiscovery(replace(CONFIG, sampled_hyperparameters=yes))
+        .trainings["ppo"]
+        .inner.sample(jax.random.key(0), 5)
         for yes in (True, False)
     )
     np.testing.assert_array_equal(fixed.learning_rate, np.full(5, 5e-3, np.float32))
@@ -269,20 +542,28 @@ def test_hyperparameters_are_drawn_from_the_papers_lists_or_fixed():
     )
 
 
+def test_own_lists_take_the_place_of_the_papers():
+    lists = {"ppo": {"learning_rate": (0.25,), "discount": (0.5, 0.75)}}
+    problem = BanditDiscovery(replace(ALL, lists=lists))
+    own = problem.trainings["ppo"].inner.sample(jax.random.key(0), 4)
+    np.testing.assert_array_equal(own.learning_rate, np.full(4, 0.25))
+    assert sorted(own.discount.tolist()) == [0.5, 0.5, 0.75, 0.75]
+    # What the lists leave out keeps its default, and an algorithm that they leave out the paper's.
+    np.testing.assert_array_equal(own.gae_lambda, np.full(4, np.float32(0.95)))
+    paper = inner_loop("dqn", "CartPole-v1", problem.env.action_space(problem.env_params))
+    assert problem.trainings["dqn"].inner.lists == paper.lists
+
+
 def test_the_inner_loop_is_the_papers_where_no_agent_is_given():
-    problem = BanditDiscovery(replace(CONFIG, environment="Pendulum-v1", agent=None))
-    assert problem.agent_config == inner_loop_config("Pendulum-v1")
+    problem = BanditDiscovery(replace(CONFIG, environment="Pendulum-v1", configs={}))
+    space = problem.env.action_space(problem.env_params)
+    training = problem.trainings["ppo"]
+    assert training.inner == inner_loop("ppo", "Pendulum-v1", space)
+    assert training.agent.config == PPOConfig(activation="relu")
     # 10 000 steps each, and 2 episodes of Pendulum's 200.
     assert problem.steps().training == 3 * 10_000
     assert problem.steps().evaluation == 3 * 2 * 200
-    assert 0.01 not in problem.training.lists["learning_rate"]
-
-
-def test_experts_are_trained_as_the_environment_is_but_for_pendulums_discount():
-    assert expert_setting("Pendulum-v1", None).hyperparameters.discount == 0.95
-    assert environment_setting("Pendulum-v1").hyperparameters.discount == 0.995
-    assert expert_setting("CartPole-v1", None) == environment_setting("CartPole-v1")
-    assert expert_setting("CartPole-v1", 3000).config.num_iterations == 3
+    assert 0.01 not in training.inner.lists["learning_rate"]
 
 
 @pytest.mark.parametrize(
@@ -296,6 +577,31 @@ def test_experts_are_trained_as_the_environment_is_but_for_pendulums_discount():
             "unknown environment 'Pendulum-v2': did you mean Pendulum",
         ),
         ({"start": "Synthetic-Pendulum"}, "unknown bandit 'Synthetic-Pendulum'"),
+        ({"mode": "al"}, "unknown mode 'al': did you mean all"),
+        ({"parameterization": "IT"}, "unknown parameterization 'IT': did you mean"),
+        ({"parameterization": "T", "init": "expert"}, "cannot be fitted to an expert: use init ra"),
+        ({"parameterization": "TI", "start": "x"}, "cannot start from a bandit: leave the start"),
+        ({"max_steps": 5}, "max_steps is 5, and parameterization I has episodes of 1 step"),
+        ({"algorithms": ("ppo", "ddpg")}, "ddpg does not fit the environment's discrete actions"),
+        ({"algorithms": ("pop",)}, "unknown algorithm 'pop': did you mean ppo"),
+        (
+            {"init": "expert", "warm_start": WarmStartConfig(expert="td3")},
+            "td3 does not fit the environment's discrete actions",
+        ),
+        (
+            {"lists": {"ppo": {"lr": (0.1,)}}},
+            "unknown hyperparameter 'lr': known are learning_rate",
+        ),
+        ({"lists": {"ppo": {"discount": ()}}}, "the list of values for discount is empty"),
+        ({"lists": {"ppo": {"discount": (True,)}}}, "discount has the value True"),
+        (
+            {"lists": {"sac": {"discount": (0.9,)}}},
+            "there are hyperparameter lists for sac, but the inner loop trains ppo",
+        ),
+        (
+            {"lists": {"ppo": {"discount": (0.9,)}}, "sampled_hyperparameters": False},
+            "fixed hyperparameters are not drawn from lists",
+        ),
     ],
 )
 def test_impossible_discoveries_are_refused(arguments, message):

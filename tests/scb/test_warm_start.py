@@ -4,19 +4,25 @@ import numpy as np
 import pytest
 from gymnax.environments import spaces
 
-from scb.agents.hyperparameters import Setting
-from scb.agents.ppo import PPO, PPOConfig, PPOHyperparameters
+from scb.agents.dqn import DQNConfig
+from scb.agents.ppo import PPOConfig, PPOHyperparameters
+from scb.agents.settings import Setting, environment_setting
+from scb.agents.td3 import TD3Config
+from scb.curriculum import CurriculumConfig
+from scb.environments.registry import make
 from scb.environments.synthetic import BanditConfig, BanditParams, SyntheticBandit, bandit_for
 from scb.errors import UserError
+from scb.experts import Expert, judged, train_expert
 from scb.warm_start import (
-    Expert,
+    EXPERTS,
     ExpertDataset,
     WarmStartConfig,
     energy_distance,
     expert_dataset,
+    expert_setting,
+    find_expert,
     fit_bandit,
     reward_targets,
-    train_expert,
 )
 from tests.scb.probes import Corridor, CorridorParams, context_bandit
 
@@ -105,22 +111,21 @@ def test_the_action_distance_of_continuous_actions_is_euclidean():
 # -----------------------------------------------------------------------------
 
 
-def untrained(env, env_params):
-    """An expert whose mode action is 0 everywhere: all its policy's weights are zero."""
-    agent = PPO(env, TINY)
-    state = agent.init(jax.random.key(0), PPOHyperparameters(), env_params)
-    policy = jax.tree.map(jnp.zeros_like, state.params["policy"])
-    state = state.replace(params={**state.params, "policy": policy})
-    return Expert(agent, state, mean_return=0.0, environment_steps=0)
+def idle(space):
+    """An expert whose action is 0 everywhere."""
+    action = jnp.zeros(space.shape, space.dtype)
+    return Expert(lambda observation: action, mean_return=0.0, environment_steps=0)
 
 
 @pytest.fixture(scope="module")
 def corridor_dataset():
     # Three cells, then the end; action 0 pays 1, 2, 4 and action 1 pays 10, 20, 40.
     params = CorridorParams(rewards=jnp.array([[1.0, 10], [2, 20], [4, 40]]), random_start=1)
-    config = WarmStartConfig(discount=0.5, num_states=64, horizon=10)
-    expert = untrained(Corridor(), params)
-    dataset, steps = expert_dataset(expert, params, jax.random.key(1), config)
+    config = WarmStartConfig(construction="q", discount=0.5, num_states=64, horizon=10)
+    env = Corridor()
+    dataset, steps = expert_dataset(
+        idle(env.action_space(params)), env, params, jax.random.key(1), config
+    )
     return jax.tree.map(np.asarray, dataset), steps, params
 
 
@@ -143,12 +148,30 @@ def test_the_datasets_steps_are_counted(corridor_dataset):
     assert corridor_dataset[1] == 256 * 100 + 64 * 2 * 10
 
 
+def test_the_action_distance_asks_the_expert_only_and_simulates_no_q_values():
+    env, params = Corridor(), CorridorParams(random_start=1)
+    dataset, steps = expert_dataset(
+        idle(env.action_space(params)),
+        env,
+        params,
+        jax.random.key(1),
+        WarmStartConfig(construction="action_distance", num_states=16, horizon=10),
+    )
+    assert steps == 256 * 100
+    np.testing.assert_array_equal(dataset.expert_action, 0)
+    # The expert takes 0 everywhere: of the two actions the first is right, half of all; deviation 1/2.
+    target = reward_targets(dataset, "action_distance", discrete=True)
+    np.testing.assert_allclose(target, np.tile([2.0, 0.0], (16, 1)), rtol=1e-5)
+
+
 def test_the_horizon_cuts_the_return():
     # Two steps: Q(0, .) = 1 + 2/2 = 2 and 10 + 1 = 11; Q(1, .) = 2 + 4/2 = 4 and 22.
     params = CorridorParams(rewards=jnp.array([[1.0, 10], [2, 20], [4, 40]]))
-    config = WarmStartConfig(discount=0.5, num_states=16, horizon=2)
-    expert = untrained(Corridor(), params)
-    dataset, _ = expert_dataset(expert, params, jax.random.key(1), config)
+    config = WarmStartConfig(construction="q", discount=0.5, num_states=16, horizon=2)
+    env = Corridor()
+    dataset, _ = expert_dataset(
+        idle(env.action_space(params)), env, params, jax.random.key(1), config
+    )
     by_hand = np.array([[2.0, 11.0], [4.0, 22.0], [4.0, 40.0]])
     np.testing.assert_allclose(dataset.q, by_hand[np.argmax(dataset.observation, axis=1)])
 
@@ -157,9 +180,9 @@ def test_the_horizon_cuts_the_return():
 def bandit_dataset():
     """Of the context bandit, whose Q is its reward: -|action - context|."""
     bandit = context_bandit()
-    config = WarmStartConfig(num_states=256, num_actions=8, horizon=3)
-    expert = untrained(bandit, bandit.default_params)
-    return expert_dataset(expert, bandit.default_params, jax.random.key(2), config)[0]
+    config = WarmStartConfig(construction="q", num_states=256, num_actions=8, horizon=3)
+    expert = idle(bandit.action_space())
+    return expert_dataset(expert, bandit, bandit.default_params, jax.random.key(2), config)[0]
 
 
 def test_continuous_actions_are_the_experts_and_random_ones_within_the_bounds(bandit_dataset):
@@ -172,6 +195,78 @@ def test_continuous_actions_are_the_experts_and_random_ones_within_the_bounds(ba
     np.testing.assert_allclose(
         bandit_dataset.q, -np.abs(action[..., 0] - bandit_dataset.observation), atol=1e-6
     )
+
+
+# -- stretched states
+# ---------------------------------------------------------------------------------
+
+
+def follow_the_context(observation):
+    """[1] observation -> the context bandit's best action, within its bounds of -1 and 2."""
+    return jnp.clip(observation, -1.0, 2.0)
+
+
+def contexts(min_spread, num_states=256):
+    bandit = context_bandit()
+    config = WarmStartConfig(num_states=num_states, num_actions=4, horizon=1, min_spread=min_spread)
+    expert = judged(follow_the_context, bandit, bandit.default_params, jax.random.key(0))
+    key = jax.random.key(2)
+    return expert_dataset(expert, bandit, bandit.default_params, key, config)[0]
+
+
+@pytest.mark.parametrize("min_spread", [1.0, 3.0])
+def test_an_entry_that_scatters_less_is_stretched_about_its_mean(min_spread):
+    # Contexts are uniform in [0, 1]: their deviation of 0.29 is too small for either.
+    plain, stretched = contexts(0.0), contexts(min_spread)
+    before, after = (np.asarray(x.observation) for x in (plain, stretched))
+    assert after.std() == pytest.approx(min_spread, rel=1e-4)
+    assert after.mean() == pytest.approx(before.mean(), abs=1e-4)
+    # A linear map that keeps the order: the same states, further apart.
+    factor = min_spread / before.std()
+    np.testing.assert_allclose(after, before.mean() + factor * (before - before.mean()), atol=1e-4)
+
+
+def test_an_entry_that_scatters_enough_is_left_as_it_is():
+    plain, stretched = contexts(0.0), contexts(0.1)
+    np.testing.assert_allclose(stretched.observation, plain.observation, atol=1e-6)
+
+
+@pytest.mark.parametrize("min_spread", [0.0, 1.0, 3.0])
+def test_the_label_of_a_state_is_the_experts_action_in_that_very_state(min_spread):
+    dataset = contexts(min_spread)
+    np.testing.assert_array_equal(
+        dataset.expert_action, np.clip(np.asarray(dataset.observation), -1.0, 2.0)
+    )
+    # It is also the first of the tried actions, so it is the one with the highest reward.
+    np.testing.assert_array_equal(dataset.action[:, 0], dataset.expert_action)
+    target = np.asarray(reward_targets(dataset, "action_distance", discrete=False))
+    np.testing.assert_array_equal(target.argmax(axis=1), 0)
+
+
+def test_discrete_labels_follow_the_stretched_state_too():
+    # The expert takes 1 where the cell's first entry exceeds 0.7. One-hot entries of 0 and 1 about a
+    # mean of m, stretched by a factor, go to m - f m and m + f (1 - m): with m near 1/3, a deviation
+    # near 0.47 and f = 2 / 0.47, cells 1 and 2 fall far below 0.7 and cell 0 rises far above.
+    params = CorridorParams(random_start=1)
+    env = Corridor()
+    expert = Expert(lambda observation: jnp.int32(observation[0] > 0.7), 0.0, 0)
+    config = WarmStartConfig(num_states=64, horizon=1, min_spread=2.0)
+    dataset, _ = expert_dataset(expert, env, params, jax.random.key(1), config)
+    np.testing.assert_allclose(dataset.observation.std(axis=0), 2.0, rtol=1e-4)
+    first = np.asarray(dataset.observation[:, 0])
+    assert set(np.unique(first.round(3)).tolist()).isdisjoint({0.0, 1.0})
+    np.testing.assert_array_equal(dataset.expert_action, first > 0.7)
+    np.testing.assert_array_equal(dataset.action, np.tile([0, 1], (64, 1)))
+    assert set(np.asarray(dataset.expert_action).tolist()) == {0, 1}
+
+
+def test_an_entry_that_never_changes_stays_finite():
+    # A corridor of one cell always shows [1].
+    env = Corridor(cells=1)
+    config = WarmStartConfig(num_states=8, horizon=1, min_spread=1.0)
+    expert = idle(env.action_space(env.default_params))
+    dataset, _ = expert_dataset(expert, env, env.default_params, jax.random.key(1), config)
+    np.testing.assert_array_equal(dataset.observation, 1.0)
 
 
 # -- the fit
@@ -246,11 +341,76 @@ def test_the_expert_is_the_best_of_those_that_were_trained():
     setting = Setting(TINY, PPOHyperparameters(), source="this test")
     best = train_expert(env, params, setting, key, 32)
     assert best.mean_return >= 7
-    # 32 agents with one batch of 2 x 8 steps.
-    assert best.environment_steps == 32 * 16
+    # 32 agents with one batch of 2 x 8 steps, each judged by 20 episodes of at most 100.
+    assert best.environment_steps == 32 * (16 + 20 * 100)
     # The agent that is handed out earns what it says.
-    actions = [best.agent.act(best.state, cell, key, params, mode=True) for cell in jnp.eye(10)]
+    actions = [best.policy(cell) for cell in jnp.eye(10)]
     assert sum(map(int, actions)) == best.mean_return
+
+
+@pytest.mark.parametrize(
+    ("name", "algorithm"),
+    [
+        ("Pendulum-v1", "ppo"),
+        ("hopper", "ppo"),
+        ("humanoidstandup", "ppo"),
+        ("CartPole-v1", None),
+        ("MountainCar-v0", None),
+        ("MountainCarContinuous-v0", None),
+        ("reacher", None),
+    ],
+)
+def test_an_expert_is_ppos_where_it_has_a_setting_of_its_own_and_evolutions_elsewhere(
+    name, algorithm
+):
+    setting = expert_setting(name, spaces.Box(-1.0, 1.0, (1,), jnp.float32), WarmStartConfig())
+    assert (setting is None) == (algorithm is None)
+    if setting is not None:
+        assert isinstance(setting.config, PPOConfig)
+
+
+def test_experts_are_trained_as_the_environment_is_but_for_pendulums_discount():
+    def of(name, **arguments):
+        env, env_params = make(name)
+        return expert_setting(name, env.action_space(env_params), WarmStartConfig(**arguments))
+
+    assert of("Pendulum-v1").hyperparameters.discount == 0.95
+    assert environment_setting("Pendulum-v1").hyperparameters.discount == 0.995
+    assert of("Pendulum-v1", expert="sac") == environment_setting("Pendulum-v1", "sac")
+    assert of("CartPole-v1", expert="ppo") == environment_setting("CartPole-v1")
+    assert of("CartPole-v1", expert="ppo", expert_steps=3000).config.num_iterations == 3
+    assert isinstance(of("CartPole-v1", expert="ddqn").config, DQNConfig)
+    assert isinstance(of("Pendulum-v1", expert="ddpg").config, TD3Config)
+    assert of("Pendulum-v1", expert="evolution") is None
+
+
+def test_every_expert_has_an_environment_that_it_fits():
+    for expert in EXPERTS:
+        for name in ("Pendulum-v1", "CartPole-v1"):
+            env, env_params = make(name)
+            space = env.action_space(env_params)
+            config = WarmStartConfig(expert=expert)
+            fits = {"dqn": "CartPole-v1", "ddqn": "CartPole-v1"}
+            fits |= {"ddpg": "Pendulum-v1", "td3": "Pendulum-v1"}
+            if fits.get(expert, name) == name:
+                expert_setting(name, space, config)
+            else:
+                with pytest.raises(UserError, match=f"{expert} does not fit the environment's"):
+                    expert_setting(name, space, config)
+
+
+def test_evolution_gets_the_papers_curriculum_at_its_own_length(monkeypatch):
+    # MountainCar: 1000 steps until generation 200, 200 from generation 800 on, of 1000 generations.
+    # Of 80 that is until generation 16, and a transition of 48.
+    seen = []
+    monkeypatch.setattr("scb.warm_start.evolve_expert", lambda *arguments: seen.append(arguments))
+    for name in ("MountainCar-v0", "CartPole-v1"):
+        env, env_params = make(name)
+        find_expert(name, env, env_params, jax.random.key(0), WarmStartConfig())
+    searches = [arguments[2] for arguments in seen]
+    assert searches[0].curriculum == CurriculumConfig("linear", 1000, 200, begin=16, transition=48)
+    assert searches[1].curriculum is None
+    assert [search.evolution.num_generations for search in searches] == [80, 80]
 
 
 # -- configuration
@@ -266,11 +426,34 @@ def test_the_expert_is_the_best_of_those_that_were_trained():
         ({"num_actions": -2}, "num_actions is -2"),
         ({"horizon": 0}, "horizon is 0"),
         ({"fit_steps": 0}, "fit_steps is 0"),
+        ({"expert_generations": 0}, "expert_generations is 0"),
+        ({"expert": "pop"}, "unknown expert 'pop': did you mean ppo"),
+        ({"min_spread": -1.0}, "min_spread is -1.0: it must be 0 or larger, and finite"),
+        ({"min_spread": float("nan")}, "min_spread is nan: it must be 0 or larger, and finite"),
+        ({"min_spread": float("inf")}, "min_spread is inf: it must be 0 or larger, and finite"),
+        ({"min_spread": 1.0, "construction": "q"}, "which the construction q cannot use"),
+        ({"min_spread": 1.0, "construction": "advantage"}, "construction advantage cannot use"),
     ],
 )
 def test_impossible_configurations_are_refused(arguments, message):
     with pytest.raises(UserError, match=message):
         WarmStartConfig(**arguments)
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments", "message"),
+    [
+        ("Pendulum-v1", {"expert": "dqn"}, "dqn does not fit the environment's continuous actions"),
+        ("CartPole-v1", {"expert": "td3"}, "td3 does not fit the environment's discrete actions"),
+        ("CartPole-v1", {"expert_steps": 9}, "expert_steps is 9, but evolution finds the expert"),
+        ("Pendulum-v1", {"expert_steps": 0}, "total_steps is 0"),
+        ("Pendulum-v1", {"expert": "sac", "expert_steps": 10}, "prefill is 1000"),
+    ],
+)
+def test_an_expert_that_cannot_be_trained_is_refused(name, arguments, message):
+    env, env_params = make(name)
+    with pytest.raises(UserError, match=message):
+        expert_setting(name, env.action_space(env_params), WarmStartConfig(**arguments))
 
 
 def test_an_action_space_of_one_number_has_scalar_shapes():

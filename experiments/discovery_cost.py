@@ -1,0 +1,399 @@
+"""What discovering a bandit costs from a warm start and from random weights, and what it reaches.
+
+    python -m experiments.discovery_cost runs/warm-1 runs/random-1 ...
+
+Reads run folders of `scb discover`, finished or not. How good the search is at a generation is the
+mean return of the agents that judge its distribution's mean; it is drawn against minutes and against
+environment steps, and tabled with what it took to reach the environment's target. Nothing is
+computed anew. `--only-render` makes table and figure from the JSON.
+"""
+
+import argparse
+import json
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from experiments.zoo_table import ENVIRONMENTS, TARGETS, read_report
+from lpo.cli import configure_jax
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+STARTS = ("warm", "random")
+# What makes two searches incomparable where it differs; shown in the JSON, and said on the page.
+SETTINGS = (
+    "population_size",
+    "agents_per_candidate",
+    "evaluation_episodes",
+    "algorithms",
+    "mode",
+    "combine",
+    "strategy",
+    "sigma",
+    "curriculum",
+    "backend",
+)
+
+
+def collect(folders: Sequence[Path]) -> dict[str, Any]:
+    """The report of run folders: every run's costs, points and when it reached the target.
+
+    Returns:
+      {"runs": [...], "left_out": [{"name", "why"}]}. A run's points are [generation, minutes,
+      environment steps, mean return], the costs being those of all generations before, and of the
+      warm start where it is recorded.
+
+    Raises:
+      UserError: a folder is no run, or no run is left.
+    """
+    from scb.errors import UserError
+
+    runs, left_out = [], []
+    for folder in folders:
+        outcome = _run(folder)
+        if isinstance(outcome, str):
+            left_out.append({"name": folder.resolve().name, "why": outcome})
+        else:
+            runs.append(outcome)
+    if not runs:
+        reasons = "; ".join(f"{x['name']}: {x['why']}" for x in left_out)
+        raise UserError(f"no run starts warm or random and was judged once ({reasons}).")
+    runs.sort(key=_place)
+    return {"runs": runs, "left_out": left_out}
+
+
+def _run(folder: Path) -> dict[str, Any] | str:
+    """A run's part of the report, or why it has none."""
+    from scb.discovery import DiscoveryConfig
+    from scb.runs import read_config
+
+    config = read_config(folder)
+    if config.get("from_bandit") or config.get("start"):
+        return "it continues from another bandit"
+    if config.get("parameterization") not in (None, "I"):
+        return "it searches for no bandit but for a synthetic MDP"
+    start = {"expert": "warm", "random": "random"}[config.get("init") or DiscoveryConfig.init]
+    environment = config.get("environment") or DiscoveryConfig.environment
+    rows, seconds = _lines(folder / "metrics.jsonl"), _lines(folder / "timing.jsonl")
+    number = min(len(rows), len(seconds))  # a run that goes on writes one before the other
+    rows = rows[:number]
+    warm = _warm_start(folder, environment)
+    elapsed, minutes = warm["minutes"] or 0.0, []
+    for line in seconds[:number]:
+        minutes.append(elapsed)
+        elapsed += line["seconds"] / 60
+    before = [0] + [row["steps/total"] for row in rows]
+    points, algorithms = [], {}
+    for generation, row in enumerate(rows):
+        if row.get("mean/fitness") is not None:
+            # Judged before the generation's own candidates are.
+            steps = before[generation] + (warm["steps"] or 0)
+            points.append([generation, round(minutes[generation], 3), steps, row["mean/fitness"]])
+            algorithms = _by_algorithm(row, "mean/")
+    if rows and rows[-1].get("final_mean/fitness") is not None:
+        steps = before[-1] + (warm["steps"] or 0)
+        points.append([number, round(elapsed, 3), steps, rows[-1]["final_mean/fitness"]])
+        algorithms = _by_algorithm(rows[-1], "final_mean/")
+    if not points:
+        return "it has not been judged yet"
+    target = TARGETS.get(environment)
+    at_target = next((p for p in points if target is not None and p[3] >= target), None)
+    evolution = config.get("evolution", config)
+    return {
+        "name": folder.resolve().name,
+        "environment": environment,
+        "start": start,
+        "seed": evolution.get("seed") or 0,
+        "settings": {name: config.get(name, evolution.get(name)) for name in SETTINGS},
+        "generations": number,
+        "planned_generations": evolution.get("generations", evolution.get("num_generations")),
+        "minutes": round(elapsed, 3),
+        "steps": {
+            "warm_start": warm["steps"] if start == "warm" else 0,
+            "training": rows[-1]["steps/training"],
+            "evaluation": rows[-1]["steps/evaluation"],
+            "total": rows[-1]["steps/total"] + (warm["steps"] or 0),
+        },
+        "warm_start_minutes": warm["minutes"] if start == "warm" else 0.0,
+        "machine": warm["machine"],
+        "target": target,
+        "reached": None
+        if at_target is None
+        else dict(zip(("generation", "minutes", "steps", "mean"), at_target, strict=True)),
+        "algorithms": algorithms,
+        "points": points,
+    }
+
+
+def _by_algorithm(row: Mapping[str, Any], prefix: str) -> dict[str, float]:
+    start = f"{prefix}fitness/"
+    return {k.removeprefix(start): v for k, v in row.items() if k.startswith(start)}
+
+
+def _warm_start(folder: Path, environment: str) -> dict[str, Any]:
+    """What the warm start took, as the run's bandit says it; None where that is unknown."""
+    path = folder / f"Synthetic-{environment}.json"
+    unknown: dict[str, Any] = {"steps": None, "minutes": None, "machine": None}
+    if not path.is_file():
+        return unknown
+    cost = json.loads(path.read_text()).get("cost", {})
+    warm = cost.get("warm_start") or {}
+    steps, seconds = warm.get("environment_steps"), warm.get("seconds")
+    return {
+        "steps": None if steps is None else int(steps),
+        "minutes": None if seconds is None else seconds / 60,
+        "machine": cost.get("machine"),
+    }
+
+
+def _lines(path: Path) -> list[dict[str, Any]]:
+    """The JSON lines up to the first that is cut, which a run in progress may just be writing."""
+    rows: list[dict[str, Any]] = []
+    for line in path.read_text().splitlines() if path.exists() else []:
+        try:
+            row = json.loads(line)
+        except json.JSONDecodeError:
+            break
+        if row.get("generation") != len(rows):
+            break
+        rows.append(row)
+    return rows
+
+
+def _place(run: Mapping[str, Any]) -> tuple[Any, ...]:
+    name = run["environment"]
+    rank = ENVIRONMENTS.index(name) if name in ENVIRONMENTS else len(ENVIRONMENTS)
+    return (rank, name, STARTS.index(run["start"]), run["seed"], run["name"])
+
+
+def markdown(report: Mapping[str, Any]) -> str:
+    """The page with the table and the figure."""
+    runs = report["runs"]
+    lines = [
+        "# What discovering a bandit costs",
+        "",
+        "`python -m experiments.discovery_cost RUN_FOLDER ...`, on runs of `scb discover`. A *warm* start fits the",
+        "bandit to an expert first, a *random* one begins with random weights, as in the paper.",
+        "",
+        "The return is the mean over the agents that judge the search distribution's mean, every few generations on",
+        "the same seeds; their own steps are not counted. Training steps are steps of the bandit, evaluation steps",
+        "those of the environment (episodes that end early count in full), and a warm start's are those of its expert.",
+        "The total counts all three. *To the target* says when that mean first stood at the target or above. It is",
+        "noisy: what a bandit is worth is measured on other seeds.",
+        "",
+        "| environment | start | seed | generations | warm start | training | evaluation | total steps | minutes "
+        "| target | to the target: generations | minutes | steps | mean return at the end |",
+        "| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |",
+    ]
+    for run in runs:
+        steps, reached, target = run["steps"], run["reached"], run["target"]
+        unfinished = run["planned_generations"] not in (None, run["generations"])
+        generations = f"{run['generations']}" + (
+            f" of {run['planned_generations']}" if unfinished else ""
+        )
+        if target is None:
+            to_target = ["", "", ""]
+        elif reached is None:
+            to_target = ["not reached", "", ""]
+        else:
+            to_target = [
+                str(reached["generation"]),
+                f"{reached['minutes']:.1f}",
+                _count(reached["steps"]),
+            ]
+        cells = [
+            run["environment"],
+            run["start"],
+            str(run["seed"]),
+            generations,
+            "not recorded" if steps["warm_start"] is None else _count(steps["warm_start"]),
+            _count(steps["training"]),
+            _count(steps["evaluation"]),
+            _count(steps["total"]),
+            f"{run['minutes']:.1f}",
+            "" if target is None else _number(target),
+            *to_target,
+            _end(run),
+        ]
+        lines.append(f"| {' | '.join(cells)} |")
+    lines += ["", *_notes(report)]
+    lines += [
+        "![Return of the search distribution's mean against minutes and environment steps](figures/discovery_cost.png)",
+        "",
+        "The points of the curves: [data/discovery_cost.json](data/discovery_cost.json).",
+        "",
+    ]
+    return "\n".join(lines)
+
+
+def _notes(report: Mapping[str, Any]) -> list[str]:
+    """What a reader must know about these runs, each a paragraph."""
+    runs, notes = report["runs"], []
+    if any(run["warm_start_minutes"] is None for run in runs):
+        notes.append(
+            "The minutes leave out the warm start's own where the run does not record them."
+        )
+    if any(run["steps"]["warm_start"] is None for run in runs):
+        notes.append("Where the warm start's steps are not recorded, the total leaves them out.")
+    machines = {json.dumps(run["machine"], sort_keys=True) for run in runs if run["machine"]}
+    if machines:
+        texts = [
+            f"{machine['cores']} cores, {machine['processor']}, accelerator: {machine['accelerator']}"
+            for machine in map(json.loads, sorted(machines))
+        ]
+        notes.append(f"Minutes are wall-clock on: {'; '.join(texts)}.")
+    for environment in dict.fromkeys(run["environment"] for run in runs):
+        settings = [run["settings"] for run in runs if run["environment"] == environment]
+        for name in SETTINGS:
+            values = [x.get(name) for x in settings]
+            values = list(dict.fromkeys("the default" if x is None else str(x) for x in values))
+            if len(values) > 1:
+                notes.append(
+                    f"The runs of {environment} differ in {name.replace('_', ' ')}: {', '.join(values)}."
+                )
+    if report["left_out"]:
+        left_out = "; ".join(f"{left['name']}, since {left['why']}" for left in report["left_out"])
+        notes.append(f"Left out: {left_out}.")
+    return [line for note in notes for line in (note, "")]
+
+
+def _end(run: Mapping[str, Any]) -> str:
+    end = _number(run["points"][-1][3])
+    if len(run["algorithms"]) < 2:
+        return end
+    each = ", ".join(f"{name.upper()} {_number(x)}" for name, x in run["algorithms"].items())
+    return f"{end} ({each})"
+
+
+def _number(x: float | None) -> str:
+    return "none" if x is None else f"{x:.1f}".removesuffix(".0").replace("-", "−")
+
+
+def _count(steps: float) -> str:
+    """A number of steps as a table shows it: 12.5 million, 40 960."""
+    if steps >= 1e6:
+        return f"{steps / 1e6:.1f}".removesuffix(".0") + " million"
+    return f"{steps:,.0f}".replace(",", "\N{NARROW NO-BREAK SPACE}")
+
+
+def figure(report: Mapping[str, Any]) -> "Figure":
+    """A row an environment: the mean's return against minutes (left) and environment steps (right)."""
+    from matplotlib.figure import Figure
+    from matplotlib.lines import Line2D
+    from matplotlib.ticker import EngFormatter, MaxNLocator
+
+    from lpo import figures
+
+    runs = report["runs"]
+    environments = list(dict.fromkeys(run["environment"] for run in runs))
+    looks = {
+        "warm": figures.Look(figures.VERMILLION, "-", "o"),
+        "random": figures.Look(figures.BLUE, "--", "s"),
+    }
+    with figures._style():
+        drawn = Figure(figsize=(figures.WIDTH, 2.4 * len(environments) + 1.2))
+        grid = drawn.subplots(len(environments), 2, sharey="row", squeeze=False)
+        for row, environment in zip(grid, environments, strict=True):
+            of_it = [run for run in runs if run["environment"] == environment]
+            for axes, column in zip(row, (1, 2), strict=True):
+                for run in of_it:
+                    look = looks[run["start"]]
+                    axes.plot(
+                        [point[column] for point in run["points"]],
+                        [point[3] for point in run["points"]],
+                        color=look.color,
+                        linestyle=look.linestyle,
+                        marker=look.marker,
+                        linewidth=1.1,
+                        markersize=3.5,
+                    )
+                if of_it[0]["target"] is not None:
+                    axes.axhline(
+                        of_it[0]["target"], color=figures.BLACK, linewidth=1.4, linestyle=":"
+                    )
+                axes.margins(x=0.03, y=0.08)
+                axes.xaxis.set_major_locator(MaxNLocator(6))
+            row[1].xaxis.set_major_formatter(EngFormatter(sep=""))
+            row[0].set_ylabel("mean return")
+            row[0].set_title(environment)
+        grid[-1][0].set_xlabel("minutes")
+        grid[-1][1].set_xlabel("environment steps (training + evaluation)")
+        handles, names = [], []
+        for start in STARTS:
+            number = sum(run["start"] == start for run in runs)
+            if number:
+                look = looks[start]
+                handles.append(
+                    Line2D(
+                        [],
+                        [],
+                        color=look.color,
+                        linestyle=look.linestyle,
+                        marker=look.marker,
+                        markersize=3.5,
+                    )
+                )
+                names.append(f"{start} start ({number} run{'s' if number > 1 else ''})")
+        if any(run["target"] is not None for run in runs):
+            handles.append(Line2D([], [], color=figures.BLACK, linewidth=1.4, linestyle=":"))
+            names.append("target")
+        figures._title(
+            drawn, "Discovery of a bandit: return of agents trained in the search's mean"
+        )
+        figures._legend_below(drawn, (handles, names), columns=3)
+    return drawn
+
+
+def render(report: Mapping[str, Any], docs: Path) -> None:
+    """Writes docs/discovery_cost.md and docs/figures/discovery_cost.png."""
+    from lpo import figures
+
+    docs.mkdir(parents=True, exist_ok=True)
+    (docs / "discovery_cost.md").write_text(markdown(report))
+    figures.save(figure(report), docs / "figures" / "discovery_cost.png")
+
+
+def write_report(path: Path, report: Mapping[str, Any]) -> None:
+    """Writes the JSON with every point on a line of its own."""
+    points = {f"@{i}@": run["points"] for i, run in enumerate(report["runs"])}
+    runs = [{**run, "points": f"@{i}@"} for i, run in enumerate(report["runs"])]
+    text = json.dumps({**report, "runs": runs}, indent=2)
+    for name, rows in points.items():
+        body = ",\n        ".join(json.dumps(row) for row in rows)
+        text = text.replace(f'"{name}"', f"[\n        {body}\n      ]")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text + "\n")
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("folders", type=Path, nargs="*", help="run folders of scb discover")
+    parser.add_argument("--out", type=Path, default=Path("docs/data/discovery_cost.json"))
+    parser.add_argument(
+        "--docs", type=Path, default=Path("docs"), help="for the table and the figure"
+    )
+    parser.add_argument("--only-render", action="store_true", help="read the JSON, not the runs")
+    arguments = parser.parse_args(argv)
+    configure_jax()
+
+    from scb.errors import UserError
+
+    try:
+        if not arguments.only_render:
+            report = collect(arguments.folders)
+            write_report(arguments.out, report)
+            for left in report["left_out"]:
+                print(f"left out: {left['name']}, since {left['why']}")
+        render(read_report(arguments.out), arguments.docs)
+    except UserError as error:
+        print(f"discovery_cost: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,153 @@
+"""What all agents share: the contract, training in segments, acting, evaluation.
+
+An agent is static configuration; its hyperparameters are traced numbers. `init`, `train`, `act` and
+`evaluate` are pure, to be jitted once and vmapped over keys, hyperparameters and environments by
+the caller.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from gymnax.environments import environment, spaces
+from jax.typing import ArrayLike
+
+from scb.errors import UserError
+from scb.evaluation import Episodes, evaluate
+
+
+@dataclass(frozen=True, eq=False)
+class Agent(ABC):
+    """An algorithm in one environment.
+
+    Args:
+      env: a gymnax 1.x environment.
+      config: static configuration.
+    """
+
+    env: environment.Environment[Any, Any]
+    config: Any
+
+    @property
+    def one_step(self) -> bool:
+        """Whether every episode is a single step, so that there is never anything to bootstrap."""
+        return bool(getattr(self.env, "one_step", False))
+
+    @abstractmethod
+    def init(self, key: jax.Array, hyperparameters: Any, env_params: Any) -> Any:
+        """A fresh agent, its environments at their first observation."""
+
+    @abstractmethod
+    def iterate(self, state: Any, hyperparameters: Any, env_params: Any) -> Any:
+        """Collects a batch of experience and learns from it, once."""
+
+    @abstractmethod
+    def choose(
+        self, state: Any, observation: jax.Array, key: jax.Array, env_params: Any, mode: bool
+    ) -> jax.Array:
+        """[O] observation -> action, not yet clipped to the action space."""
+
+    def train(self, key: jax.Array, hyperparameters: Any, env_params: Any) -> Any:
+        """Initialises and trains for `config.num_iterations`."""
+        state = self.init(key, hyperparameters, env_params)
+        return self.train_iterations(state, hyperparameters, env_params, self.config.num_iterations)
+
+    def train_iterations(
+        self, state: Any, hyperparameters: Any, env_params: Any, num_iterations: int
+    ) -> Any:
+        """`num_iterations` times: collect, then learn. A segment of a longer training."""
+
+        def iteration(state: Any, _: None) -> tuple[Any, None]:
+            return self.iterate(state, hyperparameters, env_params), None
+
+        state, _ = jax.lax.scan(iteration, state, None, num_iterations)
+        return state
+
+    def train_with_evaluations(
+        self,
+        key: jax.Array,
+        hyperparameters: Any,
+        env_params: Any,
+        evaluation: Callable[[Any, jax.Array], Any],
+        every: int,
+    ) -> tuple[Any, Any]:
+        """Trains, and evaluates before the first and after every `every`-th iteration.
+
+        Args:
+          evaluation: (state, key) -> pytree of what is wanted of the agent at that point.
+          every: iterations between evaluations; must divide `config.num_iterations`.
+
+        Returns:
+          The trained agent, and the evaluations stacked along a new first axis of num_iterations /
+          every + 1 entries.
+        """
+        if every < 1 or self.config.num_iterations % every:
+            raise UserError(
+                f"evaluation every {every} iterations does not divide {self.config.num_iterations} iterations: "
+                "choose a divisor."
+            )
+        key_train, key_evaluate = jax.random.split(key)
+        state = self.init(key_train, hyperparameters, env_params)
+
+        def segment(state: Any, key: jax.Array) -> tuple[Any, Any]:
+            outcome = evaluation(state, key)
+            return self.train_iterations(state, hyperparameters, env_params, every), outcome
+
+        keys = jax.random.split(key_evaluate, self.config.num_iterations // every + 1)
+        state, outcomes = jax.lax.scan(segment, state, keys[:-1])
+        last = evaluation(state, keys[-1])
+        return state, jax.tree.map(lambda a, b: jnp.concatenate([a, b[None]]), outcomes, last)
+
+    def act(
+        self,
+        state: Any,
+        observation: jax.Array,
+        key: jax.Array,
+        env_params: Any = None,
+        mode: bool = False,
+    ) -> jax.Array:
+        """The agent's action for one observation, within the action space's bounds.
+
+        Args:
+          mode: the most likely action instead of a sampled one.
+        """
+        env_params = self.env.default_params if env_params is None else env_params
+        action = self.choose(state, jnp.ravel(observation), key, env_params, mode)
+        return clip_to_space(action, self.env.action_space(env_params))
+
+    def evaluate(
+        self,
+        state: Any,
+        key: jax.Array,
+        num_episodes: int,
+        env: environment.Environment[Any, Any] | None = None,
+        env_params: Any = None,
+        mode: bool = False,
+        horizon: ArrayLike | None = None,
+    ) -> Episodes:
+        """Episodes of the frozen agent, in its own environment or in another of the same shapes."""
+        env = self.env if env is None else env
+        env_params = env.default_params if env_params is None else env_params
+
+        def policy(observation: jax.Array, key: jax.Array) -> jax.Array:
+            action = self.choose(state, jnp.ravel(observation), key, env_params, mode)
+            return clip_to_space(action, env.action_space(env_params))
+
+        return evaluate(env, env_params, policy, key, num_episodes, horizon)
+
+    def observation_size(self, env_params: Any) -> int:
+        """Of the flattened observation."""
+        size = 1
+        for dimension in self.env.observation_space(env_params).shape:
+            size *= dimension
+        return size
+
+
+def clip_to_space(action: jax.Array, space: spaces.Box | spaces.Discrete) -> jax.Array:
+    """A continuous action within the space's bounds and of its shape; a discrete one as it is."""
+    if isinstance(space, spaces.Discrete):
+        return action
+    return jnp.clip(jnp.reshape(action, space.shape), space.low, space.high)

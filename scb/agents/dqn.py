@@ -1,0 +1,162 @@
+"""Deep Q-learning (Mnih et al., 2015) and double Q-learning (van Hasselt et al., 2015), one traced flag apart."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import optax
+from flax import struct
+from jax.typing import ArrayLike
+
+from scb.agents import networks
+from scb.agents.off_policy import (
+    OffPolicyAgent,
+    OffPolicyConfig,
+    Transition,
+    gradient_update,
+    require_discrete,
+    target_values,
+)
+from scb.errors import UserError
+
+
+@dataclass(frozen=True)
+class DQNConfig(OffPolicyConfig):
+    """Defaults are the paper's inner loop.
+
+    Attributes:
+      target_update_every: environment steps between copies of the network into its target.
+    """
+
+    num_envs: int = 10
+    target_update_every: int = 50
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.target_update_every < 1:
+            raise UserError(
+                f"target_update_every is {self.target_update_every}: it must be at least 1."
+            )
+
+
+@struct.dataclass
+class DQNHyperparameters:
+    """Traced numbers; defaults are the paper's underlined values.
+
+    Attributes:
+      double: 1.0 to pick the next action by the network and judge it by the target (double
+        Q-learning), 0.0 to do both by the target.
+      epsilon_start, epsilon_end, epsilon_decay: probability of a random action, falling linearly
+        over that fraction of the training.
+    """
+
+    learning_rate: ArrayLike = 5e-3
+    discount: ArrayLike = 0.99
+    double: ArrayLike = 1.0
+    epsilon_start: ArrayLike = 1.0
+    epsilon_end: ArrayLike = 0.05
+    epsilon_decay: ArrayLike = 0.5
+    max_grad_norm: ArrayLike = 10.0
+
+
+@struct.dataclass
+class DQNLearner:
+    params: Any
+    target: Any  # None in one-step environments
+    optimizer: optax.OptState
+
+
+@dataclass(frozen=True, eq=False)
+class DQN(OffPolicyAgent):
+    """Deep Q-learning with epsilon-greedy exploration; evaluated greedily."""
+
+    config: DQNConfig
+
+    def _network(self, env_params: Any) -> Any:
+        space = self.env.action_space(env_params)
+        require_discrete("dqn", space, True)
+        return networks.QNetwork(space.n, self.config.hidden_sizes, self.config.activation)
+
+    def init_learner(
+        self, key: jax.Array, hyperparameters: DQNHyperparameters, env_params: Any
+    ) -> DQNLearner:
+        observation = jnp.zeros(self.observation_size(env_params))
+        params = self._network(env_params).init(key, observation)
+        optimizer = _optimizer(hyperparameters).init(params)
+        return DQNLearner(params, None if self.one_step else params, optimizer)
+
+    def explore(
+        self,
+        learner: DQNLearner,
+        hyperparameters: DQNHyperparameters,
+        observation: jax.Array,
+        key: jax.Array,
+        progress: jax.Array,
+        env_params: Any,
+    ) -> jax.Array:
+        key_coin, key_random = jax.random.split(key)
+        number = observation.shape[0]
+        done = jnp.clip(progress / hyperparameters.epsilon_decay, 0.0, 1.0)
+        start = jnp.asarray(hyperparameters.epsilon_start)
+        end = jnp.asarray(hyperparameters.epsilon_end)
+        q = self._network(env_params).apply(learner.params, observation)
+        random = jax.random.randint(key_random, (number,), 0, q.shape[-1])
+        explores = jax.random.uniform(key_coin, (number,)) < start + (end - start) * done
+        return jnp.where(explores, random, jnp.argmax(q, axis=-1))
+
+    def greedy(
+        self,
+        learner: DQNLearner,
+        observation: jax.Array,
+        key: jax.Array,
+        env_params: Any,
+        mode: bool,
+    ) -> jax.Array:
+        return jnp.argmax(self._network(env_params).apply(learner.params, observation), axis=-1)
+
+    def learn(
+        self,
+        learner: DQNLearner,
+        hyperparameters: DQNHyperparameters,
+        batch: Transition,
+        key: jax.Array,
+        step: jax.Array,
+        env_params: Any,
+    ) -> DQNLearner:
+        network = self._network(env_params)
+        if self.one_step:
+            target = batch.reward
+        else:
+            judged = network.apply(learner.target, batch.next_observation)
+            own = network.apply(learner.params, batch.next_observation)
+            pick = jnp.where(jnp.asarray(hyperparameters.double) > 0.5, own, judged)
+            best = jax.nn.one_hot(jnp.argmax(pick, axis=-1), pick.shape[-1])
+            next_value = jnp.sum(judged * best, axis=-1)
+            target = target_values(batch, next_value, hyperparameters.discount)
+
+        def loss(params: Any) -> jax.Array:
+            q = network.apply(params, batch.observation)
+            taken = jnp.sum(q * jax.nn.one_hot(batch.action, q.shape[-1]), axis=-1)
+            return 0.5 * jnp.mean((taken - target) ** 2)
+
+        gradient = jax.grad(loss)(learner.params)
+        params, optimizer = gradient_update(
+            _optimizer(hyperparameters), gradient, learner.optimizer, learner.params
+        )
+        return DQNLearner(params, learner.target, optimizer)
+
+    def update_targets(
+        self, learner: DQNLearner, hyperparameters: DQNHyperparameters, iteration: jax.Array
+    ) -> DQNLearner:
+        every = max(1, self.config.target_update_every // self.config.num_envs)
+        copy = (iteration + 1) % every == 0
+        target = jax.tree.map(lambda t, p: jnp.where(copy, p, t), learner.target, learner.params)
+        return DQNLearner(learner.params, target, learner.optimizer)
+
+
+def _optimizer(hyperparameters: DQNHyperparameters) -> optax.GradientTransformation:
+    return optax.chain(
+        optax.clip_by_global_norm(hyperparameters.max_grad_norm),
+        optax.adam(hyperparameters.learning_rate),
+    )

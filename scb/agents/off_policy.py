@@ -1,0 +1,320 @@
+"""What SAC, DQN, DDPG and TD3 share: act, store, draw from the buffer, learn.
+
+In an environment whose episodes are one step long nothing is ever bootstrapped: the target of every
+Q-value is the reward. Such environments are known by their `one_step`, and what only serves
+bootstrapping (target networks, the next state's action) is left out of their program.
+"""
+
+from abc import abstractmethod
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+from flax import struct
+from gymnax.environments import spaces
+
+from scb.agents import networks, replay
+from scb.agents.agent import Agent, clip_to_space
+from scb.agents.normalization import RunningStatistics, normalize, update_statistics
+from scb.errors import UserError, unknown_name
+
+
+@dataclass(frozen=True)
+class OffPolicyConfig:
+    """What decides shapes and program: a change recompiles.
+
+    Attributes:
+      num_envs: environments that step side by side between gradient steps.
+      buffer_size, prefill: transitions that the replay buffer holds, and random ones that it starts
+        with.
+      batch_size, gradient_steps: transitions of a gradient step, and gradient steps after each step
+        of the environments.
+      total_steps: environment steps of the whole training, the prefill included, rounded up.
+      hidden_sizes, activation: of all networks.
+      normalize_observations: by running mean and variance, frozen with the agent for evaluation.
+    """
+
+    num_envs: int = 1
+    buffer_size: int = 2000
+    prefill: int = 1000
+    batch_size: int = 100
+    gradient_steps: int = 1
+    total_steps: int = 10_000
+    hidden_sizes: tuple[int, ...] = (64, 64)
+    activation: str = "tanh"
+    normalize_observations: bool = False
+
+    def __post_init__(self) -> None:
+        for field in (
+            "num_envs",
+            "buffer_size",
+            "prefill",
+            "batch_size",
+            "gradient_steps",
+            "total_steps",
+        ):
+            value = getattr(self, field)
+            if value < 1:
+                raise UserError(f"{field} is {value}: it must be at least 1.")
+        if self.prefill % self.num_envs:
+            raise UserError(
+                f"prefill is {self.prefill}, which {self.num_envs} environments side by side cannot "
+                f"collect in whole steps: choose a multiple of {self.num_envs}."
+            )
+        if self.prefill > self.buffer_size:
+            raise UserError(
+                f"prefill is {self.prefill}, more than the replay buffer's {self.buffer_size}."
+            )
+        if self.prefill >= self.total_steps:
+            raise UserError(
+                f"prefill is {self.prefill}, which leaves nothing of {self.total_steps} steps to learn in."
+            )
+        if self.activation not in networks.ACTIVATIONS:
+            raise unknown_name("activation", self.activation, networks.ACTIVATIONS)
+
+    @property
+    def num_iterations(self) -> int:
+        return -(-(self.total_steps - self.prefill) // self.num_envs)
+
+    @property
+    def num_environment_steps(self) -> int:
+        """Steps that a training takes: `total_steps` rounded up."""
+        return self.prefill + self.num_iterations * self.num_envs
+
+
+class Transition(NamedTuple):
+    """Of one step, or of [B] steps. `next_observation` is taken before any automatic reset."""
+
+    observation: jax.Array  # [O]
+    action: jax.Array  # [] integer, or [A] within the action space's bounds
+    reward: jax.Array  # []
+    terminated: jax.Array  # [] 1.0 where nothing follows
+    next_observation: jax.Array  # [O]
+
+
+@struct.dataclass
+class OffPolicyState:
+    """An agent: what it learned (networks, targets, optimisers), its buffer, where its environments stand."""
+
+    learner: Any
+    buffer: replay.ReplayBuffer
+    statistics: RunningStatistics
+    environment: Any  # [N] states and [N, O] observations; None in one-step environments
+    iteration: jax.Array
+    key: jax.Array
+
+
+@dataclass(frozen=True, eq=False)
+class OffPolicyAgent(Agent):
+    """The loop; a subclass says how to act and how to learn."""
+
+    config: OffPolicyConfig
+
+    @abstractmethod
+    def init_learner(self, key: jax.Array, hyperparameters: Any, env_params: Any) -> Any:
+        """Networks, target networks and optimisers."""
+
+    @abstractmethod
+    def explore(
+        self,
+        learner: Any,
+        hyperparameters: Any,
+        observation: jax.Array,
+        key: jax.Array,
+        progress: jax.Array,
+        env_params: Any,
+    ) -> jax.Array:
+        """[N, O] normalised observations -> [N, ...] actions to gather experience with."""
+
+    @abstractmethod
+    def learn(
+        self,
+        learner: Any,
+        hyperparameters: Any,
+        batch: Transition,
+        key: jax.Array,
+        step: jax.Array,
+        env_params: Any,
+    ) -> Any:
+        """One gradient step on [B] transitions with normalised observations; `step` counts them."""
+
+    @abstractmethod
+    def update_targets(self, learner: Any, hyperparameters: Any, iteration: jax.Array) -> Any:
+        """Moves the target networks, once an iteration; not called in one-step environments."""
+
+    @abstractmethod
+    def greedy(
+        self, learner: Any, observation: jax.Array, key: jax.Array, env_params: Any, mode: bool
+    ) -> jax.Array:
+        """[O] normalised observation -> the trained agent's action."""
+
+    def init(self, key: jax.Array, hyperparameters: Any, env_params: Any) -> OffPolicyState:
+        """A fresh agent with its buffer prefilled by uniformly random actions."""
+        key_learner, key_reset, key_prefill, key_train = jax.random.split(key, 4)
+        config, space = self.config, self.env.action_space(env_params)
+        size = self.observation_size(env_params)
+        standing = None
+        if not self.one_step:
+            standing = self._reset(key_reset, config.num_envs, env_params)
+        action = jax.eval_shape(space.sample, key)
+        observation, number = jnp.zeros(size), jnp.zeros(())
+        example = Transition(observation, action, number, number, observation)
+        state = OffPolicyState(
+            learner=self.init_learner(key_learner, hyperparameters, env_params),
+            buffer=replay.empty_buffer(example, config.buffer_size),
+            statistics=RunningStatistics.start(size),
+            environment=standing,
+            iteration=jnp.int32(0),
+            key=key_train,
+        )
+
+        def random_actions(observation: jax.Array, key: jax.Array) -> jax.Array:
+            return jax.vmap(space.sample)(jax.random.split(key, observation.shape[0]))
+
+        if self.one_step:
+            # Contexts are independent: all of them at once.
+            _, transitions = self._step(
+                None, config.prefill, random_actions, key_prefill, env_params
+            )
+        else:
+
+            def step(standing: Any, key: jax.Array) -> tuple[Any, Transition]:
+                return self._step(standing, config.num_envs, random_actions, key, env_params)
+
+            keys = jax.random.split(key_prefill, config.prefill // config.num_envs)
+            standing, transitions = jax.lax.scan(step, standing, keys)
+            transitions = jax.tree.map(
+                lambda x: jnp.reshape(x, (config.prefill, *x.shape[2:])), transitions
+            )
+        return self._remember(replace(state, environment=standing), transitions)
+
+    def iterate(
+        self, state: OffPolicyState, hyperparameters: Any, env_params: Any
+    ) -> OffPolicyState:
+        config = self.config
+        key, key_step, *keys_learn = jax.random.split(state.key, 2 + config.gradient_steps)
+        progress = (config.prefill + state.iteration * config.num_envs) / config.total_steps
+
+        def explore(observation: jax.Array, key: jax.Array) -> jax.Array:
+            observation = self._inputs(state, observation)
+            return self.explore(
+                state.learner, hyperparameters, observation, key, progress, env_params
+            )
+
+        standing, transitions = self._step(
+            state.environment, config.num_envs, explore, key_step, env_params
+        )
+        state = self._remember(replace(state, key=key, environment=standing), transitions)
+
+        def gradient_step(learner: Any, inputs: tuple[jax.Array, jax.Array]) -> tuple[Any, None]:
+            key, number = inputs
+            key_sample, key_learn = jax.random.split(key)
+            batch = replay.sample(state.buffer, key_sample, config.batch_size)
+            batch = batch._replace(
+                observation=self._inputs(state, batch.observation),
+                next_observation=self._inputs(state, batch.next_observation),
+            )
+            step = state.iteration * config.gradient_steps + number
+            return self.learn(learner, hyperparameters, batch, key_learn, step, env_params), None
+
+        learner, _ = jax.lax.scan(
+            gradient_step,
+            state.learner,
+            (jnp.stack(keys_learn), jnp.arange(config.gradient_steps)),
+            unroll=config.gradient_steps <= 4,
+        )
+        if not self.one_step:
+            learner = self.update_targets(learner, hyperparameters, state.iteration)
+        return replace(state, learner=learner, iteration=state.iteration + 1)
+
+    def choose(
+        self,
+        state: OffPolicyState,
+        observation: jax.Array,
+        key: jax.Array,
+        env_params: Any,
+        mode: bool,
+    ) -> jax.Array:
+        return self.greedy(state.learner, self._inputs(state, observation), key, env_params, mode)
+
+    def _reset(self, key: jax.Array, number: int, env_params: Any) -> tuple[Any, jax.Array]:
+        reset = self.env.reset_env if self.one_step else self.env.reset
+        observation, env_state = jax.vmap(reset, in_axes=(0, None))(
+            jax.random.split(key, number), env_params
+        )
+        return env_state, _flatten(observation)
+
+    def _step(
+        self, standing: Any, number: int, policy: Any, key: jax.Array, env_params: Any
+    ) -> tuple[Any, Transition]:
+        """One step of `number` environments; one-step environments start afresh."""
+        key_reset, key_act, key_step = jax.random.split(key, 3)
+        space = self.env.action_space(env_params)
+        env_state, observation = (
+            self._reset(key_reset, number, env_params) if self.one_step else standing
+        )
+        action = jax.vmap(lambda a: clip_to_space(a, space))(policy(observation, key_act))
+        keys = jax.random.split(key_step, number)
+        if self.one_step:
+            _, _, reward, terminated, _ = jax.vmap(self.env.step_env, in_axes=(0, 0, 0, None))(
+                keys, env_state, action, env_params
+            )
+            standing, following = None, observation
+        else:
+            next_observation, env_state, reward, terminated, _, info = jax.vmap(
+                self.env.step, in_axes=(0, 0, 0, None)
+            )(keys, env_state, action, env_params)
+            standing = (env_state, _flatten(next_observation))
+            following = _flatten(info["final_observation"])
+        reward = jnp.reshape(reward, (number,)).astype(jnp.float32)
+        terminated = jnp.reshape(terminated, (number,)).astype(jnp.float32)
+        return standing, Transition(observation, action, reward, terminated, following)
+
+    def _remember(self, state: OffPolicyState, transitions: Transition) -> OffPolicyState:
+        if self.config.normalize_observations:
+            statistics = update_statistics(state.statistics, transitions.observation)
+            state = replace(state, statistics=statistics)
+        # Prefill and buffer are multiples of what a step adds (or the ring is scattered into).
+        return replace(state, buffer=replay.add(state.buffer, transitions, aligned=True))
+
+    def _inputs(self, state: OffPolicyState, observation: jax.Array) -> jax.Array:
+        if self.config.normalize_observations:
+            return normalize(state.statistics, observation)
+        return observation
+
+
+def _flatten(observation: jax.Array) -> jax.Array:
+    """[N, ...] -> [N, O] floats: some grid worlds observe integers."""
+    return jnp.reshape(observation, (observation.shape[0], -1)).astype(jnp.float32)
+
+
+def target_values(
+    batch: Transition, next_value: jax.Array, discount: jax.typing.ArrayLike
+) -> jax.Array:
+    """[B] r + discount * V(s'), without V where the episode terminated (a truncation is no termination)."""
+    return batch.reward + discount * (1.0 - batch.terminated) * next_value
+
+
+def polyak_average(target: Any, online: Any, polyak: jax.typing.ArrayLike) -> Any:
+    """Polyak * target + (1 - polyak) * online: the paper's convention, in which 0.99 moves slowly."""
+    return jax.tree.map(lambda t, o: polyak * t + (1.0 - polyak) * o, target, online)
+
+
+def gradient_update(
+    optimizer: optax.GradientTransformation, gradient: Any, optimizer_state: Any, params: Any
+) -> tuple[Any, Any]:
+    """(new params, new optimiser state)."""
+    updates, optimizer_state = optimizer.update(gradient, optimizer_state, params)
+    return optax.apply_updates(params, updates), optimizer_state
+
+
+def require_discrete(algorithm: str, space: spaces.Box | spaces.Discrete, discrete: bool) -> None:
+    """Raises a UserError where an algorithm doesn't fit an action space."""
+    if isinstance(space, spaces.Discrete) != discrete:
+        has, needs = ("continuous", "discrete") if discrete else ("discrete", "continuous")
+        instead = "sac, ppo, td3 or ddpg" if discrete else "sac, ppo, dqn or ddqn"
+        raise UserError(
+            f"{algorithm} needs {needs} actions, and this environment has {has} ones: use {instead}."
+        )

@@ -1,0 +1,211 @@
+"""Twin delayed DDPG (Fujimoto et al., 2018); DDPG (Lillicrap et al., 2015) is its case of one critic and no delay."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from flax import linen as nn
+from flax import struct
+from jax.typing import ArrayLike
+
+from scb.agents import networks
+from scb.agents.off_policy import (
+    OffPolicyAgent,
+    OffPolicyConfig,
+    Transition,
+    gradient_update,
+    polyak_average,
+    require_discrete,
+    target_values,
+)
+from scb.agents.sac import action_bounds
+from scb.errors import UserError
+
+
+@dataclass(frozen=True)
+class TD3Config(OffPolicyConfig):
+    """Defaults are the paper's inner loop.
+
+    Attributes:
+      num_critics: 2, of which the smaller value counts; DDPG has 1.
+      policy_delay: critic updates for each of the policy; DDPG has 1.
+    """
+
+    num_critics: int = 2
+    policy_delay: int = 2
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for field in ("num_critics", "policy_delay"):
+            if getattr(self, field) < 1:
+                raise UserError(f"{field} is {getattr(self, field)}: it must be at least 1.")
+
+
+def ddpg_config(**fields: Any) -> TD3Config:
+    """DDPG as a configuration of TD3; its target noise is the hyperparameter 0."""
+    return TD3Config(num_critics=1, policy_delay=1, **fields)
+
+
+@struct.dataclass
+class TD3Hyperparameters:
+    """Traced numbers; defaults are the paper's underlined values.
+
+    Attributes:
+      polyak: share of the target networks that an update keeps.
+      exploration_noise: standard deviation of the noise on actions that gather experience, in units
+        of half the action space's width.
+      target_noise, target_noise_clip: of the noise on the next action in the target, likewise.
+    """
+
+    learning_rate: ArrayLike = 5e-3
+    discount: ArrayLike = 0.99
+    polyak: ArrayLike = 0.95
+    exploration_noise: ArrayLike = 0.2
+    target_noise: ArrayLike = 0.2
+    target_noise_clip: ArrayLike = 0.5
+    max_grad_norm: ArrayLike = 10.0
+
+
+@struct.dataclass
+class TD3Learner:
+    params: dict[str, Any]  # {"policy", "critics" (stacked)}
+    targets: dict[str, Any] | None  # the same; None in one-step environments
+    optimizer: dict[str, optax.OptState]
+
+
+@dataclass(frozen=True, eq=False)
+class TD3(OffPolicyAgent):
+    """Deterministic policy gradients with clipped double Q-learning, target smoothing and delayed updates."""
+
+    config: TD3Config
+
+    def _networks(self, env_params: Any) -> tuple[Any, Any]:
+        space = self.env.action_space(env_params)
+        require_discrete("ddpg" if self.config.num_critics == 1 else "td3", space, False)
+        shape = (self.config.hidden_sizes, self.config.activation)
+        # The policy follows the first critic; the second only ever lowers a bootstrapped target,
+        # and without bootstrapping it has no effect on anything.
+        number = 1 if self.one_step else self.config.num_critics
+        critics = nn.vmap(
+            networks.Critic,
+            variable_axes={"params": 0},
+            split_rngs={"params": True},
+            in_axes=None,
+            axis_size=number,
+        )(*shape)
+        return networks.DeterministicPolicy(int(np.prod(space.shape)), *shape), critics
+
+    def init_learner(
+        self, key: jax.Array, hyperparameters: TD3Hyperparameters, env_params: Any
+    ) -> TD3Learner:
+        policy, critics = self._networks(env_params)
+        key_policy, key_critics = jax.random.split(key)
+        observation = jnp.zeros(self.observation_size(env_params))
+        params = {
+            "policy": policy.init(key_policy, observation),
+            "critics": critics.init(key_critics, observation, jnp.zeros(policy.action_size)),
+        }
+        optimizer = _optimizer(hyperparameters)
+        return TD3Learner(
+            params=params,
+            targets=None if self.one_step else params,
+            optimizer={name: optimizer.init(p) for name, p in params.items()},
+        )
+
+    def _scale(self, squashed: jax.Array, env_params: Any) -> jax.Array:
+        low, high = action_bounds(self.env.action_space(env_params))
+        return low + (squashed + 1.0) * 0.5 * (high - low)
+
+    def explore(
+        self,
+        learner: TD3Learner,
+        hyperparameters: TD3Hyperparameters,
+        observation: jax.Array,
+        key: jax.Array,
+        progress: jax.Array,
+        env_params: Any,
+    ) -> jax.Array:
+        policy, _ = self._networks(env_params)
+        squashed = policy.apply(learner.params["policy"], observation)
+        noise = hyperparameters.exploration_noise * jax.random.normal(key, squashed.shape)
+        return self._scale(jnp.clip(squashed + noise, -1.0, 1.0), env_params)
+
+    def greedy(
+        self,
+        learner: TD3Learner,
+        observation: jax.Array,
+        key: jax.Array,
+        env_params: Any,
+        mode: bool,
+    ) -> jax.Array:
+        policy, _ = self._networks(env_params)
+        return self._scale(policy.apply(learner.params["policy"], observation), env_params)
+
+    def learn(
+        self,
+        learner: TD3Learner,
+        hyperparameters: TD3Hyperparameters,
+        batch: Transition,
+        key: jax.Array,
+        step: jax.Array,
+        env_params: Any,
+    ) -> TD3Learner:
+        policy, critics = self._networks(env_params)
+        params, optimizer_state = dict(learner.params), dict(learner.optimizer)
+        optimizer = _optimizer(hyperparameters)
+        action = jnp.reshape(batch.action, (-1, policy.action_size))
+        if self.one_step:
+            target = batch.reward
+        else:
+            assert learner.targets is not None
+            squashed = policy.apply(learner.targets["policy"], batch.next_observation)
+            limit = jnp.asarray(hyperparameters.target_noise_clip)
+            noise = hyperparameters.target_noise * jax.random.normal(key, squashed.shape)
+            squashed = jnp.clip(squashed + jnp.clip(noise, -limit, limit), -1.0, 1.0)
+            next_action = self._scale(squashed, env_params)
+            next_q = critics.apply(learner.targets["critics"], batch.next_observation, next_action)
+            target = target_values(batch, next_q.min(axis=0), hyperparameters.discount)
+
+        def critic_loss(critic_params: Any) -> jax.Array:
+            q = critics.apply(critic_params, batch.observation, action)
+            return 0.5 * jnp.sum(jnp.mean((q - target) ** 2, axis=-1))
+
+        gradient = jax.grad(critic_loss)(params["critics"])
+        params["critics"], optimizer_state["critics"] = gradient_update(
+            optimizer, gradient, optimizer_state["critics"], params["critics"]
+        )
+
+        def policy_loss(policy_params: Any) -> jax.Array:
+            chosen = self._scale(policy.apply(policy_params, batch.observation), env_params)
+            return -jnp.mean(critics.apply(params["critics"], batch.observation, chosen)[0])
+
+        def update_policy(carry: tuple[Any, Any]) -> tuple[Any, Any]:
+            policy_params, state = carry
+            gradient = jax.grad(policy_loss)(policy_params)
+            return gradient_update(optimizer, gradient, state, policy_params)
+
+        carry = (params["policy"], optimizer_state["policy"])
+        if self.config.policy_delay == 1:
+            carry = update_policy(carry)
+        else:
+            # `step` is no member of a vmapped population: this stays a branch, and skips the work.
+            due = step % self.config.policy_delay == self.config.policy_delay - 1
+            carry = jax.lax.cond(due, update_policy, lambda carry: carry, carry)
+        params["policy"], optimizer_state["policy"] = carry
+        return TD3Learner(params, learner.targets, optimizer_state)
+
+    def update_targets(
+        self, learner: TD3Learner, hyperparameters: TD3Hyperparameters, iteration: jax.Array
+    ) -> TD3Learner:
+        targets = polyak_average(learner.targets, learner.params, hyperparameters.polyak)
+        return TD3Learner(learner.params, targets, learner.optimizer)
+
+
+def _optimizer(hyperparameters: TD3Hyperparameters) -> optax.GradientTransformation:
+    return optax.chain(
+        optax.clip_by_global_norm(hyperparameters.max_grad_norm),
+        optax.adam(hyperparameters.learning_rate),
+    )

@@ -1,0 +1,302 @@
+"""Fully synthetic MDPs: environments of many steps whose weights are evolved.
+
+The parameterisations of Liesen et al. (2024), appendix "Ablations of the Meta-Evolution Algorithm":
+
+  T   learned transition, reward and termination; episodes start where the evaluation environment's
+      do. What Ferreira et al. (2022), "Learning Synthetic Environments and Reward Networks", learn.
+  TI  and a learned initial-state distribution.
+  I   that distribution and the reward alone, one step long: the bandit of `synthetic.py`.
+
+The state is the observation, a learned function of its predecessor. Repeated over long episodes it
+may grow beyond any number: NaN and infinities are passed on as they are, and evolution ranks such a
+candidate last.
+"""
+
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any, cast
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from gymnax.environments import environment, spaces
+from jax.typing import ArrayLike
+
+from scb.environments.synthetic import (
+    LATENTS,
+    BanditConfig,
+    SyntheticBandit,
+    TwoLayers,
+    Weights,
+    bandit_for,
+    encode_action,
+    encoded_size,
+    flat_size,
+    shapes_of,
+)
+from scb.errors import UserError, unknown_name
+
+MDP_PARAMETERIZATIONS = ("T", "TI")
+PARAMETERIZATIONS = (*MDP_PARAMETERIZATIONS, "I")
+
+
+@struct.dataclass
+class MDPState(environment.EnvState):
+    observation: jax.Array  # [O]
+    terminated: jax.Array  # [] whether the step that led here ended the episode by itself
+
+
+@struct.dataclass
+class MDPParams(environment.EnvParams):
+    """What a step may read: all traced, so weights and episode lengths vmap.
+
+    Attributes:
+      weights: {"reward": {...}, "transition": {...}, "termination": {...}}, two Dense layers each,
+        and "initial_state" where that is learned.
+      max_steps_in_episode: at least 1. Without effect where `MDPConfig.max_steps` is 1.
+    """
+
+    weights: Weights = struct.field(default_factory=dict)
+    max_steps_in_episode: ArrayLike = 1
+
+
+@dataclass(frozen=True)
+class MDPConfig(BanditConfig):
+    """What decides an MDP's shapes and program; layers and latents are a bandit's.
+
+    Attributes:
+      parameterization: "T" or "TI". A "T" has no latent.
+      max_steps: maximum episode length, the default of `MDPParams.max_steps_in_episode`. At 1 it is
+        also a promise, on which agents skip all that only longer episodes need.
+    """
+
+    parameterization: str = field(default="TI", kw_only=True)
+    max_steps: int = field(kw_only=True)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.parameterization not in MDP_PARAMETERIZATIONS:
+            raise unknown_name(
+                "parameterization of a synthetic MDP", self.parameterization, MDP_PARAMETERIZATIONS
+            )
+        if self.max_steps < 1:
+            raise UserError(f"max_steps is {self.max_steps}: it must be at least 1.")
+
+
+class SyntheticMDP(environment.Environment[MDPState, MDPParams]):
+    """An MDP with learned dynamics, as a gymnax 1.x environment.
+
+    With [s, a] the observation and the action, joined: s' = transition([s, a]), r = reward([s, a]),
+    and the step terminates where termination([s, a]) > 0, a logit against one half; all of it
+    deterministic. An episode ends there, or at `max_steps_in_episode`: that is a truncation, to be
+    bootstrapped, unless the step also terminates. Only where the maximum is 1 reaching it is a
+    termination, and the step ends where it began: such a "TI" is the bandit of the same weights.
+
+    Args:
+      observation_size: O, the flattened observation size of the evaluation environment.
+      action_space: the evaluation environment's. Actions enter the networks as in a bandit.
+      config: parameterisation, maximum episode length, layer size, activation, latent distribution.
+      weights: what `default_params` holds; None for an MDP that is only ever given explicit
+        `params`.
+      name: as it is to be shown.
+      env, env_params: the evaluation environment, in whose start states a "T" starts; None for a
+        "TI", which has its own. It starts where the environment's automatic reset does: for Brax, in
+        a pool of states (see `BraxEnvironment`).
+
+    Raises:
+      UserError: a "T" without an evaluation environment, a "TI" with one, or an environment with
+        observations of another size.
+    """
+
+    def __init__(
+        self,
+        observation_size: int,
+        action_space: spaces.Box | spaces.Discrete,
+        config: MDPConfig,
+        weights: Weights | None = None,
+        name: str = "SyntheticMDP",
+        env: environment.Environment[Any, Any] | None = None,
+        env_params: Any = None,
+    ) -> None:
+        self.config = config
+        self.observation_size = observation_size
+        self._action_space = action_space
+        self._name = name
+        self.discrete = isinstance(action_space, spaces.Discrete)
+        self._action_size = encoded_size(action_space)
+        self.latent_size = config.latent_size or observation_size
+        self.env = env
+        self.env_params = (
+            env.default_params if env is not None and env_params is None else env_params
+        )
+        self._check_start()
+        network = partial(TwoLayers, hidden_size=config.hidden_size, activation=config.activation)
+        self._initial_state = network(output_size=observation_size)
+        self._reward = network(output_size=1)
+        self._transition = network(output_size=observation_size)
+        self._termination = network(output_size=1)
+        self._weights = weights
+
+    def _check_start(self) -> None:
+        if (self.env is None) == (self.config.parameterization == "T"):
+            raise UserError(
+                f"{self.name!r} is a synthetic MDP of parameterization {self.config.parameterization} "
+                f"{'without' if self.env is None else 'with'} an evaluation environment: give one to "
+                "T, which starts in its start states, and none to TI."
+            )
+        if self.env is not None:
+            size = flat_size(self.env.observation_space(self.env_params).shape)
+            if size != self.observation_size:
+                raise UserError(
+                    f"{self.name!r} has observations of {self.observation_size} entries and "
+                    f"{self.env.name} has {size}: give the evaluation environment it was made for."
+                )
+
+    @property
+    def name(self) -> str:
+        return self._name
+
+    @property
+    def num_actions(self) -> int:
+        return self._action_size
+
+    @property
+    def one_step(self) -> bool:
+        """Whether every episode is a single step, whatever the params; a maximum of 1 in params alone is no promise."""
+        return self.config.max_steps == 1
+
+    @property
+    def default_params(self) -> MDPParams:
+        if self._weights is None:
+            raise UserError(
+                f"synthetic MDP {self.name!r} has no weights of its own: pass "
+                f"params=MDPParams(weights=..., max_steps_in_episode={self.config.max_steps})."
+            )
+        return self.params(self._weights)
+
+    def params(self, weights: Weights) -> MDPParams:
+        """These weights with the configured maximum episode length."""
+        return MDPParams(weights=weights, max_steps_in_episode=self.config.max_steps)
+
+    def init_weights(self, key: jax.Array) -> Weights:
+        """Random weights (Flax's default initialisation), the start of the paper's evolution."""
+        key_state, key_reward, key_transition, key_termination = jax.random.split(key, 4)
+        inputs = jnp.zeros(self.observation_size + self._action_size)
+        weights = {
+            "reward": self._reward.init(key_reward, inputs)["params"],
+            "transition": self._transition.init(key_transition, inputs)["params"],
+            "termination": self._termination.init(key_termination, inputs)["params"],
+        }
+        if self.config.parameterization == "TI":
+            latent = jnp.zeros(self.latent_size)
+            weights["initial_state"] = self._initial_state.init(key_state, latent)["params"]
+        return weights
+
+    def weight_shapes(self) -> dict[str, tuple[int, ...]]:
+        """{"reward/Dense_0/kernel": (O + A, hidden), ...}: what an artefact of this MDP must hold."""
+        return shapes_of(self.init_weights)
+
+    def mean_reward(
+        self, observation: jax.Array, action: ArrayLike, params: MDPParams
+    ) -> jax.Array:
+        """[O] observation, action -> [] reward; only in one-step episodes also the Q-function."""
+        inputs = self._inputs(observation, action)
+        reward = self._reward.apply({"params": params.weights["reward"]}, inputs)
+        return cast(jax.Array, reward)[0]
+
+    def transition(self, observation: jax.Array, action: ArrayLike, params: MDPParams) -> jax.Array:
+        """[O] observation, action -> [O] next observation, not bounded in any way."""
+        inputs = self._inputs(observation, action)
+        after = self._transition.apply({"params": params.weights["transition"]}, inputs)
+        return cast(jax.Array, after)
+
+    def termination_logit(
+        self, observation: jax.Array, action: ArrayLike, params: MDPParams
+    ) -> jax.Array:
+        """[O] observation, action -> [] logit; the step terminates where it is positive, and not where it is NaN."""
+        inputs = self._inputs(observation, action)
+        logit = self._termination.apply({"params": params.weights["termination"]}, inputs)
+        return cast(jax.Array, logit)[0]
+
+    def reset_env(self, key: jax.Array, params: MDPParams) -> tuple[jax.Array, MDPState]:
+        if self.env is None:
+            latent = LATENTS[self.config.latent](key, self.latent_size)
+            weights = {"params": params.weights["initial_state"]}
+            observation = cast(jax.Array, self._initial_state.apply(weights, latent))
+        else:
+            start, _ = self.env.reset_env(key, self.env_params)
+            observation = jnp.ravel(start).astype(jnp.float32)
+        state = MDPState(time=jnp.int32(0), observation=observation, terminated=jnp.bool_(False))
+        return observation, state
+
+    def step_env(
+        self, key: jax.Array, state: MDPState, action: ArrayLike, params: MDPParams
+    ) -> tuple[jax.Array, MDPState, jax.Array, jax.Array, dict[str, Any]]:
+        single = self._limit(params) <= 1
+        after = self.transition(state.observation, action, params)
+        # As in the bandit; and an overflow that no agent is to see cannot reach it this way either.
+        after = jnp.where(single, state.observation, after)
+        terminated = single | (self.termination_logit(state.observation, action, params) > 0.0)
+        reward = self.mean_reward(state.observation, action, params)
+        state = MDPState(time=state.time + 1, observation=after, terminated=terminated)
+        return after, state, reward, terminated, {"discount": self.discount(state, params)}
+
+    def _limit(self, params: MDPParams) -> jax.Array:
+        # Written out where it is promised: the compiler then drops the networks that don't matter.
+        return jnp.asarray(1 if self.one_step else params.max_steps_in_episode)
+
+    def is_terminated(self, state: MDPState, params: MDPParams) -> jax.Array:
+        return state.terminated
+
+    def is_truncated(self, state: MDPState, params: MDPParams) -> jax.Array:
+        """Whether the maximum length alone ended the episode."""
+        return (state.time >= self._limit(params)) & ~state.terminated
+
+    def action_space(self, params: MDPParams | None = None) -> spaces.Box | spaces.Discrete:
+        return self._action_space
+
+    def observation_space(self, params: MDPParams | None = None) -> spaces.Box:
+        return spaces.Box(-jnp.inf, jnp.inf, (self.observation_size,), jnp.float32)
+
+    def _inputs(self, observation: jax.Array, action: ArrayLike) -> jax.Array:
+        return jnp.concatenate([observation, encode_action(action, self._action_space)])
+
+
+def synthetic_for(
+    env: environment.Environment[Any, Any],
+    env_params: Any,
+    parameterization: str,
+    config: BanditConfig,
+    name: str,
+    max_steps: int | None = None,
+) -> SyntheticBandit | SyntheticMDP:
+    """An untrained synthetic environment with the (flattened) shapes of an evaluation environment.
+
+    Args:
+      env, env_params: the evaluation environment.
+      parameterization: "T", "TI" or "I", as in the paper; "I" is the bandit.
+      config: layers and latents; of an `MDPConfig`, nothing else is read.
+      name: of what is returned.
+      max_steps: maximum episode length; None: the evaluation environment's own, and 1 for "I".
+
+    Raises:
+      UserError: an unknown parameterisation, or a maximum length that is not possible with it.
+    """
+    if parameterization not in PARAMETERIZATIONS:
+        raise unknown_name("parameterization", parameterization, PARAMETERIZATIONS)
+    layers = (config.hidden_size, config.activation, config.latent, config.latent_size)
+    if parameterization == "I":
+        if max_steps not in (None, 1):
+            raise UserError(
+                f"max_steps is {max_steps}, and parameterization I has episodes of 1 step: leave it out, "
+                "or choose TI."
+            )
+        return bandit_for(env, env_params, BanditConfig(*layers), name)
+    if max_steps is None:
+        max_steps = int(env_params.max_steps_in_episode)
+    mdp_config = MDPConfig(*layers, parameterization=parameterization, max_steps=max_steps)
+    observation_size = flat_size(env.observation_space(env_params).shape)
+    start = {"env": env, "env_params": env_params} if parameterization == "T" else {}
+    return SyntheticMDP(
+        observation_size, env.action_space(env_params), mdp_config, name=name, **start
+    )

@@ -1,0 +1,219 @@
+"""Experts: good policies of an environment, to fit a bandit to.
+
+An expert is anything that acts. Two ways to get one are here: training agents of any algorithm on
+the environment and keeping the best, and evolving a small policy network on its return. The second
+needs no reward along the way: with episodes that are longer at first it finds the goal of
+MountainCar, where policy gradients see nothing to follow.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import linen as nn
+from gymnax.environments import environment, spaces
+
+from scb.agents import networks
+from scb.agents.agent import clip_to_space
+from scb.agents.normalization import RunningStatistics, normalize, update_statistics
+from scb.agents.sac import action_bounds
+from scb.agents.settings import Setting
+from scb.curriculum import CurriculumConfig, horizon, with_limit
+from scb.evaluation import evaluate
+from scb.evolution import EnvironmentSteps, EvolutionConfig, evolve
+
+EPISODES = 20  # by which an expert is judged
+
+
+class Expert(NamedTuple):
+    """A policy, what it earns, and what it cost.
+
+    Attributes:
+      policy: [O] flattened observation -> action within the bounds; traceable.
+      mean_return: over 20 episodes in the environment.
+      environment_steps: taken to find it, evaluation included; an upper bound where episodes end
+        early.
+    """
+
+    policy: Callable[[jax.Array], jax.Array]
+    mean_return: float
+    environment_steps: int
+
+
+def judged(
+    policy: Callable[[jax.Array], jax.Array],
+    env: environment.Environment[Any, Any],
+    env_params: Any,
+    key: jax.Array,
+    environment_steps: int = 0,
+) -> Expert:
+    """An expert from any policy of flattened observations, its return measured."""
+    episodes = jax.jit(
+        lambda key: (
+            evaluate(env, env_params, lambda obs, _: policy(jnp.ravel(obs)), key, EPISODES).returns
+        )
+    )(key)
+    steps = environment_steps + EPISODES * int(env_params.max_steps_in_episode)
+    return Expert(policy, float(np.mean(episodes)), steps)
+
+
+def train_expert(
+    env: environment.Environment[Any, Any],
+    env_params: Any,
+    setting: Setting,
+    key: jax.Array,
+    num_experts: int,
+) -> Expert:
+    """The best of `num_experts` agents trained on the environment itself, by 20 episodes of mode actions."""
+    agent = setting.agent(env)
+
+    @jax.jit
+    def train(key: jax.Array) -> tuple[Any, jax.Array]:
+        key_train, key_evaluate = jax.random.split(key)
+        state = agent.train(key_train, setting.hyperparameters, env_params)
+        episodes = agent.evaluate(state, key_evaluate, EPISODES, env_params=env_params, mode=True)
+        return state, episodes.returns.mean()
+
+    states, returns = jax.vmap(train)(jax.random.split(key, num_experts))
+    best = int(jnp.argmax(returns))
+    state = jax.tree.map(lambda x: x[best], states)
+
+    def policy(observation: jax.Array) -> jax.Array:
+        return agent.act(state, observation, key, env_params, mode=True)
+
+    steps = setting.num_environment_steps * num_experts
+    evaluation = num_experts * EPISODES * int(env_params.max_steps_in_episode)
+    return Expert(policy, float(returns[best]), steps + evaluation)
+
+
+@dataclass(frozen=True)
+class PolicySearchConfig:
+    """How a policy network is evolved on an environment's return.
+
+    Attributes:
+      hidden_size: of its one tanh layer; observations are normalised by what random actions see.
+      episodes: of each candidate, the same for all of a generation.
+      curriculum: of the episodes' length; None for the environment's own.
+      evolution: the outer loop's.
+    """
+
+    hidden_size: int = 16
+    episodes: int = 8
+    curriculum: CurriculumConfig | None = None
+    evolution: EvolutionConfig = field(
+        default_factory=lambda: EvolutionConfig(
+            population_size=64,
+            num_generations=80,
+            sigma=0.5,
+            mean_evaluations=2,
+            evaluate_mean_every=1000,
+        )
+    )
+
+
+class _PolicySearch:
+    """The evolution problem: a candidate is a policy network's weights."""
+
+    def __init__(
+        self, env: environment.Environment[Any, Any], env_params: Any, config: PolicySearchConfig
+    ) -> None:
+        self.env, self.env_params, self.config = env, env_params, config
+        curriculum = config.curriculum
+        self.horizon = None if curriculum is None else horizon(curriculum)
+        self.longest = int(
+            env_params.max_steps_in_episode if curriculum is None else curriculum.longest
+        )
+        self.space = env.action_space(env_params)
+        size = (config.hidden_size,)
+        self.network: nn.Module = (
+            networks.QNetwork(self.space.n, size, "tanh")
+            if isinstance(self.space, spaces.Discrete)
+            else networks.DeterministicPolicy(int(np.prod(self.space.shape)), size, "tanh")
+        )
+        self.statistics = _random_statistics(env, env_params)
+
+    def policy(self, weights: Any) -> Callable[[jax.Array], jax.Array]:
+        def act(observation: jax.Array) -> jax.Array:
+            outputs: Any = self.network.apply(weights, normalize(self.statistics, observation))
+            if isinstance(self.space, spaces.Discrete):
+                return jnp.argmax(outputs, axis=-1)
+            low, high = action_bounds(self.space)
+            return clip_to_space(low + (outputs + 1.0) * 0.5 * (high - low), self.space)
+
+        return act
+
+    def initial_solution(self, key: jax.Array) -> Any:
+        size = int(np.prod(self.env.observation_space(self.env_params).shape))
+        return self.network.init(key, jnp.zeros(size))
+
+    def _returns(self, weights: Any, key: jax.Array, limit: Any) -> jax.Array:
+        policy = self.policy(weights)
+        return evaluate(
+            self.env,
+            with_limit(self.env_params, self.longest),
+            lambda observation, _: policy(jnp.ravel(observation)),
+            key,
+            self.config.episodes,
+            limit,
+        ).returns
+
+    def evaluate(self, candidate: Any, key: jax.Array, generation: jax.Array) -> dict[str, Any]:
+        limit = None if self.horizon is None else self.horizon(generation)
+        return {"fitness": self._returns(candidate, key, limit).mean()}
+
+    def evaluate_mean(self, candidate: Any, key: jax.Array) -> dict[str, Any]:
+        limit = self.env_params.max_steps_in_episode
+        return {"fitness": self._returns(candidate, key, limit).mean()}
+
+    def steps(self) -> EnvironmentSteps:
+        return EnvironmentSteps(training=0, evaluation=self.config.episodes * self.longest)
+
+
+def evolve_expert(
+    env: environment.Environment[Any, Any],
+    env_params: Any,
+    config: PolicySearchConfig,
+    key: jax.Array,
+) -> Expert:
+    """The mean of an evolution over policy networks.
+
+    Args:
+      key: decides everything; `config.evolution.seed` is not used.
+    """
+    key_seed, key_judge = jax.random.split(key)
+    seed = int(jax.random.randint(key_seed, (), 0, 2**31 - 1))
+    evolution = replace(config.evolution, seed=seed)
+    problem = _PolicySearch(env, env_params, config)
+    outcome = evolve(problem, evolution, quiet=True)
+    steps = problem.steps().total * evolution.population_size * evolution.num_generations
+    return judged(problem.policy(outcome.mean), env, env_params, key_judge, steps)
+
+
+def _random_statistics(
+    env: environment.Environment[Any, Any], env_params: Any, num_envs: int = 64
+) -> RunningStatistics:
+    """Moments of the observations of random actions, each held for 20 steps so that they lead somewhere."""
+    space = env.action_space(env_params)
+
+    def step(carry: Any, inputs: tuple[jax.Array, jax.Array]) -> Any:
+        env_state, action = carry
+        time, key = inputs
+        key_action, key_step = jax.random.split(key)
+        action = jnp.where(time % 20 == 0, space.sample(key_action), action)
+        observation, env_state, *_ = env.step(key_step, env_state, action, env_params)
+        return (env_state, action), jnp.ravel(observation)
+
+    def roll(key: jax.Array) -> jax.Array:
+        key_reset, key_action, key_steps = jax.random.split(key, 3)
+        _, env_state = env.reset(key_reset, env_params)
+        number = min(200, int(env_params.max_steps_in_episode))
+        inputs = (jnp.arange(number), jax.random.split(key_steps, number))
+        return jax.lax.scan(step, (env_state, space.sample(key_action)), inputs)[1]
+
+    with jax.ensure_compile_time_eval():
+        visited = jax.jit(jax.vmap(roll))(jax.random.split(jax.random.key(0), num_envs))
+        visited = jnp.reshape(visited, (-1, visited.shape[-1]))
+        return update_statistics(RunningStatistics.start(visited.shape[-1]), visited)

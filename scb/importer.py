@@ -1,0 +1,200 @@
+"""The bandits that the paper's authors published, put into this project's format.
+
+Liesen et al. (2024) released theirs as synthetic-gymnax (Apache-2.0). This reads their arrays, one
+.npz file for each evaluation environment; the release's own checkpoints are pickles, which run code
+when they are opened, and are never read here.
+"""
+
+import hashlib
+from pathlib import Path
+from typing import Any, cast
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from scb.artefacts import read_arrays, unflatten
+from scb.environments.registry import make
+from scb.environments.synthetic import BanditConfig, SyntheticBandit, Weights, bandit_for
+from scb.environments.zoo import PREFIX, save_bandit
+from scb.errors import UserError, unknown_name
+
+# The release's name of a bandit -> its evaluation environment.
+PUBLISHED_BANDITS = {
+    "acrobot": "Acrobot-v1",
+    "cartpole": "CartPole-v1",
+    "mountaincar": "MountainCar-v0",
+    "continuous_mountaincar": "MountainCarContinuous-v0",
+    "pendulum": "Pendulum-v1",
+    "hopper": "hopper",
+    "walker2d": "walker2d",
+    "halfcheetah": "halfcheetah",
+    "swimmer": "swimmer",
+    "humanoidstandup": "humanoidstandup",
+}
+ORIGIN = "published by Liesen et al. (2024), released as synthetic-gymnax, Apache-2.0"
+
+# The paper's table says tanh; the released code's default is ReLU, and these weights go with it.
+_CONFIG = BanditConfig(hidden_size=32, activation="relu", latent="normal")
+_PICKLE_SUFFIXES = (".pkl", ".pickle", ".p", ".ckpt")
+# How a pickle of protocol 2 or later starts.
+_PICKLE_START = b"\x80"
+
+
+def published_bandit(path: str | Path, environment: str | None = None) -> SyntheticBandit:
+    """One published bandit from its arrays.
+
+    Args:
+      path: an .npz file with `initial_state/Dense_0/kernel` and the seven other arrays of two
+        networks with 32 hidden units.
+      environment: its evaluation environment; None takes it from the file's name ("pendulum.npz"
+        is Pendulum-v1's).
+
+    Returns:
+      The bandit, under the name "Synthetic-<environment>".
+
+    Raises:
+      UserError: the file is missing, a pickle, damaged, of an unknown name, or holds other arrays.
+    """
+    path = Path(path)
+    _check_is_npz(path)
+    home = _environment_of(path) if environment is None else environment
+    env, env_params = make(home)
+    bandit = bandit_for(env, env_params, _CONFIG, f"{PREFIX}{home}")
+    arrays = _arrays(path)
+    _check_arrays(path, arrays, bandit, home)
+    # Checked above to be exactly what `Weights` is.
+    tree = cast(Weights, unflatten(path, arrays))
+    weights = jax.tree.map(lambda array: jnp.asarray(array, jnp.float32), tree)
+    return SyntheticBandit(
+        bandit.observation_size, bandit.action_space(), _CONFIG, weights, bandit.name
+    )
+
+
+def import_published(source: str | Path, out: str | Path) -> list[Path]:
+    """Writes published bandits as `out/Synthetic-<environment>.npz`, each with its .json.
+
+    All are read and checked before the first is written.
+
+    Args:
+      source: a folder with .npz files, or one such file.
+      out: where to write; made if it is missing.
+
+    Returns:
+      The written .npz files, in the order of the sources' names.
+
+    Raises:
+      UserError: see `published_bandit`; or the folder is missing or holds no .npz.
+    """
+    bandits = [(path, published_bandit(path)) for path in _sources(Path(source))]
+    return [
+        save_bandit(
+            Path(out) / f"{bandit.name}.npz",
+            bandit,
+            bandit.default_params.weights,
+            _metadata(path, bandit),
+        )
+        for path, bandit in bandits
+    ]
+
+
+def import_published_command(directory: Path, out: Path = Path("runs/published")) -> None:
+    """Import the bandits that the paper's authors published, so that every command takes them by file.
+
+    Args:
+      directory: folder with their arrays, such as pendulum.npz, or one such file.
+      out: folder for the bandits, such as Synthetic-Pendulum-v1.npz.
+    """
+    for path in import_published(directory, out):
+        print(f"bandit: {path}")
+
+
+def _sources(source: Path) -> list[Path]:
+    if not source.is_dir():
+        _check_is_npz(source)
+        return [source]
+    paths = sorted(path for path in source.iterdir() if path.suffix == ".npz")
+    if not paths:
+        pickles = any(path.suffix in _PICKLE_SUFFIXES for path in source.iterdir())
+        raise UserError(
+            f"{source} holds no .npz file"
+            + (", only pickles, which run code when they are opened" if pickles else "")
+            + ": give the folder with the published bandits' arrays, such as pendulum.npz."
+        )
+    return paths
+
+
+def _check_is_npz(path: Path) -> None:
+    if path.suffix in _PICKLE_SUFFIXES:
+        raise _pickle(path)
+    if path.is_dir():
+        raise UserError(f"{path} is a folder: give one bandit's .npz file here.")
+    if not path.is_file():
+        raise UserError(
+            f"{path} does not exist: give the published bandits' folder, or one of its .npz files."
+        )
+    if path.suffix != ".npz":
+        raise UserError(f"{path} is no .npz file: give the bandit's arrays, such as pendulum.npz.")
+
+
+def _environment_of(path: Path) -> str:
+    if path.stem not in PUBLISHED_BANDITS:
+        raise unknown_name("published bandit", path.stem, PUBLISHED_BANDITS)
+    return PUBLISHED_BANDITS[path.stem]
+
+
+def _arrays(path: Path) -> dict[str, np.ndarray]:
+    try:
+        return read_arrays(path)
+    except UserError as error:
+        # NumPy refuses a member with objects by naming that option. Only the wording depends on it:
+        # whatever is wrong, nothing is unpickled.
+        with path.open("rb") as file:
+            starts_as_pickle = file.read(1) == _PICKLE_START
+        if starts_as_pickle or "allow_pickle" in str(error.__cause__):
+            raise _pickle(path) from error
+        raise
+
+
+def _pickle(path: Path) -> UserError:
+    return UserError(
+        f"{path} holds pickled objects, which run code when they are opened: only plain arrays in "
+        "an .npz file are read, so convert it where you trust it."
+    )
+
+
+def _check_arrays(
+    path: Path, arrays: dict[str, np.ndarray], bandit: SyntheticBandit, environment: str
+) -> None:
+    shapes = bandit.weight_shapes()
+    for kind, names in (
+        ("lacks", [name for name in shapes if name not in arrays]),
+        ("has an unknown", [name for name in arrays if name not in shapes]),
+    ):
+        if names:
+            raise UserError(
+                f"{path} {kind} array {names[0]!r}: a published bandit holds exactly "
+                f"{', '.join(shapes)}, so fetch or convert it again."
+            )
+    for name, expected in shapes.items():
+        if arrays[name].shape != expected:
+            raise UserError(
+                f"array {name!r} of {path} has shape {arrays[name].shape} where a bandit of "
+                f"{environment}, with {bandit.observation_size} observations and "
+                f"{bandit.num_actions} actions, has {expected}: give the file of this environment."
+            )
+
+
+def _metadata(path: Path, bandit: SyntheticBandit) -> dict[str, Any]:
+    return {
+        "config": {"evaluation_environment": bandit.name.removeprefix(PREFIX)},
+        # The release says none of these.
+        "seeds": {},
+        "results": {},
+        "cost": {},
+        "command": ORIGIN,
+        "source": {
+            "file": path.name,
+            "sha256": hashlib.sha256(path.read_bytes()).hexdigest(),
+        },
+    }

@@ -1,0 +1,180 @@
+"""What the page on costs says must be what the run folders hold."""
+
+import json
+
+import pytest
+
+from experiments import discovery_cost
+from scb.errors import UserError
+
+# Seconds and returns by generation: judged before the generations 0 and 2, and after 3.
+SECONDS = [60.0, 30.0, 30.0, 120.0]
+JUDGED = {0: -400.0, 2: -165.0}
+FINAL = -150.0
+
+
+def run_folder(
+    folder, init=None, environment="Pendulum-v1", judged=None, final=FINAL, rows=4, **config
+):
+    """A run folder of 100 training and 10 evaluation steps a generation."""
+    folder.mkdir()
+    settings = {"command": "discover", "environment": environment, "seed": 3, "init": init}
+    settings |= {"generations": 4, "population_size": 32, "from_bandit": None, **config}
+    (folder / "config.json").write_text(json.dumps(settings))
+    lines = []
+    for generation in range(rows):
+        done = generation + 1
+        row = {"generation": generation, "fitness/mean": -9.0}
+        row |= {"steps/training": 100 * done, "steps/evaluation": 10 * done}
+        row["steps/total"] = 110 * done
+        value = (JUDGED if judged is None else judged).get(generation)
+        if value is not None:
+            row |= {"mean/fitness": value, "mean/fitness/ppo": value}
+        if generation == 3 and final is not None:
+            row |= {"final_mean/fitness": final, "final_mean/fitness/ppo": final - 1}
+            row |= {"final_mean/fitness/sac": final + 1}
+        lines.append(json.dumps(row))
+    (folder / "metrics.jsonl").write_text("\n".join(lines) + "\n")
+    times = [json.dumps({"generation": i, "seconds": s}) for i, s in enumerate(SECONDS[:rows])]
+    (folder / "timing.jsonl").write_text("\n".join(times) + "\n")
+    return folder
+
+
+def bandit_file(folder, **warm_start):
+    machine = {"cores": 2, "processor": "AMD EPYC", "accelerator": "none"}
+    cost = {"warm_start": warm_start, "machine": machine}
+    (folder / "Synthetic-Pendulum-v1.json").write_text(json.dumps({"cost": cost}))
+
+
+def cells_of(text, start):
+    [line] = [line for line in text.splitlines() if line.startswith("| Pendulum-v1 | " + start)]
+    return [cell.strip() for cell in line.strip("|").split("|")]
+
+
+def test_a_point_costs_what_went_before_it(tmp_path):
+    [run] = discovery_cost.collect([run_folder(tmp_path / "a", "random")])["runs"]
+    # The mean at generation 2 is judged after 60 + 30 s and 2 * 110 steps; the last after all.
+    assert run["points"] == [[0, 0.0, 0, -400.0], [2, 1.5, 220, -165.0], [4, 4.0, 440, -150.0]]
+    assert (run["minutes"], run["generations"]) == (4.0, 4)
+    assert run["steps"] == {"warm_start": 0, "training": 400, "evaluation": 40, "total": 440}
+
+
+def test_the_target_is_reached_at_the_first_judgement_above_it(tmp_path):
+    [run] = discovery_cost.collect([run_folder(tmp_path / "a")])["runs"]
+    # Pendulum's target is -170; -165 at generation 2 is the first above it.
+    assert run["reached"] == {"generation": 2, "minutes": 1.5, "steps": 220, "mean": -165.0}
+    cells = cells_of(discovery_cost.markdown({"runs": [run], "left_out": []}), "warm")
+    assert cells[9:13] == ["−170", "2", "1.5", "220"]
+    assert cells[13] == "−150 (PPO −151, SAC −149)"
+
+
+def test_a_target_that_is_exactly_met_is_reached(tmp_path):
+    [run] = discovery_cost.collect([run_folder(tmp_path / "a", judged={0: -170.0})])["runs"]
+    assert run["reached"]["generation"] == 0
+
+
+def test_a_run_that_never_gets_there_says_so(tmp_path):
+    folder = run_folder(tmp_path / "a", judged={0: -400.0}, final=-300.0)
+    report = discovery_cost.collect([folder])
+    assert report["runs"][0]["reached"] is None
+    assert "not reached" in cells_of(discovery_cost.markdown(report), "warm")
+
+
+def test_a_warm_start_is_paid_for_where_it_is_recorded(tmp_path):
+    known, unknown = run_folder(tmp_path / "a"), run_folder(tmp_path / "b", seed=4)
+    bandit_file(known, environment_steps=1000, seconds=30.0)
+    report = discovery_cost.collect([known, unknown])
+    first, second = report["runs"]
+    assert first["points"][0] == [0, 0.5, 1000, -400.0]
+    assert first["points"][-1] == [4, 4.5, 1440, -150.0]
+    assert (first["minutes"], first["steps"]["total"]) == (4.5, 1440)
+    assert second["steps"]["warm_start"] is None
+    text = discovery_cost.markdown(report)
+    assert "not recorded" in text
+    assert "leave out the warm start's own" in text
+
+
+def test_a_start_is_warm_unless_it_is_said_to_be_random(tmp_path):
+    folders = [
+        run_folder(tmp_path / name, init)
+        for name, init in (("a", None), ("b", "expert"), ("c", "random"))
+    ]
+    report = discovery_cost.collect(folders)
+    assert {run["name"]: run["start"] for run in report["runs"]} == {
+        "a": "warm",
+        "b": "warm",
+        "c": "random",
+    }
+
+
+def test_runs_that_start_elsewhere_are_left_out_and_named(tmp_path):
+    kept = run_folder(tmp_path / "kept")
+    continued = run_folder(tmp_path / "continued", from_bandit="runs/x/Synthetic-Pendulum-v1.npz")
+    mdp = run_folder(tmp_path / "mdp", "random", parameterization="TI")
+    report = discovery_cost.collect([kept, continued, mdp])
+    assert [run["name"] for run in report["runs"]] == ["kept"]
+    assert [x["name"] for x in report["left_out"]] == ["continued", "mdp"]
+    assert "continued, since it continues from another bandit" in discovery_cost.markdown(report)
+    with pytest.raises(UserError, match="no run starts warm or random"):
+        discovery_cost.collect([continued])
+
+
+def test_a_run_in_progress_is_read_up_to_its_last_whole_line(tmp_path):
+    folder = run_folder(tmp_path / "a", rows=3)
+    for name in ("metrics.jsonl", "timing.jsonl"):
+        with (folder / name).open("a") as file:
+            file.write('{"generation": 3, "sec')
+    # A generation whose seconds are not written yet does not count.
+    with (folder / "timing.jsonl").open("w") as file:
+        file.write('{"generation": 0, "seconds": 60.0}\n{"generation": 1, "seconds": 30.0}\n')
+    report = discovery_cost.collect([folder])
+    [run] = report["runs"]
+    assert run["generations"] == 2
+    assert run["points"] == [[0, 0.0, 0, -400.0]]
+    assert "2 of 4" in cells_of(discovery_cost.markdown(report), "warm")
+
+
+def test_settings_that_differ_are_told(tmp_path):
+    folders = [
+        run_folder(tmp_path / "a"),
+        run_folder(tmp_path / "b", "random", population_size=64),
+    ]
+    text = discovery_cost.markdown(discovery_cost.collect(folders))
+    assert "The runs of Pendulum-v1 differ in population size: 32, 64." in text
+
+
+def test_the_figure_has_a_row_an_environment_and_a_line_a_run(tmp_path):
+    folders = [
+        run_folder(tmp_path / "a"),
+        run_folder(tmp_path / "b", "random", seed=4),
+        run_folder(tmp_path / "c", "random", environment="CartPole-v1"),
+    ]
+    report = discovery_cost.collect(folders)
+    drawn = discovery_cost.figure(report)
+    cartpole, _, minutes, steps = drawn.axes
+    assert cartpole.get_title(loc="left") == "CartPole-v1"
+    assert len(cartpole.lines) == 2  # one run, the target
+    warm, random, target = minutes.lines
+    assert list(warm.get_xdata()) == [0.0, 1.5, 4.0]
+    assert list(steps.lines[0].get_xdata()) == [0, 220, 440]
+    assert list(warm.get_ydata()) == [-400.0, -165.0, -150.0]
+    assert (warm.get_linestyle(), random.get_linestyle()) == ("-", "--")
+    assert list(target.get_ydata()) == [-170.0, -170.0]
+
+
+def test_the_command_writes_what_it_can_render_again(tmp_path, capsys):
+    folder = run_folder(tmp_path / "a")
+    out, docs = tmp_path / "data" / "cost.json", tmp_path / "docs"
+    places = ["--out", str(out), "--docs", str(docs)]
+    assert discovery_cost.main([str(folder), *places]) == 0
+    stored = json.loads(out.read_text())
+    assert stored == discovery_cost.collect([folder])
+    assert str(tmp_path) not in out.read_text()
+    page, image = docs / "discovery_cost.md", docs / "figures" / "discovery_cost.png"
+    before = page.read_text(), image.read_bytes()
+    assert before[0] == discovery_cost.markdown(stored)
+    page.unlink()
+    assert discovery_cost.main(["--only-render", *places]) == 0
+    assert (page.read_text(), image.read_bytes()) == before
+    assert discovery_cost.main([str(tmp_path / "nowhere"), *places]) == 2
+    assert "not a run" in capsys.readouterr().err

@@ -1,0 +1,260 @@
+"""The table says what was measured, and nothing is measured twice."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import scb.agents.hyperparameters as tables
+from experiments import zoo_table
+from scb.discovery import SyntheticTraining, judge
+from scb.environments.registry import make
+from scb.environments.synthetic import BanditConfig, bandit_for
+from scb.environments.zoo import load_bandit, save_bandit
+from scb.errors import UserError
+from scb.statistics import estimate, iqm
+
+MACHINE = {"processor": "AMD EPYC", "cores": 2}
+
+
+def entry(environment, algorithm, kind, mode, sampled, **changes):
+    """A made-up entry with these agents' returns."""
+    made = {
+        "environment": environment,
+        "algorithm": algorithm,
+        "bandit": kind,
+        "sha256": kind,
+        "agents": len(mode),
+        "episodes": 50,
+        "seed": 10_000,
+        "backend": None,
+        "training_steps": 10_000,
+        "inner_loop": algorithm,
+        "mode_actions": zoo_table.summary(np.asarray(mode, float)),
+        "sampled_actions": zoo_table.summary(np.asarray(sampled, float)),
+    }
+    return made | changes
+
+
+def report(*entries):
+    return {
+        "command": "python -m experiments.zoo_table",
+        "machine": MACHINE,
+        "differences": zoo_table.differences(entries),
+        "entries": list(entries),
+    }
+
+
+def row_of(text, environment, algorithm):
+    """The cells of the first row of an environment and algorithm."""
+    start = f"| {environment} | {algorithm} |"
+    [line, *_] = [line for line in text.splitlines() if line.startswith(start)]
+    return [cell.strip() for cell in line.strip("|").split("|")]
+
+
+PENDULUM = report(
+    # IQMs of four are the means of the middle two: -160 and -180, -200 and -210.
+    entry("Pendulum-v1", "td3", "ours", [-170, -150, -900, -130], [-190, -170, -900, -130]),
+    entry("Pendulum-v1", "td3", "published", [-210, -190, -950, -140], [-220, -200, -950, -150]),
+)
+
+
+def test_a_row_holds_the_measured_the_papers_and_the_target():
+    cells = row_of(zoo_table.markdown(PENDULUM), "Pendulum-v1", "TD3")
+    values = [cell.split(" [")[0] for cell in cells[2:6]]
+    assert values == ["−160.0", "−180.0", "−200.0", "−210.0"]
+    # -160 is above the target of -170, -180 is not.
+    assert cells[6:] == ["−168.5", "−170: yes / no"]
+
+
+def test_the_difference_is_paired_and_signed():
+    text = zoo_table.markdown(PENDULUM).split("## Ours − published")[1]
+    cells = row_of(text, "Pendulum-v1", "TD3")
+    # -160 - -200 = 40 and -180 - -210 = 30.
+    assert [cell.split(" [")[0] for cell in cells[2:]] == ["+40.00", "+30.00"]
+
+
+def test_bandits_measured_differently_are_not_subtracted():
+    ours, theirs = PENDULUM["entries"]
+    assert len(zoo_table.differences([ours, theirs])) == 1
+    for changed in ({"agents": 3}, {"episodes": 5}, {"seed": 1}, {"inner_loop": "other"}):
+        assert zoo_table.differences([ours, theirs | changed]) == []
+
+
+def test_an_agent_without_a_finite_return_counts_as_the_worst_and_is_told():
+    # Of -4, -3, -2 and the NaN, which counts as -4, the middle two are -4 and -3.
+    broken = zoo_table.summary(np.array([-4.0, np.nan, -3.0, -2.0]))
+    assert broken["iqm"]["value"] == pytest.approx(-3.5)
+    assert broken["agents"] == [-4.0, None, -3.0, -2.0]
+    made = entry("Pendulum-v1", "ppo", "ours", [np.nan, -4, -3, -2], [-1, -2, -3, -4])
+    text = zoo_table.markdown(report(made))
+    assert "PPO on Pendulum-v1 (ours, most likely actions): 1 of 4" in text
+
+
+def test_the_page_says_how_many_episodes_and_which_physics():
+    hopper = entry("hopper", "ppo", "ours", [1, 2, 3], [1, 2, 3], episodes=5, backend="generalized")
+    text = zoo_table.markdown(report(hopper, *PENDULUM["entries"]))
+    assert "Classic control: hyperparameters drawn from the paper's lists, 50 episodes" in text
+    assert "Brax (generalized physics): the paper's fixed hyperparameters, 5 episodes" in text
+    rows = [line for line in text.splitlines() if line.startswith(("| Pendulum", "| hopper"))]
+    assert rows[0].startswith("| Pendulum-v1")  # classic control comes first
+
+
+def test_the_figure_draws_what_the_table_says():
+    hopper = entry("hopper", "ppo", "ours", [1, 2, 3], [1, 2, 3], episodes=5, backend="generalized")
+    drawn = zoo_table.figure(report(*PENDULUM["entries"], hopper))
+    pendulum, brax = drawn.axes
+    assert brax.get_title(loc="left") == "hopper (generalized, 5 episodes)"
+    points = {line.get_xdata()[0]: line for line in pendulum.lines if line.get_marker() in "os"}
+    assert sorted(points) == pytest.approx([-210, -200, -180, -160])
+    filled = {x for x, line in points.items() if line.get_markerfacecolor() != "white"}
+    assert filled == {-160.0, -200.0}  # the most likely actions'
+    # The paper's expert.
+    assert any(list(line.get_xdata()) == [-137.4, -137.4] for line in pendulum.lines)
+    [expected] = [e for e in PENDULUM["entries"] if e["bandit"] == "ours"]
+    ends = [segment[:, 0].tolist() for c in pendulum.collections for segment in c.get_segments()]
+    assert [expected["mode_actions"]["iqm"][end] for end in ("low", "high")] in ends
+
+
+def test_every_target_and_paper_figure_is_of_a_fitting_algorithm():
+    assert set(zoo_table.TARGETS) < set(zoo_table.PAPER) == set(zoo_table.PAPER_EXPERT)
+    for environment, figures in zoo_table.PAPER.items():
+        env, params = make(environment)
+        assert tuple(figures) == tables.algorithms_for(env.action_space(params))
+
+
+@pytest.fixture
+def tiny(tmp_path, monkeypatch):
+    """A CartPole bandit that nobody evolved, and PPO with 16 steps as the only algorithm."""
+    bandit = bandit_for(*make("CartPole-v1"), BanditConfig(hidden_size=4), "Synthetic-CartPole-v1")
+    path = tmp_path / "Synthetic-CartPole-v1.npz"
+    metadata = {"seeds": {}, "results": {}, "cost": {}, "command": "none"}
+    metadata["config"] = {"evaluation_environment": "CartPole-v1"}
+    save_bandit(path, bandit, bandit.init_weights(zoo_key()), metadata)
+    full = tables.inner_loop
+
+    def small(*arguments, **keywords):
+        inner = full(*arguments, **keywords)
+        sizes = {"num_envs": 2, "num_steps": 8, "num_epochs": 1, "num_minibatches": 1}
+        return replace(
+            inner, config=replace(inner.config, total_steps=16, hidden_sizes=(4,), **sizes)
+        )
+
+    monkeypatch.setattr(tables, "inner_loop", small)
+    monkeypatch.setattr(tables, "algorithms_for", lambda space: ("ppo",))
+    monkeypatch.setattr(zoo_table, "DEFAULT_PUBLISHED", tmp_path / "nothing")
+    arguments = ["--bandits", str(path), "--agents", "2", "--episodes", "2"]
+    arguments += ["--out", str(tmp_path / "data" / "zoo_table.json"), "--docs", str(tmp_path)]
+    return path, arguments, small
+
+
+def zoo_key():
+    import jax
+
+    return jax.random.key(0)
+
+
+def test_a_measurement_is_what_judging_gives_and_is_not_repeated(tiny, tmp_path, monkeypatch):
+    path, arguments, small = tiny
+    assert zoo_table.main(arguments) == 0
+    stored = json.loads((tmp_path / "data" / "zoo_table.json").read_text())
+    [made] = stored["entries"]
+
+    env, params = make("CartPole-v1")
+    bandit = load_bandit(path)
+    inner = small("ppo", "CartPole-v1", env.action_space(params))
+    training = SyntheticTraining(bandit, env, params, inner)
+    expected = judge(training, bandit.default_params.weights, 10_000, 2, 2)
+    for actions, returns in expected.items():
+        assert made[actions]["agents"] == pytest.approx(returns, abs=1e-3)
+        assert made[actions]["iqm"]["value"] == pytest.approx(float(iqm(returns)), abs=1e-3)
+        assert made[actions]["iqm"]["low"] == pytest.approx(estimate(returns).low, abs=1e-3)
+    assert (made["training_steps"], made["seed"], made["backend"]) == (16, 10_000, None)
+    assert str(tmp_path) not in json.dumps(stored)
+    assert (tmp_path / "zoo_table.md").read_text() == zoo_table.markdown(stored)
+    assert (tmp_path / "figures" / "zoo_table.png").stat().st_size > 10_000
+
+    calls = []
+
+    def counted(training, weights, seed, num_agents, num_episodes):
+        calls.append((seed, num_agents, num_episodes))
+        return {"sampled_actions": np.ones(num_agents), "mode_actions": np.ones(num_agents)}
+
+    monkeypatch.setattr("scb.discovery.judge", counted)
+    assert zoo_table.main(arguments) == 0
+    assert calls == []
+    # Another number of episodes is another measurement, and takes the old one's place.
+    arguments[arguments.index("--episodes") + 1] = "3"
+    assert zoo_table.main(arguments) == 0
+    assert calls == [(10_000, 2, 3)]
+    stored = json.loads((tmp_path / "data" / "zoo_table.json").read_text())
+    assert [e["episodes"] for e in stored["entries"]] == [3]
+    # And so is another bandit under the same name.
+    bandit_weights = load_bandit(path).init_weights(zoo_key())
+    bandit_weights["reward"]["Dense_1"]["bias"] += 1.0
+    metadata = {"seeds": {}, "results": {}, "cost": {}, "command": "none", "config": {}}
+    save_bandit(path, bandit, bandit_weights, metadata)
+    assert zoo_table.main(arguments) == 0
+    assert len(calls) == 2
+
+
+def test_only_rendering_measures_nothing(tmp_path, monkeypatch):
+    def forbidden(*arguments):
+        raise AssertionError("measured")
+
+    monkeypatch.setattr(zoo_table, "measure", forbidden)
+    out = tmp_path / "report.json"
+    out.write_text(json.dumps(PENDULUM))
+    arguments = ["--only-render", "--out", str(out), "--docs", str(tmp_path)]
+    assert zoo_table.main(arguments) == 0
+    assert (tmp_path / "zoo_table.md").read_text() == zoo_table.markdown(PENDULUM)
+
+
+def test_rendering_without_a_report_says_to_measure_first(tmp_path, capsys):
+    out = tmp_path / "report.json"
+    assert zoo_table.main(["--only-render", "--out", str(out), "--docs", str(tmp_path)]) == 2
+    assert "measure first" in capsys.readouterr().err
+
+
+def published_pendulum(folder):
+    """A folder like the released one, with Pendulum's and hopper's arrays, all zeros but the biases."""
+    folder.mkdir()
+    for name, environment in (("pendulum", "Pendulum-v1"), ("hopper", "hopper")):
+        bandit = bandit_for(*make(environment), BanditConfig(), environment)
+        shapes = bandit.weight_shapes()
+        np.savez(folder / f"{name}.npz", **{k: np.ones(v, np.float32) for k, v in shapes.items()})
+    return folder
+
+
+def test_ours_comes_before_the_published_and_brax_last(tmp_path):
+    folder = published_pendulum(tmp_path / "published")
+    found = zoo_table.candidates(None, folder)
+    ours = [x for x in found if x.kind == "ours"]
+    pendulum = [x for x in found if x.environment == "Pendulum-v1"]
+    assert [x.kind for x in pendulum] == ["ours", "published"]
+    assert [x.bandit.config.activation for x in pendulum] == ["tanh", "relu"]
+    ranks = [zoo_table.ENVIRONMENTS.index(x.environment) for x in found]
+    assert ranks == sorted(ranks)
+    assert len(ours) + 2 == len(found)
+    without = zoo_table.candidates(None, folder, skip_brax=True)
+    assert "hopper" not in {x.environment for x in without}
+
+
+def test_a_named_bandit_brings_its_published_peer_only(tmp_path):
+    folder = published_pendulum(tmp_path / "published")
+    named = zoo_table.candidates(["Synthetic-Pendulum-v1"], folder)
+    assert {x.environment for x in named} == {"Pendulum-v1"}
+    with pytest.raises(UserError, match="unknown bandit"):
+        zoo_table.candidates(["Synthetic-Nowhere-v1"], folder)
+
+
+def test_the_digest_is_of_the_arrays_and_not_of_their_packing(tmp_path):
+    arrays = {"a": np.arange(3.0), "b": np.zeros((2, 2))}
+    np.savez(tmp_path / "one.npz", **arrays)
+    np.savez_compressed(tmp_path / "two.npz", **dict(reversed(arrays.items())))
+    np.savez(tmp_path / "three.npz", a=arrays["a"] + 1, b=arrays["b"])
+    one, two, three = (
+        zoo_table.arrays_digest(tmp_path / f"{x}.npz") for x in ("one", "two", "three")
+    )
+    assert one == two != three

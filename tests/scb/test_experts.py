@@ -1,0 +1,165 @@
+"""Experts: policies that are evolved, trained or handed over, what they earn and what they cost."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from scb.agents.dqn import DQNConfig, DQNHyperparameters
+from scb.agents.settings import Setting
+from scb.curriculum import CurriculumConfig
+from scb.environments.registry import make
+from scb.evolution import EvolutionConfig
+from scb.experts import PolicySearchConfig, evolve_expert, judged, train_expert
+from tests.scb.probes import ContinuousCorridor, Corridor, CorridorParams
+
+EVOLUTION = EvolutionConfig(
+    population_size=16,
+    num_generations=12,
+    sigma=0.5,
+    mean_evaluations=2,
+    evaluate_mean_every=1000,
+)
+SEARCH = PolicySearchConfig(hidden_size=8, episodes=1, evolution=EVOLUTION)
+# Action 1 pays in cells 0, 2 and 3, action 0 in cell 1: 4 in all, and 2 by chance.
+CELLS = CorridorParams(
+    rewards=jnp.array([[0.0, 1.0], [1.0, 0.0], [0.0, 1.0], [0.0, 1.0]]),
+    last=3,
+    max_steps_in_episode=4,
+)
+BEST = [1, 0, 1, 1]
+
+
+def actions(expert, cells=4):
+    return [int(expert.policy(cell)) for cell in jnp.eye(cells)]
+
+
+# -- a policy that is handed over
+# ---------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("policy", "earned"),
+    [
+        # 1 in cells 0, 2 and 3; 0 in cell 1; and the optimum by reading the observation.
+        (lambda observation: jnp.int32(1), 3.0),
+        (lambda observation: jnp.int32(0), 1.0),
+        (lambda observation: jnp.array(BEST)[jnp.argmax(observation)], 4.0),
+    ],
+)
+def test_a_hand_made_policy_is_measured(policy, earned):
+    expert = judged(policy, Corridor(cells=4), CELLS, jax.random.key(0), environment_steps=7)
+    assert expert.mean_return == earned
+    # 20 episodes of at most 4 steps, and what it cost before.
+    assert expert.environment_steps == 7 + 20 * 4
+    assert expert.policy is policy
+
+
+def test_a_policy_is_given_flattened_observations():
+    class Folded(Corridor):
+        def get_obs(self, state, params=None, key=None):
+            return jnp.reshape(super().get_obs(state), (2, 2))
+
+    def policy(observation):
+        assert observation.shape == (4,)
+        return jnp.array(BEST)[jnp.argmax(observation)]
+
+    assert judged(policy, Folded(cells=4), CELLS, jax.random.key(0)).mean_return == 4.0
+
+
+# -- a policy that is evolved
+# -------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def evolved():
+    return evolve_expert(Corridor(cells=4), CELLS, SEARCH, jax.random.key(0))
+
+
+def test_an_evolved_policy_solves_a_corridor(evolved):
+    assert evolved.mean_return == 4.0
+    assert actions(evolved) == BEST
+
+
+def test_the_steps_of_an_evolution_are_counted(evolved):
+    # 12 generations of 16 candidates with 1 episode of 4 steps; then 20 episodes that judge it.
+    assert evolved.environment_steps == 12 * 16 * 4 + 20 * 4
+
+
+def test_the_key_alone_decides_the_expert(evolved):
+    # The configuration's own seed does not.
+    other_seed = replace(SEARCH, evolution=replace(EVOLUTION, seed=5))
+    again = evolve_expert(Corridor(cells=4), CELLS, other_seed, jax.random.key(0))
+    assert again.mean_return == evolved.mean_return
+    between = jnp.linspace(-1.0, 1.0, 400).reshape(100, 4)
+    np.testing.assert_array_equal(
+        jax.vmap(again.policy)(between), jax.vmap(evolved.policy)(between)
+    )
+    other = evolve_expert(Corridor(cells=4), CELLS, SEARCH, jax.random.key(1))
+    assert (jax.vmap(other.policy)(between) != jax.vmap(evolved.policy)(between)).any()
+
+
+def test_an_evolved_policy_finds_continuous_actions_within_the_bounds():
+    # Cells pay 1 - (a - t)^2 with t = -0.5 and 1.5, of actions in [-1, 2]: 2 at best. The best
+    # constant action, 0.5, earns 0, and so do uniform actions or less.
+    params = CorridorParams(
+        rewards=jnp.array([[1.0, 1.0, -0.5], [1.0, 1.0, 1.5]]), last=1, max_steps_in_episode=2
+    )
+    search = replace(SEARCH, evolution=replace(EVOLUTION, num_generations=40))
+    expert = evolve_expert(ContinuousCorridor(cells=2), params, search, jax.random.key(0))
+    assert expert.mean_return > 1.9
+    first, second = (expert.policy(cell) for cell in jnp.eye(2))
+    assert first.shape == (1,)
+    assert float(first[0]) == pytest.approx(-0.5, abs=0.3)
+    assert float(second[0]) == pytest.approx(1.5, abs=0.3)
+    # Far outside of what it has seen, an action is still within the bounds.
+    far = np.asarray(jax.vmap(expert.policy)(1e3 * jnp.eye(2)))
+    assert far.min() >= -1.0 and far.max() <= 2.0
+
+
+@pytest.mark.parametrize("paying", [0, 1])
+def test_a_curriculum_lets_a_policy_see_what_lies_beyond_the_environments_limit(paying):
+    # Episodes end after 2 steps, but only the fourth cell pays. A curriculum that stays at 4 steps
+    # during the whole search shows it; the expert itself is judged within the limit, and earns 0.
+    rewards = jnp.zeros((4, 2)).at[3, paying].set(1.0)
+    params = CorridorParams(rewards=rewards, last=3, max_steps_in_episode=2)
+    curriculum = CurriculumConfig("linear", initial=4, final=2, begin=100)
+    search = replace(SEARCH, curriculum=curriculum)
+    expert = evolve_expert(Corridor(cells=4), params, search, jax.random.key(0))
+    assert actions(expert)[3] == paying
+    assert expert.mean_return == 0.0
+    # Episodes of 4 steps in the search, and of 2 in the judgement.
+    assert expert.environment_steps == 12 * 16 * 4 + 20 * 2
+
+
+def test_an_evolved_policy_balances_a_pole():
+    # CartPole pays 1 a step, 500 at most; random actions earn about 22.
+    env, env_params = make("CartPole-v1")
+    search = replace(
+        SEARCH, episodes=2, evolution=replace(EVOLUTION, population_size=32, num_generations=8)
+    )
+    expert = evolve_expert(env, env_params, search, jax.random.key(0))
+    assert expert.mean_return > 400
+
+
+# -- an agent that is trained
+# -------------------------------------------------------------------------
+
+
+def test_any_agent_can_be_the_expert():
+    config = DQNConfig(
+        num_envs=4,
+        buffer_size=400,
+        prefill=80,
+        batch_size=32,
+        total_steps=480,
+        hidden_sizes=(16,),
+    )
+    setting = Setting(config, DQNHyperparameters(learning_rate=0.02), source="this test")
+    expert = train_expert(Corridor(cells=4), CELLS, setting, jax.random.key(0), num_experts=2)
+    assert expert.mean_return == 4.0
+    assert actions(expert) == BEST
+    # Two agents of 480 steps, each judged by 20 episodes of 4.
+    assert expert.environment_steps == 2 * (480 + 20 * 4)
