@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 STARTS = ("warm", "random")
+# How a run's log names an algorithm's interquartile mean beside its mean.
+_IQM = "_iqm"
 # What makes two searches incomparable where it differs; shown in the JSON, and said on the page.
 SETTINGS = (
     "population_size",
@@ -90,11 +92,11 @@ def _run(folder: Path) -> dict[str, Any] | str:
         if row.get("mean/fitness") is not None:
             # Judged before the generation's own candidates are.
             steps = before[generation] + (warm["steps"] or 0)
-            points.append([generation, round(minutes[generation], 3), steps, row["mean/fitness"]])
+            points.append([generation, round(minutes[generation], 3), steps, _judged(row, "mean/")])
             algorithms = _by_algorithm(row, "mean/")
     if rows and rows[-1].get("final_mean/fitness") is not None:
         steps = before[-1] + (warm["steps"] or 0)
-        points.append([number, round(elapsed, 3), steps, rows[-1]["final_mean/fitness"]])
+        points.append([number, round(elapsed, 3), steps, _judged(rows[-1], "final_mean/")])
         algorithms = _by_algorithm(rows[-1], "final_mean/")
     if not points:
         return "it has not been judged yet"
@@ -123,8 +125,14 @@ def _run(folder: Path) -> dict[str, Any] | str:
         if at_target is None
         else dict(zip(("generation", "minutes", "steps", "mean"), at_target, strict=True)),
         "algorithms": algorithms,
+        "statistic": "IQM" if f"final_mean/fitness{_IQM}" in rows[-1] else "mean",
         "points": points,
     }
+
+
+def _judged(row: Mapping[str, Any], prefix: str) -> float:
+    """The interquartile mean over the agents, which targets are stated in; the mean where none was logged."""
+    return float(row.get(f"{prefix}fitness{_IQM}", row[f"{prefix}fitness"]))
 
 
 def _by_algorithm(row: Mapping[str, Any], prefix: str) -> dict[str, float]:
@@ -177,14 +185,14 @@ def markdown(report: Mapping[str, Any]) -> str:
         "`python -m experiments.discovery_cost RUN_FOLDER ...`, on runs of `scb discover`. A *warm* start fits the",
         "bandit to an expert first, a *random* one begins with random weights, as in the paper.",
         "",
-        "The return is the mean over the agents that judge the search distribution's mean, every few generations on",
-        "the same seeds; their own steps are not counted. Training steps are steps of the bandit, evaluation steps",
+        "The return is the interquartile mean (where a run logged none, the mean) over the agents that judge the",
+        "search distribution's mean, every few generations on the same seeds; their own steps are not counted. Training steps are steps of the bandit, evaluation steps",
         "those of the environment (episodes that end early count in full), and a warm start's are those of its expert.",
-        "The total counts all three. *To the target* says when that mean first stood at the target or above. It is",
+        "The total counts all three. *To the target* says when that return first stood at the target or above. It is",
         "noisy: what a bandit is worth is measured on other seeds.",
         "",
         "| environment | start | seed | generations | warm start | training | evaluation | total steps | minutes "
-        "| target | to the target: generations | minutes | steps | mean return at the end |",
+        "| target | to the target: generations | minutes | steps | return at the end |",
         "| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |",
     ]
     for run in runs:
@@ -260,11 +268,14 @@ def _notes(report: Mapping[str, Any]) -> list[str]:
 
 
 def _end(run: Mapping[str, Any]) -> str:
-    end = _number(run["points"][-1][3])
-    if len(run["algorithms"]) < 2:
+    """The last mean, and by algorithm the interquartile means where the run logs them, else the means."""
+    end, logged = _number(run["points"][-1][3]), run["algorithms"]
+    iqms = {name.removesuffix(_IQM): x for name, x in logged.items() if name.endswith(_IQM)}
+    shown = iqms or logged
+    if not iqms and len(logged) < 2:
         return end
-    each = ", ".join(f"{name.upper()} {_number(x)}" for name, x in run["algorithms"].items())
-    return f"{end} ({each})"
+    each = ", ".join(f"{name.upper()} {_number(x)}" for name, x in shown.items())
+    return f"{end} ({'IQM: ' if iqms else ''}{each})"
 
 
 def _number(x: float | None) -> str:
@@ -314,7 +325,10 @@ def figure(report: Mapping[str, Any]) -> "Figure":
                         of_it[0]["target"], color=figures.BLACK, linewidth=1.4, linestyle=":"
                     )
                 axes.margins(x=0.03, y=0.08)
-                axes.xaxis.set_major_locator(MaxNLocator(6))
+                # From zero, so that what a warm start costs before the first point can be seen.
+                right = axes.get_xlim()[1]
+                axes.set_xlim(-0.02 * right, right)
+                axes.xaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 2.5, 5, 10]))
             row[1].xaxis.set_major_formatter(EngFormatter(sep=""))
             row[0].set_ylabel("mean return")
             row[0].set_title(environment)

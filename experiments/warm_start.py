@@ -5,12 +5,15 @@
 For one expert and one set of states, the bandit is fitted to each construction of the paper's lemma
 (the Q-function, the normalised advantage, -||a - a*||, and that last one on states stretched to
 unit spread), agents of every algorithm train in it with sampled hyperparameters, and their return in
-the environment itself says which construction trains best. No evolution is involved.
+the environment itself says which construction trains best. No evolution is involved. Environments
+that --out holds already are kept, so that they can be measured one at a time.
 """
 
 import argparse
+import json
 import sys
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +27,28 @@ ARMS: dict[str, dict[str, Any]] = {
     "-||a - a*||": {"construction": "action_distance"},
     "-||a - a*||, stretched states": {"construction": "action_distance", "min_spread": 1.0},
 }
+
+
+def markdown(report: Mapping[str, Any]) -> str:
+    """A table, one row an environment and algorithm, one column a construction; the best in bold."""
+    lines = [
+        "| environment (expert) | algorithm | " + " | ".join(ARMS) + " |",
+        "| --- | --- |" + " --- |" * len(ARMS),
+    ]
+    for name, result in report["environments"].items():
+        arms = result["returns"]
+        for algorithm in next(iter(arms.values())):
+            if algorithm in ("fit", "fit_seconds"):
+                continue
+            iqms = {arm: arms[arm][algorithm]["mode_actions"]["iqm"] for arm in ARMS}
+            best = max(iqms, key=lambda arm: iqms[arm]["value"])
+            cells = []
+            for arm, x in iqms.items():
+                text = f"{x['value']:.0f} [{x['low']:.0f}, {x['high']:.0f}]".replace("-", "\u2212")
+                cells.append(f"**{text}**" if arm == best else text)
+            expert = f"{result['expert_return']:.0f}".replace("-", "\u2212")
+            lines.append(f"| {name} ({expert}) | {algorithm.upper()} | {' | '.join(cells)} |")
+    return "\n".join(lines)
 
 
 def main() -> int:
@@ -60,6 +85,8 @@ def main() -> int:
         "machine": machine_description(),
         "environments": {},
     }
+    if arguments.out.exists():
+        report["environments"] = json.loads(arguments.out.read_text())["environments"]
     for name in arguments.environment:
         env, env_params = make(name)
         space = env.action_space(env_params)
@@ -105,8 +132,9 @@ def main() -> int:
                 print(f"{name} | {arm} | {algorithm} | {both}", flush=True)
             result["returns"][arm] = row
         report["environments"][name] = result
-    arguments.out.parent.mkdir(parents=True, exist_ok=True)
-    write_json(arguments.out, report)
+        arguments.out.parent.mkdir(parents=True, exist_ok=True)
+        write_json(arguments.out, report)
+    print(markdown(report))
     return 0
 
 

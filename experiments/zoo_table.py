@@ -18,6 +18,7 @@ import hashlib
 import json
 import math
 import sys
+import textwrap
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -324,7 +325,10 @@ def markdown(report: Mapping[str, Any]) -> str:
         "",
         f"`{report['command']}`",
         "",
-        f"{_protocol_text(entries)} Interquartile means with 95 % bootstrap intervals over agents.",
+        *textwrap.wrap(
+            f"{_protocol_text(entries)} Interquartile means with 95 % bootstrap intervals over agents.",
+            width=118,
+        ),
         "",
         "*Ours* are the bandits of this repository"
         + (
@@ -478,7 +482,7 @@ def figure(report: Mapping[str, Any]) -> "Figure":
     with figures._style():
         drawn = Figure(figsize=(figures.WIDTH, 2.1 * rows + 1.1))
         grid = drawn.subplots(rows, columns, squeeze=False).flat
-        for axes, environment in zip(grid, environments, strict=False):
+        for panel, (axes, environment) in enumerate(zip(grid, environments, strict=False)):
             algorithms = [a for e, a in pairs if e == environment]
             for position, algorithm in enumerate(algorithms):
                 if position % 2 == 0:
@@ -508,14 +512,13 @@ def figure(report: Mapping[str, Any]) -> "Figure":
             axes.set_ylim(len(algorithms) - 0.5, -0.5)
             axes.tick_params(axis="y", length=0)
             axes.grid(axis="y", visible=False)
-            axes.xaxis.set_major_locator(MaxNLocator(5))
+            axes.xaxis.set_major_locator(MaxNLocator(5, steps=[1, 2, 2.5, 5, 10]))
             axes.margins(x=0.06)
             axes.set_title(_panel_title(environment, entries))
+            if panel + columns >= len(environments):  # nothing below it
+                axes.set_xlabel("return in the environment")
         for axes in drawn.axes[len(environments) :]:
             axes.remove()
-        drawn.supxlabel(
-            "return in the environment (interquartile mean, 95 % interval)", fontsize=10
-        )
         kinds = [kind for kind in BANDITS if any(e["bandit"] == kind for e in entries)]
         handles = [
             Line2D(
@@ -536,7 +539,8 @@ def figure(report: Mapping[str, Any]) -> "Figure":
             names.append("SAC trained on the environment (paper)")
         agents = " or ".join(str(n) for n in sorted({entry["agents"] for entry in entries}))
         figures._title(
-            drawn, f"Agents trained in a bandit, in its environment: {agents} agents a point"
+            drawn,
+            f"Agents trained in a bandit, in its environment: IQM of {agents} agents, 95 % intervals",
         )
         figures._legend_below(drawn, (handles, names), columns=3)
     return drawn

@@ -66,6 +66,9 @@ _PAPER_GENERATIONS = {
     ),
 }
 
+# Of 32 bits, which is what an agent calculates with.
+_LARGEST = float(np.finfo(np.float32).max)
+
 # Reported on these seeds, which neither evolution nor selection sees.
 FIRST_REPORTING_SEED = 10_000
 SELECTIONS = ("final", "best")
@@ -96,7 +99,7 @@ def discover_command(
     algorithms: str | None = None,
     mode: str | None = None,
     hyperparameters: Path | None = None,
-    fixed_hyperparameters: bool | None = None,
+    fixed_hyperparameters: bool = False,
     init: str | None = None,
     expert: str | None = None,
     expert_steps: int | None = None,
@@ -109,7 +112,7 @@ def discover_command(
     agents_per_candidate: int | None = None,
     combine: str | None = None,
     evaluation_episodes: int | None = None,
-    mode_actions: bool | None = None,
+    mode_actions: bool = False,
     curriculum: str | None = None,
     sigma: float | None = None,
     mean_evaluations: int | None = None,
@@ -169,6 +172,10 @@ def discover_command(
       judge_episodes: episodes of each of them.
       wandb: project to log to, with the extra `wandb`.
     """
+    if judge_agents < 0:
+        raise UserError(f"judge_agents is {judge_agents}: give 0 for no judgement, or more.")
+    if judge_episodes < 1:
+        raise UserError(f"judge_episodes is {judge_episodes}: give at least 1.")
     flags = {
         "command": "discover",
         "environment": environment,
@@ -179,7 +186,7 @@ def discover_command(
         "algorithms": algorithms,
         "mode": mode,
         "hyperparameters": None if hyperparameters is None else str(hyperparameters),
-        "fixed_hyperparameters": fixed_hyperparameters,
+        "fixed_hyperparameters": fixed_hyperparameters or None,
         "init": init,
         "expert": expert,
         "expert_steps": expert_steps,
@@ -192,7 +199,7 @@ def discover_command(
         "agents_per_candidate": agents_per_candidate,
         "combine": combine,
         "evaluation_episodes": evaluation_episodes,
-        "mode_actions": mode_actions,
+        "mode_actions": mode_actions or None,
         "curriculum": curriculum,
         "sigma": sigma,
         "mean_evaluations": mean_evaluations,
@@ -202,7 +209,7 @@ def discover_command(
         "select": select,
     }
     settings = settle(flags, PRESETS, preset, resume)
-    if settings["preset"] == "paper":
+    if settings.get("preset") == "paper":
         name = settings.get("environment") or DiscoveryConfig.environment
         settings |= {k: v for k, v in _paper_settings(name).items() if settings.get(k) is None}
     chosen = settings.get("select") or "final"
@@ -233,7 +240,7 @@ def discover_command(
         "config": {
             "evaluation_environment": config.environment,
             "backend": getattr(problem.env, "backend", None),
-            "discovery": config_dict(config),
+            "discovery": config_dict(problem.config),
             "settings": settings,
             "started_from": _origin(settings.get("from_bandit")),
         },
@@ -361,7 +368,7 @@ def discovery_config(settings: Mapping[str, Any]) -> DiscoveryConfig:
 
 def _names(text: str) -> tuple[str, ...]:
     """The algorithms of "ppo,sac"; none for "all", which stands for the paper's."""
-    if text == "all":
+    if text.strip().lower() == "all":
         return ()
     names = tuple(name.strip().lower() for name in text.split(",") if name.strip())
     if not names:
@@ -394,22 +401,38 @@ def read_lists(path: Path) -> dict[str, dict[str, tuple[float, ...]]]:
     """{algorithm: {hyperparameter: values}} from a JSON file; what is wrong with it is a UserError."""
     wanted = 'give {"ppo": {"learning_rate": [0.001, 0.005]}, ...}'
     try:
-        content = json.loads(path.read_text())
+        content = json.loads(path.read_text(), parse_constant=_no_json)
     except OSError as error:
         raise UserError(f"cannot read {path} ({error.strerror}): {wanted}.") from error
     except ValueError as error:
         raise UserError(f"{path} is no JSON ({error}): {wanted}.") from error
-    if not isinstance(content, dict) or not all(isinstance(x, dict) for x in content.values()):
+    if (
+        not isinstance(content, dict)
+        or not content
+        or not all(isinstance(lists, dict) and lists for lists in content.values())
+    ):
         raise UserError(f"{path} holds no hyperparameter lists: {wanted}.")
     for algorithm, lists in content.items():
         if algorithm not in ALGORITHMS:
             raise unknown_name("algorithm", algorithm, ALGORITHMS)
         for name, values in lists.items():
-            if not isinstance(values, list):
+            if not isinstance(values, list) or not values:
                 raise UserError(
                     f"{path}: {algorithm}'s {name} is {values!r}, no list of numbers: {wanted}."
                 )
+            for value in values:
+                number = isinstance(value, int | float) and not isinstance(value, bool)
+                if not number or abs(value) > _LARGEST:
+                    raise UserError(
+                        f"{path}: {algorithm}'s {name} has the value {value!r}, which is no number that an "
+                        "agent can take: give finite numbers only."
+                    )
     return {a: {n: tuple(v) for n, v in lists.items()} for a, lists in content.items()}
+
+
+def _no_json(constant: str) -> Any:
+    """Raises a ValueError for NaN and infinities, which Python would read."""
+    raise ValueError(f"{constant} is no JSON number")
 
 
 def train(

@@ -36,7 +36,7 @@ from scb.environments.synthetic_mdp import PARAMETERIZATIONS, SyntheticMDP, synt
 from scb.environments.zoo import open_bandit
 from scb.errors import UserError, unknown_name
 from scb.evolution import EnvironmentSteps, EvolutionConfig, Outcome, evolve, map_population
-from scb.runs import Run
+from scb.runs import Run, Stopwatch
 from scb.warm_start import (
     WarmStartConfig,
     expert_dataset,
@@ -270,13 +270,14 @@ class BanditDiscovery:
         key_expert, key_data, key_fit = jax.random.split(
             jax.random.fold_in(jax.random.key(self.config.evolution.seed), 1), 3
         )
-        warm = self.config.warm_start
+        warm, watch = self.config.warm_start, Stopwatch()
         expert = find_expert(self.config.environment, self.env, self.env_params, key_expert, warm)
         dataset, dataset_steps = expert_dataset(expert, self.env, self.env_params, key_data, warm)
         weights, report = fit_bandit(self.bandit, dataset, key_fit, warm)
         self.warm_start_report = {
             "expert_return": expert.mean_return,
             "environment_steps": expert.environment_steps + dataset_steps,
+            "seconds": round(watch.lap(), 1),
             **report,
         }
         return weights

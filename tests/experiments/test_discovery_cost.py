@@ -68,6 +68,13 @@ def test_the_target_is_reached_at_the_first_judgement_above_it(tmp_path):
     assert cells[13] == "−150 (PPO −151, SAC −149)"
 
 
+def test_the_end_shows_interquartile_means_where_they_are_logged(tmp_path):
+    [run] = discovery_cost.collect([run_folder(tmp_path / "a")])["runs"]
+    run["algorithms"] = {"ppo": -150.0, "ppo_iqm": -140.0}
+    cells = cells_of(discovery_cost.markdown({"runs": [run], "left_out": []}), "warm")
+    assert cells[13] == "−150 (IQM: PPO −140)"
+
+
 def test_a_target_that_is_exactly_met_is_reached(tmp_path):
     [run] = discovery_cost.collect([run_folder(tmp_path / "a", judged={0: -170.0})])["runs"]
     assert run["reached"]["generation"] == 0

@@ -9,6 +9,7 @@ import pytest
 import scb.agents.hyperparameters as tables
 from experiments import zoo_table
 from scb.discovery import SyntheticTraining, judge
+from scb.environments.brax import BRAX_NAMES
 from scb.environments.registry import make
 from scb.environments.synthetic import BanditConfig, bandit_for
 from scb.environments.zoo import load_bandit, save_bandit
@@ -95,8 +96,9 @@ def test_an_agent_without_a_finite_return_counts_as_the_worst_and_is_told():
 def test_the_page_says_how_many_episodes_and_which_physics():
     hopper = entry("hopper", "ppo", "ours", [1, 2, 3], [1, 2, 3], episodes=5, backend="generalized")
     text = zoo_table.markdown(report(hopper, *PENDULUM["entries"]))
-    assert "Classic control: hyperparameters drawn from the paper's lists, 50 episodes" in text
-    assert "Brax (generalized physics): the paper's fixed hyperparameters, 5 episodes" in text
+    prose = " ".join(text.split())
+    assert "Classic control: hyperparameters drawn from the paper's lists, 50 episodes" in prose
+    assert "Brax (generalized physics): the paper's fixed hyperparameters, 5 episodes" in prose
     rows = [line for line in text.splitlines() if line.startswith(("| Pendulum", "| hopper"))]
     assert rows[0].startswith("| Pendulum-v1")  # classic control comes first
 
@@ -120,6 +122,9 @@ def test_the_figure_draws_what_the_table_says():
 def test_every_target_and_paper_figure_is_of_a_fitting_algorithm():
     assert set(zoo_table.TARGETS) < set(zoo_table.PAPER) == set(zoo_table.PAPER_EXPERT)
     for environment, figures in zoo_table.PAPER.items():
+        if environment in BRAX_NAMES:  # whose actions are all continuous
+            assert tuple(figures) == ("ppo", "sac", "ddpg", "td3")
+            continue
         env, params = make(environment)
         assert tuple(figures) == tables.algorithms_for(env.action_space(params))
 

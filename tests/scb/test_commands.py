@@ -4,8 +4,11 @@ import contextlib
 import io
 import json
 import os
+import shlex
+import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -16,12 +19,15 @@ import pytest
 import scb
 from lpo.cli import scb_main
 from scb import artefacts
+from scb.agents.hyperparameters import inner_loop
 from scb.agents.ppo import PPOConfig
 from scb.commands import discovery_config
-from scb.discovery import DiscoveryConfig
+from scb.curriculum import CurriculumConfig
+from scb.discovery import BanditDiscovery, DiscoveryConfig
 from scb.environments.registry import make
 from scb.environments.synthetic import BanditConfig, bandit_for
 from scb.environments.zoo import load_bandit, save_bandit, zoo_names
+from scb.evolution import config_dict
 
 METADATA = {"seeds": {}, "results": {}, "cost": {}, "command": "scb discover", "config": {}}
 TINY = PPOConfig(
@@ -43,12 +49,21 @@ def call(*arguments):
     return SimpleNamespace(code=code, out=out.getvalue(), err=err.getvalue())
 
 
+def small(*arguments):
+    inner = inner_loop(*arguments)
+    if inner.name == "ppo":
+        return replace(inner, config=TINY)
+    sizes = {"buffer_size": 16, "prefill": 8, "batch_size": 4, "hidden_sizes": (4,)}
+    config = replace(inner.config, num_envs=2, gradient_steps=1, total_steps=16, **sizes)
+    return replace(inner, config=config)
+
+
 @pytest.fixture(scope="module", autouse=True)
 def small_inner_loop():
     """The commands take the paper's 10 000 steps; here 16 must do."""
     with pytest.MonkeyPatch.context() as patch:
         for module in ("scb.discovery", "scb.commands"):
-            patch.setattr(f"{module}.inner_loop_config", lambda name: TINY)
+            patch.setattr(f"{module}.inner_loop", small)
         patch.setattr("scb.discovery.EvolutionConfig.mean_evaluations", 2)
         yield
 
@@ -56,7 +71,7 @@ def small_inner_loop():
 @pytest.fixture(scope="module")
 def discovered(tmp_path_factory):
     folder = tmp_path_factory.mktemp("runs") / "cartpole"
-    result = call(*DISCOVER, "--out", folder)
+    result = call(*DISCOVER, "--judge-episodes", "2", "--out", folder)
     assert result.code == 0, result.err
     return folder, result
 
@@ -76,8 +91,11 @@ def bandit_file(tmp_path_factory):
 def test_a_discovery_says_what_its_bandit_is_worth_and_where_it_lies(discovered):
     folder, result = discovered
     lines = result.out.splitlines()
-    assert lines[0].startswith("PPO, sampled hyperparameters, sampled actions, on CartPole-v1: IQM")
-    assert "the most likely actions" in result.out
+    # Every algorithm that fits the action space judges it, whichever trained in the search.
+    text = " ".join(result.out.split())
+    for algorithm in ("PPO", "SAC", "DQN"):
+        assert f"{algorithm} on CartPole-v1: sampled actions IQM " in text
+    assert text.count("; mode actions IQM ") == 3
     path = "".join(lines[-2:]).split("bandit: ")[1]
     assert Path(path) == folder / "Synthetic-CartPole-v1.npz"
     assert "generation 2/2: fitness" in result.err
@@ -93,9 +111,12 @@ def test_a_discovery_leaves_a_bandit_with_its_story(discovered):
     assert metadata["config"]["evaluation_environment"] == "CartPole-v1"
     assert metadata["config"]["started_from"] is None
     assert metadata["seeds"] == {"discovery": 7, "reporting": 10_000}
-    for actions in ("sampled_actions", "mode_actions"):
-        estimate = metadata["results"]["PPO"][actions]
-        assert estimate["n"] == 20 and estimate["low"] <= estimate["value"] <= estimate["high"]
+    assert metadata["results"].keys() == {"PPO", "SAC", "DQN"}
+    for result in metadata["results"].values():
+        for actions in ("sampled_actions", "mode_actions"):
+            estimate = result[actions]
+            assert estimate["n"] == 20
+            assert estimate["low"] <= estimate["value"] <= estimate["high"]
     # 2 generations of 4 candidates with 2 agents each: 16 training steps, 500 evaluation steps at
     # most.
     assert metadata["cost"]["environment_steps_training"] == 2 * 4 * 2 * 16
@@ -104,11 +125,11 @@ def test_a_discovery_leaves_a_bandit_with_its_story(discovered):
     assert {p.name for p in folder.iterdir()} >= {"config.json", "metrics.jsonl", "checkpoints"}
 
 
-def test_a_finished_discovery_is_resumed_to_the_same_bandit(discovered):
-    folder, _ = discovered
+def test_a_finished_discovery_is_resumed_to_the_same_bandit(discovered, tmp_path):
+    folder = Path(shutil.copytree(discovered[0], tmp_path / "copy"))
     before = (folder / "Synthetic-CartPole-v1.npz").read_bytes()
     metrics = (folder / "metrics.jsonl").read_bytes()
-    result = call("discover", "--resume", folder)
+    result = call("discover", "--resume", folder, "--judge-agents", "0")
     assert (result.code, result.err) == (0, "")
     assert (folder / "Synthetic-CartPole-v1.npz").read_bytes() == before
     assert (folder / "metrics.jsonl").read_bytes() == metrics
@@ -127,7 +148,8 @@ def test_a_flag_that_contradicts_the_resumed_run_is_refused(discovered):
 def test_a_discovery_from_a_bandit_tells_where_it_started(discovered, tmp_path):
     folder, _ = discovered
     start = folder / "Synthetic-CartPole-v1.npz"
-    result = call(*DISCOVER, "--from-bandit", start, "--out", tmp_path / "second")
+    out = ["--judge-agents", "0", "--out", tmp_path / "second"]
+    result = call(*DISCOVER, "--from-bandit", start, *out)
     assert result.code == 0, result.err
     origin = json.loads((tmp_path / "second" / "Synthetic-CartPole-v1.json").read_text())
     first = json.loads(start.with_suffix(".json").read_text())
@@ -150,9 +172,135 @@ def test_settings_become_a_configuration_and_what_is_left_out_keeps_its_default(
     assert not discovery_config({"fixed_hyperparameters": True}).sampled_hyperparameters
 
 
+@pytest.fixture
+def asked_for(monkeypatch):
+    """Runs a command as far as the problem, and returns the configuration that it asks for."""
+    seen = []
+
+    def record(config):
+        seen.append(config)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("scb.commands.BanditDiscovery", record)
+
+    def run(*arguments):
+        assert call(*arguments).code == 130
+        return seen.pop()
+
+    return run
+
+
+# Tables "Hyperparameters for meta-training", "Number of generations for each environment" and
+# "Hyperparameters for evaluation length curricula" of Liesen et al. (2024): generations, population
+# size, rollouts, evaluation seeds, mode, curriculum.
+MOUNTAIN_CAR = ("linear", 1000, 200, 200, 600)
+BRAX = ("linear", 100, 1000, 200, 1600)
+PAPER = {
+    "Acrobot-v1": (300, 128, 1, 50, "all", None),
+    "CartPole-v1": (300, 128, 1, 50, "all", None),
+    "MountainCar-v0": (1000, 128, 1, 50, "all", MOUNTAIN_CAR),
+    "MountainCarContinuous-v0": (300, 128, 1, 50, "all", None),
+    "Pendulum-v1": (1000, 64, 8, 50, "all", None),
+    "inverted_pendulum": (300, 256, 1, 16, "sequential", None),
+    "inverted_double_pendulum": (300, 256, 1, 16, "sequential", None),
+    "reacher": (30, 256, 1, 16, "sequential", None),
+    "pusher": (100, 256, 1, 16, "sequential", None),
+    "hopper": (2000, 256, 1, 16, "sequential", BRAX),
+    "walker2d": (2000, 256, 1, 16, "sequential", BRAX),
+    "swimmer": (2000, 256, 1, 16, "sequential", BRAX),
+    "halfcheetah": (2000, 256, 1, 16, "sequential", BRAX),
+    "ant": (2000, 256, 1, 16, "sequential", BRAX),
+}
+
+
+@pytest.mark.parametrize("environment", PAPER)
+def test_the_preset_paper_is_the_papers_tables(asked_for, environment):
+    config = asked_for("discover", "--preset", "paper", "--environment", environment)
+    generations, population, rollouts, episodes, mode, curriculum = PAPER[environment]
+    evolution = config.evolution
+    assert (evolution.num_generations, evolution.population_size) == (generations, population)
+    assert (config.agents_per_candidate, config.evaluation_episodes) == (rollouts, episodes)
+    assert config.mode == mode
+    assert config.curriculum == (None if curriculum is None else CurriculumConfig(*curriculum))
+    # The rows and tables that are the same for all: SNES from 0.05, 64 agents for the mean, the mean
+    # of the returns, 32 tanh units, a normal latent as large as the observation.
+    assert (evolution.strategy, evolution.sigma, evolution.combine) == ("SNES", 0.05, "mean")
+    assert config.bandit == BanditConfig(32, "tanh", "normal", None)
+    assert (config.init, config.start, config.parameterization) == ("random", None, "I")
+    assert config.sampled_hyperparameters and not config.mode_actions
+    # All that fit the action space; Brax's and Pendulum's is continuous.
+    assert config.algorithms == ()
+
+
+def test_single_flags_override_the_preset_paper(asked_for):
+    paper = ["discover", "--preset", "paper", "--environment", "MountainCar-v0"]
+    config = asked_for(
+        *paper, "--generations", "10", "--algorithms", "ppo,DQN", "--mode", "sequential"
+    )
+    assert (config.algorithms, config.mode) == (("ppo", "dqn"), "sequential")
+    assert config.evolution.population_size == 128
+    # A hundredth of the generations: the transition begins at 2 and takes 6.
+    assert config.curriculum == CurriculumConfig("linear", 1000, 200, 2, 6)
+    assert asked_for(*paper, "--curriculum", "none").curriculum is None
+    config = asked_for(*paper, "--curriculum", "cosine:50:100:3:4")
+    assert config.curriculum == CurriculumConfig("cosine", 50, 100, 3, 4)
+
+
+def test_the_preset_quick_trains_ppo_alone_unless_all_are_asked_for(asked_for):
+    assert asked_for("discover").algorithms == ("ppo",)
+    assert asked_for("discover", "--algorithms", "ppo, sac ,ppo").algorithms == (
+        "ppo",
+        "sac",
+        "ppo",
+    )
+    for text in ("all", " All "):
+        assert asked_for("discover", "--algorithms", text).algorithms == ()
+
+
+def test_a_file_gives_the_lists_to_draw_from(asked_for, tmp_path):
+    path = tmp_path / "lists.json"
+    path.write_text('{"ppo": {"learning_rate": [0.25, 1]}, "sac": {"polyak": [0.5]}}')
+    config = asked_for("discover", "--hyperparameters", path)
+    assert config.lists == {"ppo": {"learning_rate": (0.25, 1)}, "sac": {"polyak": (0.5,)}}
+    drawn = BanditDiscovery(config).trainings["ppo"].inner.sample(jax.random.key(0), 2)
+    assert sorted(drawn.learning_rate.tolist()) == [0.25, 1.0]
+
+
+def test_a_synthetic_mdp_is_discovered_and_its_command_asks_for_the_same_again(tmp_path, asked_for):
+    flags = ["--parameterization", "T", "--max-steps", "3", "--mode", "sequential"]
+    flags += ["--algorithms", "ppo,dqn,ppo", "--curriculum", "linear:2:4:0:2", "--mode-actions"]
+    flags += ["--fixed-hyperparameters", "--out", tmp_path / "run"]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("scb.commands.BanditDiscovery", BanditDiscovery)
+        result = call(*DISCOVER, *flags, "--judge-agents", "0")
+    assert result.code == 0, result.err
+    path = tmp_path / "run" / "Synthetic-CartPole-v1.npz"
+    mdp, params = make(str(path))
+    assert (mdp.config.parameterization, params.max_steps_in_episode) == ("T", 3)
+    metadata = json.loads(path.with_suffix(".json").read_text())
+    assert (metadata["kind"], metadata["results"]) == ("synthetic_mdp", {})
+    # 2 generations of 4 candidates: 2 agents, turns of 16 steps, episodes of at most 4.
+    assert metadata["cost"]["environment_steps_training"] == 2 * 4 * 2 * 16
+    assert metadata["cost"]["environment_steps_evaluation"] == 2 * 4 * 2 * 4
+    program, *command = shlex.split(metadata["command"])
+    assert program == "scb"
+    config = asked_for(*command, "--out", tmp_path / "again")
+    assert json.loads(json.dumps(config_dict(config))) == metadata["config"]["discovery"]
+    assert config.mode_actions and not config.sampled_hyperparameters
+
+
 def test_a_refused_discovery_leaves_no_folder_behind(tmp_path):
     # Else the corrected command would be refused too: the folder would not be empty any more.
-    for flag, value in [("environment", "CartPole-v2"), ("from-bandit", "nobody"), ("seed", "-1")]:
+    for flag, value in [
+        ("environment", "CartPole-v2"),
+        ("from-bandit", "nobody"),
+        ("seed", "-1"),
+        ("algorithms", "dqn"),
+        ("expert", "dqn"),
+        ("expert-steps", "0"),
+        ("judge-agents", "-1"),
+        ("curriculum", "linear:1:1000:0:1"),
+    ]:
         assert call("discover", f"--{flag}", value, "--out", tmp_path / "run").code == 2
         assert not (tmp_path / "run").exists()
 
@@ -177,6 +325,14 @@ def test_training_prints_the_sorted_returns_and_their_mean(bandit_file):
     assert call(*train, "--seed", "1").out != result.out
 
 
+@pytest.mark.parametrize("algorithm", ["sac", "dqn", "ddqn"])
+def test_every_fitting_algorithm_trains_in_a_bandit(bandit_file, algorithm):
+    train = ["train", "--bandit", bandit_file, "--agents", "2", "--episodes", "1"]
+    result = call(*train, "--algorithm", algorithm)
+    assert (result.code, result.err) == (0, "")
+    assert result.out.splitlines()[1].endswith("(n=2)")
+
+
 def test_listing_names_every_bandit_of_the_zoo():
     result = call("list")
     assert (result.code, result.err) == (0, "")
@@ -191,6 +347,10 @@ def test_listing_names_every_bandit_of_the_zoo():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
+        ("train --algorithm pop", "unknown algorithm 'pop': did you mean ppo"),
+        ("train --algorithm dqn", "dqn does not fit the environment's continuous actions: use ppo"),
+        ("train --bandit FILE --algorithm td3", "td3 does not fit the environment's discrete act"),
+        ("train --backend spring", "'Pendulum-v1' does not take {'backend': 'spring'}"),
         ("train --bandit Synthetic-Pendulum-v2", "unknown bandit 'Synthetic-Pendulum-v2'"),
         ("train --bandit nowhere.npz", "nowhere.npz does not exist"),
         ("train --agents 0", "agents is 0: give at least 1"),
@@ -217,6 +377,54 @@ def test_listing_names_every_bandit_of_the_zoo():
         ("discover --construction Q", "unknown warm-start construction 'Q': did you mean q"),
         ("discover --combine rank", "unknown combination of tasks 'rank': did you mean ranks"),
         ("discover --from-bandit nobody", "unknown bandit 'nobody'"),
+        ("discover --backend spring", "'Pendulum-v1' does not take {'backend': 'spring'}"),
+        (
+            "discover --environment Pendulum-v1 --algorithms ppo,dqn",
+            "dqn does not fit the environment's continuous actions: use ppo, sac, ddpg, td3",
+        ),
+        (
+            "discover --environment CartPole-v1 --algorithms td3",
+            "td3 does not fit the environment's discrete actions: use ppo, sac, dqn, ddqn",
+        ),
+        ("discover --algorithms pop", "unknown algorithm 'pop': did you mean ppo"),
+        ("discover --algorithms ,", "the list of algorithms is empty: give one or more of ppo"),
+        ("discover --algorithms ''", "the list of algorithms is empty: give one or more of ppo"),
+        (
+            "discover --environment CartPole-v1 --curriculum linear:100:501:0:5",
+            "ends with episodes of 501 steps, but one of CartPole-v1 takes at most 500",
+        ),
+        ("discover --curriculum linear", "the curriculum 'linear' is not understood: give paper"),
+        ("discover --curriculum linear:1:2:3", "'linear:1:2:3' is not understood"),
+        ("discover --curriculum linear:1:2:3:4:5", "'linear:1:2:3:4:5' is not understood"),
+        ("discover --curriculum linear:1.5:2:3:4", "'linear:1.5:2:3:4' is not understood"),
+        ("discover --curriculum linear:a:2:3:4", "'linear:a:2:3:4' is not understood"),
+        ("discover --curriculum ''", "the curriculum '' is not understood"),
+        (
+            "discover --curriculum liner:1:2:3:4",
+            "unknown curriculum shape 'liner': did you mean li",
+        ),
+        ("discover --curriculum linear:0:2:3:4", "the curriculum's initial length is 0"),
+        ("discover --curriculum linear:1:2:-3:4", "the curriculum begins at generation -3"),
+        ("discover --curriculum linear:1:2:3:0", "the curriculum's transition takes 0 generations"),
+        ("discover --mode al", "unknown mode 'al': did you mean all"),
+        ("discover --parameterization IT", "unknown parameterization 'IT': did you mean"),
+        ("discover --parameterization T", "(T) cannot be fitted to an expert: use init random"),
+        ("discover --parameterization TI --init random --max-steps 0", "max_steps is 0"),
+        ("discover --max-steps 5", "max_steps is 5, and parameterization I has episodes of 1 step"),
+        (
+            "discover --parameterization TI --from-bandit Synthetic-Pendulum-v1",
+            "a synthetic MDP cannot start from a bandit",
+        ),
+        ("discover --expert pop", "unknown expert 'pop': did you mean ppo"),
+        ("discover --expert dqn", "dqn does not fit the environment's continuous actions"),
+        ("discover --expert sac --expert-steps 10", "prefill is 1000, which leaves nothing of 10"),
+        ("discover --expert evolution --expert-steps 10", "expert_steps is 10, but evolution"),
+        ("discover --min-spread 1 --construction q", "min_spread is 1.0, which the construction q"),
+        ("discover --min-spread -1", "min_spread is -1.0: it must be 0 or larger, and finite"),
+        ("discover --min-spread nan", "min_spread is nan: it must be 0 or larger, and finite"),
+        ("discover --judge-agents -1", "judge_agents is -1: give 0 for no judgement, or more"),
+        ("discover --judge-episodes 0", "judge_episodes is 0: give at least 1"),
+        ("import-published --directory nowhere", "nowhere does not exist: give the published"),
         ("discover --out FOLDER", "already exists and is not empty"),
         ("discover --out FILE/run", "cannot write to"),
         ("discover --resume FOLDER", "is not a run"),
@@ -230,13 +438,78 @@ def test_a_wrong_input_is_one_sentence_and_exit_code_2(
         "FOLDER", str(bandit_file.parent)
     )
     before = sorted(bandit_file.parent.iterdir())
-    result = call(*arguments.split())
+    refused(shlex.split(arguments), message)
+    assert sorted(bandit_file.parent.iterdir()) == before
+
+
+def refused(arguments, message):
+    result = call(*arguments)
     assert result.code == 2
     assert result.err.startswith("scb: ") and result.err.count("\n") == 1
     assert message in result.err
     assert result.err.rstrip().endswith((".", "?"))
     assert "Traceback" not in result.err and result.out == ""
-    assert sorted(bandit_file.parent.iterdir()) == before
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (None, "cannot read lists.json (No such file or directory): give {"),
+        ("", "lists.json is no JSON (Expecting value"),
+        ("{'ppo': {}}", "lists.json is no JSON ("),
+        (b"\xff\xfe", "lists.json is no JSON ("),
+        ("[1, 2]", "lists.json holds no hyperparameter lists: give {"),
+        ("{}", "lists.json holds no hyperparameter lists"),
+        ('{"ppo": {}}', "lists.json holds no hyperparameter lists"),
+        ('{"ppo": [0.1]}', "lists.json holds no hyperparameter lists"),
+        ('{"pop": {"discount": [0.9]}}', "unknown algorithm 'pop': did you mean ppo"),
+        ('{"ppo": {"lr": [0.1]}}', "unknown hyperparameter 'lr': known are learning_rate"),
+        ('{"ppo": {"discount": []}}', "ppo's discount is [], no list of numbers"),
+        ('{"ppo": {"discount": 0.9}}', "ppo's discount is 0.9, no list of numbers"),
+        ('{"ppo": {"learning_rate": ["fast"]}}', "learning_rate has the value 'fast', which is no"),
+        ('{"ppo": {"discount": [0.9, true]}}', "discount has the value True, which is no number"),
+        ('{"ppo": {"discount": [null]}}', "discount has the value None, which is no number"),
+        ('{"ppo": {"discount": [[0.9]]}}', "discount has the value [0.9], which is no number"),
+        ('{"ppo": {"discount": [NaN]}}', "lists.json is no JSON (NaN is no JSON number)"),
+        ('{"ppo": {"discount": [-Infinity]}}', "is no JSON (-Infinity is no JSON number)"),
+        ('{"ppo": {"discount": [1e999]}}', "discount has the value inf, which is no number"),
+        ('{"ppo": {"discount": [1e39]}}', "discount has the value 1e+39, which is no number"),
+        ('{"sac": {"discount": [0.9]}}', "lists for sac, but the inner loop trains ppo"),
+    ],
+)
+def test_a_wrong_file_of_hyperparameters_is_refused(tmp_path, monkeypatch, content, message):
+    monkeypatch.chdir(tmp_path)
+    path = tmp_path / "lists.json"
+    if content is not None:
+        path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    before = sorted(tmp_path.iterdir())
+    refused(["discover", "--hyperparameters", "lists.json"], message)
+    assert sorted(tmp_path.iterdir()) == before
+
+
+def test_fixed_hyperparameters_and_lists_to_draw_from_contradict_each_other(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "lists.json").write_text('{"ppo": {"discount": [0.9]}}')
+    flags = ["--hyperparameters", "lists.json", "--fixed-hyperparameters"]
+    refused(["discover", *flags], "fixed hyperparameters are not drawn from lists")
+
+
+def test_an_import_of_pickles_is_refused_and_writes_nothing(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "published").mkdir()
+    (tmp_path / "published" / "pendulum.pkl").write_bytes(b"\x80")
+    message = "published holds no .npz file, only pickles, which run code when they are opened"
+    refused(["import-published", "--directory", "published", "--out", "out"], message)
+    (tmp_path / "published" / "pendulum.npz").write_bytes(b"\x80\x05N.")
+    message = "pendulum.npz holds pickled objects, which run code when they are opened"
+    refused(["import-published", "--directory", "published", "--out", "out"], message)
+    assert [path.name for path in tmp_path.iterdir()] == ["published"]
+
+
+@pytest.mark.parametrize("config", ["{}", '{"command": "meta-train", "preset": "paper"}'])
+def test_a_run_of_something_else_is_not_resumed(tmp_path, config):
+    (tmp_path / "config.json").write_text(config)
+    refused(["discover", "--resume", tmp_path], f"cannot resume {tmp_path}: its config differs at")
 
 
 @pytest.mark.parametrize(
