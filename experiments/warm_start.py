@@ -3,7 +3,7 @@
     python -m experiments.warm_start --environment MountainCar-v0
 
 For one expert and one set of states, the bandit is fitted to each construction of the paper's lemma
-(the Q-function, the normalised advantage, -||a - a*||, and that last one on states stretched to
+(the Q-function, the normalised advantage, −‖a − a*‖, and that last one on states stretched to
 unit spread), agents of every algorithm train in it with sampled hyperparameters, and their return in
 the environment itself says which construction trains best. No evolution is involved. Environments
 that --out holds already are kept, so that they can be measured one at a time.
@@ -24,8 +24,8 @@ SEED = 7_000
 ARMS: dict[str, dict[str, Any]] = {
     "Q": {"construction": "q"},
     "normalised advantage": {"construction": "advantage"},
-    "-||a - a*||": {"construction": "action_distance"},
-    "-||a - a*||, stretched states": {"construction": "action_distance", "min_spread": 1.0},
+    "−‖a − a*‖": {"construction": "action_distance"},
+    "−‖a − a*‖, stretched states": {"construction": "action_distance", "min_spread": 1.0},
 }
 
 

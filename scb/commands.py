@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from gymnax.environments import environment as environments
 from rich.console import Console
-from rich.table import Table
+from rich.table import Column, Table
 
 from scb.agents.hyperparameters import ALGORITHMS, algorithms_for, inner_loop
 from scb.artefacts import machine_description
@@ -483,10 +483,9 @@ def list_command() -> None:
     """List the bandits that ship with the library, with what they are worth and what they cost."""
     algorithms = [name.upper() for name in ALGORITHMS if name != "ddqn"]
     table = Table(
-        "bandit",
+        Column("bandit", no_wrap=True),
         *algorithms,
         "minutes",
-        "found with",
         title="IQM of 20 agents with sampled hyperparameters in the environment: most likely actions (sampled)",
     )
     for name in zoo_names():
@@ -496,8 +495,12 @@ def list_command() -> None:
             result = metadata["results"].get(algorithm)
             cells.append("" if result is None else _cell(result))
         minutes = f"{metadata['cost']['seconds'] / 60:.0f}"
-        table.add_row(name, *cells, minutes, metadata["command"])
-    Console().print(table)
+        table.add_row(name, *cells, minutes)
+    console = Console()
+    # A file or a pipe is given the whole table; a terminal what fits into it.
+    console.print(table, width=None if console.is_terminal else 120)
+    for name in zoo_names():
+        print(f"{name}: {bandit_metadata(name)['command']}")
 
 
 def _cell(result: Mapping[str, Any]) -> str:

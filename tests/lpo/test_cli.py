@@ -165,7 +165,7 @@ def test_bandits_and_objectives_do_not_stand_in_for_each_other(
 ):
     assert "is a bandit: give a drift here" in refused("train", "--objective", cartpole_bandit)
     message = refused("train", "--bandit", objective_file, program="scb")
-    assert "is a drift: give a bandit here" in message
+    assert "is a drift: give a bandit or synthetic_mdp here" in message
 
 
 @pytest.mark.parametrize("command", ["certify", "train", "run"])

@@ -19,8 +19,8 @@ from lpo.generalization import (
     training_setting,
 )
 from lpo.objectives import Objective, load_objective
-from scb.agents.settings import Setting
 from scb.agents.ppo import PPOHyperparameters
+from scb.agents.settings import Setting
 from scb.errors import UserError
 
 SEEDS = (7, 8, 9)

@@ -11,8 +11,8 @@ from gymnax.environments import spaces
 from lpo import meta_training
 from lpo.drift import LearnedDrift
 from lpo.meta_training import MetaTraining, MetaTrainingConfig, inner_loop, meta_train
-from scb.agents.settings import environment_setting
 from scb.agents.ppo import PPOConfig
+from scb.agents.settings import environment_setting
 from scb.environments.synthetic import BanditConfig, SyntheticBandit
 from scb.errors import UserError
 from scb.evaluation import Episodes

@@ -9,8 +9,8 @@ import pytest
 
 from lpo import cli, pipeline
 from lpo.objectives import load_objective
-from scb.agents.settings import Setting
 from scb.agents.ppo import PPOConfig, PPOHyperparameters
+from scb.agents.settings import Setting
 
 
 @pytest.fixture(scope="module", autouse=True)
