@@ -103,6 +103,7 @@ def discover_command(
     init: str | None = None,
     expert: str | None = None,
     expert_steps: int | None = None,
+    expert_generations: int | None = None,
     construction: str | None = None,
     min_spread: float | None = None,
     from_bandit: str | None = None,
@@ -148,6 +149,7 @@ def discover_command(
       init: expert (fit the bandit to an expert first, in seconds) or random (as the paper).
       expert: what finds the expert: evolution, ppo, sac, dqn, ddpg, td3, or auto.
       expert_steps: environment steps that each agent trains for to become the expert.
+      expert_generations: of the evolution that finds the expert.
       construction: of the expert fit: action_distance, advantage or q.
       min_spread: stretch entries of the expert's states to at least this standard deviation.
       from_bandit: start from this bandit (a zoo name or file.npz) instead.
@@ -190,6 +192,7 @@ def discover_command(
         "init": init,
         "expert": expert,
         "expert_steps": expert_steps,
+        "expert_generations": expert_generations,
         "construction": construction,
         "min_spread": min_spread,
         "from_bandit": from_bandit,
@@ -344,7 +347,9 @@ def discovery_config(settings: Mapping[str, Any]) -> DiscoveryConfig:
         more["lists"] = read_lists(Path(settings["hyperparameters"]))
     return DiscoveryConfig(
         bandit=BanditConfig(**given("activation", "latent")),
-        warm_start=WarmStartConfig(**given("expert", "expert_steps", "construction", "min_spread")),
+        warm_start=WarmStartConfig(
+            **given("expert", "expert_steps", "expert_generations", "construction", "min_spread")
+        ),
         evolution=evolution,
         curriculum=parse_curriculum(
             settings.get("curriculum"), environment, evolution.num_generations
