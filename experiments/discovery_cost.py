@@ -125,7 +125,7 @@ def _run(folder: Path) -> dict[str, Any] | str:
         if at_target is None
         else dict(zip(("generation", "minutes", "steps", "mean"), at_target, strict=True)),
         "algorithms": algorithms,
-        "statistic": "IQM" if f"final_mean/fitness{_IQM}" in rows[-1] else "mean",
+        "statistic": "IQM" if any(f"mean/fitness{_IQM}" in row for row in rows) else "mean",
         "points": points,
     }
 
@@ -331,7 +331,8 @@ def figure(report: Mapping[str, Any]) -> "Figure":
                 axes.set_xlim(-0.02 * right, right)
                 axes.xaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 2.5, 5, 10]))
             row[1].xaxis.set_major_formatter(EngFormatter(sep=""))
-            row[0].set_ylabel("mean return")
+            statistics = " or ".join(dict.fromkeys(run["statistic"] for run in of_it))
+            row[0].set_ylabel(f"return ({statistics})")
             row[0].set_title(environment)
         grid[-1][0].set_xlabel("minutes")
         grid[-1][1].set_xlabel("environment steps (training + evaluation)")

@@ -185,3 +185,16 @@ def test_the_command_writes_what_it_can_render_again(tmp_path, capsys):
     assert (page.read_text(), image.read_bytes()) == before
     assert discovery_cost.main([str(tmp_path / "nowhere"), *places]) == 2
     assert "not a run" in capsys.readouterr().err
+
+
+def test_the_interquartile_mean_counts_where_it_is_logged(tmp_path):
+    folder = run_folder(tmp_path / "a", "random")
+    lines = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+    lines[0]["mean/fitness_iqm"] = -160.0  # above the target of -170, where the mean is -400
+    (folder / "metrics.jsonl").write_text("\n".join(map(json.dumps, lines)) + "\n")
+    [run] = discovery_cost.collect([folder])["runs"]
+    assert run["points"][0] == [0, 0.0, 0, -160.0]
+    assert run["reached"]["generation"] == 0
+    assert run["statistic"] == "IQM"
+    [other] = discovery_cost.collect([run_folder(tmp_path / "b", "random")])["runs"]
+    assert other["statistic"] == "mean"

@@ -473,7 +473,13 @@ def test_an_expert_start_is_fitted_once_and_from_the_seed_alone(monkeypatch):
     # A resumed run asks again, whatever its key: same weights.
     assert problem.initial_solution(jax.random.key(4)) is start
     report = problem.warm_start_report
-    assert set(report) == {"expert_return", "environment_steps", "reward_r2", "energy_distance"}
+    assert set(report) == {
+        "expert_return",
+        "environment_steps",
+        "seconds",
+        "reward_r2",
+        "energy_distance",
+    }
     # Two experts of two batches of 2 x 8 steps, each judged by 20 episodes of at most 500; 256
     # trajectories of 200 steps, and 16 states with 2 actions of 3 steps.
     assert report["environment_steps"] == 2 * (2 * 16 + 20 * 500) + 256 * 200 + 16 * 2 * 3

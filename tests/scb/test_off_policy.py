@@ -581,7 +581,7 @@ def test_the_values_of_a_probe_are_learned(name, probe):
     expected = expected_values(probe, CASES[name])
     found = values[:, : len(expected)]
     # A parabola falls to -3 at the ends of the action space, where few steps were taken.
-    np.testing.assert_allclose(found, np.broadcast_to(expected, found.shape), atol=0.1, rtol=0.1)
+    np.testing.assert_allclose(found, np.broadcast_to(expected, found.shape), atol=0.15, rtol=0.1)
 
 
 @each_case
