@@ -2,9 +2,9 @@
 
     python -m experiments.zoo_bandit runs/mine/Synthetic-Pendulum-v1.npz --table docs/data/zoo_table.json
 
-Results are those of `experiments.zoo_table` for exactly these weights; nothing is edited by hand. A
-new bandit enters without results first, `zoo_table` measures the zoo, and the same command again
-fills them in.
+Results are those of `experiments.zoo_table` for exactly these weights, else those that `scb discover`
+measured at its end; nothing is edited by hand. A new bandit enters with what it has, `zoo_table`
+measures the zoo, and the same command again fills the table's results in.
 """
 
 import argparse
@@ -53,7 +53,7 @@ def main() -> int:
         bandit = load_bandit(path)
         metadata = dict(bandit_metadata(str(path)))
         # The weights' bytes decide the checksum, so that it stays the same in every folder.
-        metadata["results"] = results_of(table, metadata["sha256"])
+        metadata["results"] = results_of(table, metadata["sha256"]) or metadata["results"]
         for own in ("schema_version", "name", "versions", "sha256", "kind"):
             metadata.pop(own)
         weights = bandit.default_params.weights

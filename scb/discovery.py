@@ -206,6 +206,11 @@ class BanditDiscovery:
         if not config.algorithms:
             config = replace(config, algorithms=algorithms_for(space))
         check_algorithms(config.algorithms, space)
+        if config.mode == "all" and len(set(config.algorithms)) < len(config.algorithms):
+            raise UserError(
+                f"an algorithm stands twice in {', '.join(config.algorithms)}: name each once, or use the mode "
+                "sequential, where it then has two turns."
+            )
         unused = [name for name in config.lists if name not in config.algorithms]
         if len(unused) == len(config.lists) > 0:
             raise UserError(

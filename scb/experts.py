@@ -17,9 +17,8 @@ from flax import linen as nn
 from gymnax.environments import environment, spaces
 
 from scb.agents import networks
-from scb.agents.agent import clip_to_space
+from scb.agents.agent import clip_to_space, scale_to_space
 from scb.agents.normalization import RunningStatistics, normalize, update_statistics
-from scb.agents.sac import action_bounds
 from scb.agents.settings import Setting
 from scb.curriculum import CurriculumConfig, horizon, with_limit
 from scb.evaluation import evaluate
@@ -140,8 +139,7 @@ class _PolicySearch:
             outputs: Any = self.network.apply(weights, normalize(self.statistics, observation))
             if isinstance(self.space, spaces.Discrete):
                 return jnp.argmax(outputs, axis=-1)
-            low, high = action_bounds(self.space)
-            return clip_to_space(low + (outputs + 1.0) * 0.5 * (high - low), self.space)
+            return clip_to_space(scale_to_space(outputs, self.space), self.space)
 
         return act
 

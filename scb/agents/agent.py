@@ -151,3 +151,12 @@ def clip_to_space(action: jax.Array, space: spaces.Box | spaces.Discrete) -> jax
     if isinstance(space, spaces.Discrete):
         return action
     return jnp.clip(jnp.reshape(action, space.shape), space.low, space.high)
+
+
+def scale_to_space(squashed: jax.Array, space: spaces.Box) -> jax.Array:
+    """[..., A] in [-1, 1] -> [..., A] between the bounds of the flattened action."""
+    low, high = (
+        jnp.ravel(jnp.broadcast_to(jnp.asarray(bound, jnp.float32), space.shape))
+        for bound in (space.low, space.high)
+    )
+    return low + (squashed + 1.0) * 0.5 * (high - low)

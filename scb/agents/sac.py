@@ -14,6 +14,7 @@ from gymnax.environments import spaces
 from jax.typing import ArrayLike
 
 from scb.agents import networks
+from scb.agents.agent import scale_to_space
 from scb.agents.off_policy import (
     OffPolicyAgent,
     OffPolicyConfig,
@@ -132,12 +133,7 @@ class SAC(OffPolicyAgent):
             action: jax.Array = outputs.mode() if mode else outputs.sample(seed=key)
             return action
         squashed = jnp.tanh(outputs[0]) if mode else _sample(key, *outputs)[0]
-        return self._scale(squashed, env_params)
-
-    def _scale(self, squashed: jax.Array, env_params: Any) -> jax.Array:
-        """[..., A] in [-1, 1] -> within the action space's bounds, flattened."""
-        low, high = action_bounds(self.env.action_space(env_params))
-        return low + (squashed + 1.0) * 0.5 * (high - low)
+        return scale_to_space(squashed, self.env.action_space(env_params))
 
     def learn(
         self,
@@ -165,7 +161,7 @@ class SAC(OffPolicyAgent):
                 entropy = outputs.entropy()
                 return jnp.sum(outputs.probs * q, axis=-1) + temperature * entropy, entropy
             squashed, log_prob = _sample(key, *outputs)
-            action = self._scale(squashed, env_params)
+            action = scale_to_space(squashed, self.env.action_space(env_params))
             q = critics.apply(critic_params, observation, action).min(axis=0)
             return q - temperature * log_prob, -log_prob
 
@@ -216,14 +212,6 @@ class SAC(OffPolicyAgent):
     ) -> SACLearner:
         targets = polyak_average(learner.targets, learner.params["critics"], hyperparameters.polyak)
         return SACLearner(learner.params, targets, learner.optimizer)
-
-
-def action_bounds(space: spaces.Box) -> tuple[jax.Array, jax.Array]:
-    """[A] lower and upper bounds of the flattened action."""
-    return (
-        jnp.ravel(jnp.broadcast_to(jnp.asarray(space.low, jnp.float32), space.shape)),
-        jnp.ravel(jnp.broadcast_to(jnp.asarray(space.high, jnp.float32), space.shape)),
-    )
 
 
 def _sample(key: jax.Array, mean: jax.Array, std: jax.Array) -> tuple[jax.Array, jax.Array]:

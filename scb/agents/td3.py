@@ -12,6 +12,7 @@ from flax import struct
 from jax.typing import ArrayLike
 
 from scb.agents import networks
+from scb.agents.agent import scale_to_space
 from scb.agents.off_policy import (
     OffPolicyAgent,
     OffPolicyConfig,
@@ -21,7 +22,6 @@ from scb.agents.off_policy import (
     require_discrete,
     target_values,
 )
-from scb.agents.sac import action_bounds
 from scb.errors import UserError
 
 
@@ -115,10 +115,6 @@ class TD3(OffPolicyAgent):
             optimizer={name: optimizer.init(p) for name, p in params.items()},
         )
 
-    def _scale(self, squashed: jax.Array, env_params: Any) -> jax.Array:
-        low, high = action_bounds(self.env.action_space(env_params))
-        return low + (squashed + 1.0) * 0.5 * (high - low)
-
     def explore(
         self,
         learner: TD3Learner,
@@ -131,7 +127,9 @@ class TD3(OffPolicyAgent):
         policy, _ = self._networks(env_params)
         squashed = policy.apply(learner.params["policy"], observation)
         noise = hyperparameters.exploration_noise * jax.random.normal(key, squashed.shape)
-        return self._scale(jnp.clip(squashed + noise, -1.0, 1.0), env_params)
+        return scale_to_space(
+            jnp.clip(squashed + noise, -1.0, 1.0), self.env.action_space(env_params)
+        )
 
     def greedy(
         self,
@@ -142,7 +140,8 @@ class TD3(OffPolicyAgent):
         mode: bool,
     ) -> jax.Array:
         policy, _ = self._networks(env_params)
-        return self._scale(policy.apply(learner.params["policy"], observation), env_params)
+        squashed = policy.apply(learner.params["policy"], observation)
+        return scale_to_space(squashed, self.env.action_space(env_params))
 
     def learn(
         self,
@@ -154,6 +153,7 @@ class TD3(OffPolicyAgent):
         env_params: Any,
     ) -> TD3Learner:
         policy, critics = self._networks(env_params)
+        space = self.env.action_space(env_params)
         params, optimizer_state = dict(learner.params), dict(learner.optimizer)
         optimizer = _optimizer(hyperparameters)
         action = jnp.reshape(batch.action, (-1, policy.action_size))
@@ -165,7 +165,7 @@ class TD3(OffPolicyAgent):
             limit = jnp.asarray(hyperparameters.target_noise_clip)
             noise = hyperparameters.target_noise * jax.random.normal(key, squashed.shape)
             squashed = jnp.clip(squashed + jnp.clip(noise, -limit, limit), -1.0, 1.0)
-            next_action = self._scale(squashed, env_params)
+            next_action = scale_to_space(squashed, space)
             next_q = critics.apply(learner.targets["critics"], batch.next_observation, next_action)
             target = target_values(batch, next_q.min(axis=0), hyperparameters.discount)
 
@@ -179,7 +179,7 @@ class TD3(OffPolicyAgent):
         )
 
         def policy_loss(policy_params: Any) -> jax.Array:
-            chosen = self._scale(policy.apply(policy_params, batch.observation), env_params)
+            chosen = scale_to_space(policy.apply(policy_params, batch.observation), space)
             return -jnp.mean(critics.apply(params["critics"], batch.observation, chosen)[0])
 
         def update_policy(carry: tuple[Any, Any]) -> tuple[Any, Any]:

@@ -589,6 +589,7 @@ def test_the_inner_loop_is_the_papers_where_no_agent_is_given():
         ({"max_steps": 5}, "max_steps is 5, and parameterization I has episodes of 1 step"),
         ({"algorithms": ("ppo", "ddpg")}, "ddpg does not fit the environment's discrete actions"),
         ({"algorithms": ("pop",)}, "unknown algorithm 'pop': did you mean ppo"),
+        ({"algorithms": ("ppo", "ppo")}, "an algorithm stands twice in ppo, ppo: name each once"),
         (
             {"init": "expert", "warm_start": WarmStartConfig(expert="td3")},
             "td3 does not fit the environment's discrete actions",

@@ -580,8 +580,11 @@ def test_the_values_of_a_probe_are_learned(name, probe):
     values, _, _ = probe_agents(name)[probe]
     expected = expected_values(probe, CASES[name])
     found = values[:, : len(expected)]
-    # A parabola falls to -3 at the ends of the action space, where few steps were taken.
-    np.testing.assert_allclose(found, np.broadcast_to(expected, found.shape), atol=0.15, rtol=0.1)
+    # A parabola falls to -3 at the ends of the action space, where few steps are taken.
+    atol = 0.1 if probe in STATE_VALUES or CASES[name].discrete else 0.2
+    np.testing.assert_allclose(
+        found, np.broadcast_to(expected, found.shape), atol=atol, rtol=atol / 2
+    )
 
 
 @each_case

@@ -1,0 +1,32 @@
+"""The table of the warm-start study says what the report says."""
+
+import json
+
+from experiments import warm_start
+
+
+def report(values):
+    arms = {}
+    for arm, value in zip(warm_start.ARMS, values, strict=True):
+        iqm = {"value": value, "low": value - 10, "high": value + 10, "n": 16}
+        arms[arm] = {"fit": {}, "fit_seconds": 1.0, "ppo": {"mode_actions": {"iqm": iqm}}}
+    return {"environments": {"MountainCar-v0": {"expert_return": -97.0, "returns": arms}}}
+
+
+def test_the_best_construction_is_in_bold():
+    row = warm_start.markdown(report([-190.0, -146.0, -125.0, -166.0])).splitlines()[-1]
+    cells = [cell.strip() for cell in row.strip("|").split("|")]
+    assert cells[:2] == ["MountainCar-v0 (−97)", "PPO"]
+    assert cells[2:] == [
+        "−190 [−200, −180]",
+        "−146 [−156, −136]",
+        "**−125 [−135, −115]**",
+        "−166 [−176, −156]",
+    ]
+
+
+def test_the_committed_table_is_that_of_the_committed_report():
+    with open("docs/data/warm_start.json") as file:
+        table = warm_start.markdown(json.load(file))
+    with open("docs/results.md") as file:
+        assert table in file.read()
