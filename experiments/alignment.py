@@ -43,7 +43,7 @@ def main() -> int:
 
     from lpo.drift import ClipDrift, DPODrift, Drift, NoDrift
     from lpo.generalization import learning_curves
-    from lpo.meta_training import MetaTraining, MetaTrainingConfig
+    from lpo.meta_training import MetaTrainingConfig, TaskTraining
     from lpo.objectives import Objective
     from scb.artefacts import machine_description, package_versions
     from scb.evolution import map_population
@@ -72,7 +72,9 @@ def main() -> int:
         for name, drift in family.items():
             # MetaTraining takes any member of the contract: the known drifts stand in for a
             # candidate.
-            problem = MetaTraining(MetaTrainingConfig(drift=drift, **regime))  # type: ignore[arg-type]
+            problem = TaskTraining(
+                MetaTrainingConfig(drift=drift, **regime), "Synthetic-Pendulum-v1"
+            )  # type: ignore[arg-type]
             train = map_population(
                 lambda key, p=problem, w=parameters[name]: p.train_one(w, key),
                 arguments.agents,

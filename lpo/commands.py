@@ -37,6 +37,9 @@ META_TRAINING_PRESETS: dict[str, dict[str, Any]] = {
     "paper": {"population_size": 64, "generations": 512},
 }
 
+# A temporally-aware drift meets trainings from a quarter to twice as long as the setting's own.
+TEMPORAL_HORIZONS = (0.25, 0.5, 1.0, 2.0)
+
 
 def seed_list(count: int, first: int) -> list[int]:
     """`count` consecutive seeds; a UserError where there are none or one is negative."""
@@ -83,6 +86,7 @@ def run(
 
 def meta_train_command(
     environment: str | None = None,
+    tasks: str | None = None,
     preset: str | None = None,
     seed: int | None = None,
     out: Path = Path("runs/meta-train"),
@@ -90,6 +94,9 @@ def meta_train_command(
     fitness: str | None = None,
     reward_noise: float | None = None,
     base: str | None = None,
+    temporal: bool = False,
+    horizons: str | None = None,
+    combine: str | None = None,
     strategy: str | None = None,
     population_size: int | None = None,
     generations: int | None = None,
@@ -105,6 +112,7 @@ def meta_train_command(
 
     Args:
       environment: where the inner loop trains: Synthetic-Pendulum-v1, Pendulum-v1, hopper, ...
+      tasks: several of them at once, separated by commas; observations and actions may differ.
       preset: quick (30 generations of 32) or paper (512 of 64); single flags override it.
       seed: decides everything.
       out: folder to write; must be new or empty.
@@ -116,6 +124,12 @@ def meta_train_command(
       reward_noise: noise on the bandit's reward, in its standard deviations. Without it the drift
         overfits the bandit.
       base: ppo (the network corrects PPO's clip) or none.
+      temporal: let the drift change over an agent's training; inner agents then train for random
+        numbers of updates.
+      horizons: how long inner agents train, as fractions of the setting's number of updates, such
+        as 0.25,0.5,1; one is drawn for each generation. With --temporal 0.25,0.5,1,2 if left out.
+      combine: how a candidate's agents and tasks count: mean, or ranks (the mean over them of its
+        rank among the candidates; the default for several tasks).
       strategy: any of evosax's, by name (Open_ES, SNES, CMA_ES, ...).
       population_size: candidates a generation.
       generations: how many.
@@ -131,10 +145,14 @@ def meta_train_command(
         {
             "command": "meta-train",
             "environment": environment,
+            "tasks": tasks,
             "seed": seed,
             "fitness": fitness,
             "reward_noise": reward_noise,
             "base": base,
+            "temporal": temporal or None,
+            "horizons": horizons,
+            "combine": combine,
             "strategy": strategy,
             "population_size": population_size,
             "generations": generations,
@@ -163,7 +181,7 @@ def meta_train_command(
     figures.save(
         figures.meta_training_curve(
             outcome.metrics,
-            config.environment,
+            ", ".join(config.tasks),
             config.fitness,
             config.evolution.population_size,
             config.evolution.mean_evaluations,
@@ -184,28 +202,40 @@ def meta_training_config(settings: Mapping[str, Any]) -> MetaTrainingConfig:
         }
 
     default = MetaTrainingConfig()
+    if settings.get("environment") and settings.get("tasks"):
+        raise UserError(
+            f"the environment {settings['environment']} and the tasks {settings['tasks']} are both given: name all "
+            "in the tasks."
+        )
+    tasks = _listed(settings.get("tasks") or settings.get("environment"), "tasks") or default.tasks
+    horizons = _numbers(settings.get("horizons"), "horizons")
+    if settings.get("temporal") and not horizons:
+        horizons = TEMPORAL_HORIZONS
     evolution = EvolutionConfig(
         **{
             "strategy": default.evolution.strategy,
             "sigma": default.evolution.sigma,
             "learning_rate": default.evolution.learning_rate,
             "mean_evaluations": default.evolution.mean_evaluations,
+            "combine": "mean" if len(tasks) == 1 else "ranks",
             **given(
                 strategy="strategy",
                 population_size="population_size",
                 num_generations="generations",
                 sigma="sigma",
                 learning_rate="learning_rate",
+                combine="combine",
                 seed="seed",
             ),
         }
     )
-    drift = LearnedDrift(**given(base="base"))
+    drift = LearnedDrift(**given(base="base", temporal="temporal"))
     return MetaTrainingConfig(
+        tasks=tasks,
         drift=drift,
+        horizons=horizons,
         evolution=evolution,
         **given(
-            environment="environment",
             fitness="fitness",
             reward_noise="reward_noise",
             agents_per_candidate="agents_per_candidate",
@@ -214,6 +244,23 @@ def meta_training_config(settings: Mapping[str, Any]) -> MetaTrainingConfig:
             backend="backend",
         ),
     )
+
+
+def _listed(text: str | None, what: str) -> tuple[str, ...]:
+    """The names in "a,b"; none for None."""
+    names = tuple(name.strip() for name in (text or "").split(",") if name.strip())
+    if text is not None and not names:
+        raise UserError(f"the list of {what} is empty: give one or more, separated by commas.")
+    return names
+
+
+def _numbers(text: str | None, what: str) -> tuple[float, ...]:
+    try:
+        return tuple(float(x) for x in _listed(text, what))
+    except ValueError as error:
+        raise UserError(
+            f"{what} {text!r} are no numbers: give them separated by commas, such as 0.25,0.5,1."
+        ) from error
 
 
 def train(

@@ -31,6 +31,9 @@ FEATURES = (
     "A log r",
     "A(log r)^2",
 )
+# A temporally-aware drift sees every feature a second time, scaled by the fraction of training done
+# (Jackson et al., 2024). A fraction as an input of its own would not vanish at ratio 1.
+TEMPORAL_FEATURES = (*FEATURES, *(f"n/N {feature}" for feature in FEATURES))
 
 
 @runtime_checkable
@@ -132,12 +135,15 @@ class LearnedDrift:
       hidden_size: of the one tanh layer.
       clip: epsilon of the PPO base.
       xi: half-width of the dead zone, in units of the penalty; the original code has 1e-4.
+      temporal: whether the features come a second time scaled by the fraction of training done, so
+        that the drift can change while an agent learns (Jackson et al., 2024, TA-LPO).
     """
 
     base: Base = "ppo"
     hidden_size: int = 128
     clip: float = 0.2
     xi: float = 1e-6
+    temporal: bool = False
 
     def __post_init__(self) -> None:
         if self.base not in BASES:
@@ -147,8 +153,13 @@ class LearnedDrift:
         if not (self.clip > 0 and self.xi > 0):
             raise UserError(f"clip and xi are {self.clip} and {self.xi}: both must be positive.")
 
+    @property
+    def features(self) -> tuple[str, ...]:
+        """Names of the network's inputs, in their order."""
+        return TEMPORAL_FEATURES if self.temporal else FEATURES
+
     def weight_shapes(self) -> dict[str, tuple[int, ...]]:
-        return {"hidden": (len(FEATURES), self.hidden_size), "output": (self.hidden_size, 1)}
+        return {"hidden": (len(self.features), self.hidden_size), "output": (self.hidden_size, 1)}
 
     def init(self, key: jax.Array) -> dict[str, jax.Array]:
         """Flax's default initialisation, never zeros.
@@ -169,6 +180,8 @@ class LearnedDrift:
     ) -> jax.Array:
         chex.assert_equal_shape([log_ratio, advantage, progress])
         inputs = drift_features(log_ratio, advantage)
+        if self.temporal:
+            inputs = jnp.concatenate([inputs, progress[..., None] * inputs], axis=-1)
         penalty = (jnp.tanh(inputs @ parameters["hidden"]) @ parameters["output"])[..., 0]
         if self.base == "ppo":
             penalty = penalty + clipped_surrogate_drift(self.clip, log_ratio, advantage, progress)

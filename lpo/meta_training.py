@@ -15,10 +15,12 @@ from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
+from jax.typing import ArrayLike
 
 from lpo.drift import LearnedDrift
 from scb.agents.ppo import PPO, PPOConfig, PPOState
 from scb.agents.settings import environment_setting
+from scb.environments.brax import BRAX_NAMES
 from scb.environments.registry import make
 from scb.environments.synthetic import SyntheticBandit
 from scb.environments.zoo import home_of
@@ -35,8 +37,8 @@ class MetaTrainingConfig:
     """What to learn an objective on, and how.
 
     Attributes:
-      environment: where the inner loop trains: a bandit ("Synthetic-Pendulum-v1"), or any
-        environment.
+      tasks: where the inner loop trains: bandits ("Synthetic-Pendulum-v1"), or any environments.
+        Of several, whose returns have different scales, `evolution.combine` says how they count.
       drift: the learned drift's family.
       initial_scale: factor on the output layer's random start, so that the search begins near the
         base.
@@ -44,6 +46,9 @@ class MetaTrainingConfig:
         the mean of that over the training; "transfer": in the bandit's evaluation environment.
       agent: PPO's static configuration; None takes `inner_loop(environment, contexts)`.
       contexts: size of a batch on a bandit.
+      horizons: how long inner agents train, as fractions of the setting's number of updates; one is
+        drawn for each generation. Empty: always in full. A temporally-aware drift learns here that
+        the fraction of training done is what matters.
       learning_rates, entropy_coefficients: values that an inner agent's are drawn from; where
         empty, those of the (evaluation) environment's own setting.
       reward_noise: standard deviation of the noise on a bandit's reward, in standard deviations of
@@ -57,12 +62,13 @@ class MetaTrainingConfig:
       evolution: the outer loop's.
     """
 
-    environment: str = "Synthetic-Pendulum-v1"
+    tasks: tuple[str, ...] = ("Synthetic-Pendulum-v1",)
     drift: LearnedDrift = field(default_factory=LearnedDrift)
     initial_scale: float = 0.1
     fitness: Fitness = "return"
     agent: PPOConfig | None = None
     contexts: int = 200
+    horizons: tuple[float, ...] = ()
     learning_rates: tuple[float, ...] = ()
     entropy_coefficients: tuple[float, ...] = ()
     reward_noise: float = 5.0
@@ -79,11 +85,29 @@ class MetaTrainingConfig:
     def __post_init__(self) -> None:
         if self.fitness not in FITNESSES:
             raise unknown_name("fitness", self.fitness, FITNESSES)
-        if self.fitness == "transfer" and home_of(self.environment) is None:
+        if not self.tasks:
+            raise UserError("the list of tasks is empty: give at least one bandit or environment.")
+        for name in self.tasks:
+            if self.tasks.count(name) > 1:
+                raise UserError(f"the task {name} is there twice: give each once.")
+            if self.fitness == "transfer" and home_of(name) is None:
+                raise UserError(
+                    f"fitness 'transfer' asks for a bandit, and {name!r} is none: use 'return' or 'area', or "
+                    f"train on 'Synthetic-{name}'."
+                )
+        if self.agent is not None and len(self.tasks) > 1:
             raise UserError(
-                f"fitness 'transfer' asks for a bandit, and {self.environment!r} is none: use 'return' or 'area', or "
-                f"train on 'Synthetic-{self.environment}'."
+                "one agent configuration does not fit several tasks: leave it out, and each takes its own."
             )
+        if self.horizons and self.fitness == "area":
+            raise UserError(
+                "fitness 'area' needs trainings of one length: leave out the horizons, or use 'return'."
+            )
+        for horizon in self.horizons:
+            if not 0 < horizon < math.inf:
+                raise UserError(
+                    f"a horizon is {horizon}: it must be larger than 0, and finite (1 is the setting's own)."
+                )
         for name in ("agents_per_candidate", "evaluation_episodes", "contexts"):
             value = getattr(self, name)
             if value is not None and value < 1:
@@ -114,21 +138,31 @@ def inner_loop(environment: str, contexts: int) -> PPOConfig:
     )
 
 
-class MetaTraining:
-    """The evolution problem: a candidate is a drift's weights."""
+class TaskTraining:
+    """Trains one PPO agent with a drift in one task's environment and says what it is worth.
 
-    def __init__(self, config: MetaTrainingConfig) -> None:
-        self.config = config
-        self.home = home_of(config.environment) or config.environment
-        physics = {} if config.backend is None else {"backend": config.backend}
+    Args:
+      config: the meta-training's.
+      environment: the task, one of the configuration's.
+    """
+
+    def __init__(self, config: MetaTrainingConfig, environment: str) -> None:
+        self.config, self.environment = config, environment
+        self.home = home_of(environment) or environment
+
+        def physics(name: str) -> dict[str, str]:
+            # Of several tasks only Brax's have a choice; a single one is told where it has none.
+            elsewhere = len(config.tasks) > 1 and name not in BRAX_NAMES
+            return {} if config.backend is None or elsewhere else {"backend": config.backend}
+
         if config.fitness == "transfer":
             # The bandit has no physics; the environment that it stands for may.
-            self.env, self.env_params = make(config.environment)
-            self.evaluation_env, self.evaluation_params = make(self.home, **physics)
+            self.env, self.env_params = make(environment)
+            self.evaluation_env, self.evaluation_params = make(self.home, **physics(self.home))
         else:
-            self.env, self.env_params = make(config.environment, **physics)
+            self.env, self.env_params = make(environment, **physics(environment))
             self.evaluation_env, self.evaluation_params = self.env, self.env_params
-        self.agent_config = config.agent or inner_loop(config.environment, config.contexts)
+        self.agent_config = config.agent or inner_loop(environment, config.contexts)
         self.agent = PPO(self.env, self.agent_config, config.drift)
         one_step = isinstance(self.evaluation_env, SyntheticBandit)
         self.evaluation_episodes = config.evaluation_episodes or (50 if one_step else 20)
@@ -138,23 +172,14 @@ class MetaTraining:
             self.training_params = self.env_params.replace(reward_noise=config.reward_noise * scale)
         self.base_hyperparameters = environment_setting(self.home).hyperparameters
 
-    def initial_solution(self, key: jax.Array) -> dict[str, jax.Array]:
-        weights = self.config.drift.init(key)
-        return {**weights, "output": weights["output"] * self.config.initial_scale}
+    def train_one(
+        self, drift_parameters: Any, key: jax.Array, horizon: ArrayLike = 1.0
+    ) -> jax.Array:
+        """[] fitness of one agent that was trained with these drift parameters.
 
-    def evaluate(
-        self, candidate: Any, key: jax.Array, generation: jax.Array
-    ) -> dict[str, jax.Array]:
-        fitness = jax.vmap(lambda k: self.train_one(candidate, k))(
-            jax.random.split(key, self.config.agents_per_candidate)
-        )
-        return {"fitness": fitness}
-
-    def evaluate_mean(self, candidate: Any, key: jax.Array) -> dict[str, jax.Array]:
-        return {"fitness": self.train_one(candidate, key)}
-
-    def train_one(self, drift_parameters: Any, key: jax.Array) -> jax.Array:
-        """[] fitness of one agent that was trained with these drift parameters."""
+        Args:
+          horizon: how long it trains, as a fraction of the inner loop's iterations; traced.
+        """
         config = self.config
         key_rate, key_entropy, key_train, key_evaluate = jax.random.split(key, 4)
         hyperparameters = replace(self.base_hyperparameters, drift=drift_parameters)
@@ -180,7 +205,16 @@ class MetaTraining:
                 key_train, hyperparameters, self.training_params, judge, every=self._area_every
             )
             return returns[1:].mean()
-        state = self.agent.train(key_train, hyperparameters, self.training_params)
+        if not config.horizons:
+            state = self.agent.train(key_train, hyperparameters, self.training_params)
+            return judge(state, key_evaluate)
+        iterations = jnp.round(jnp.asarray(horizon) * self.agent_config.num_iterations)
+        iterations = jnp.maximum(1, iterations.astype(jnp.int32))
+        hyperparameters = replace(hyperparameters, horizon=iterations)
+        state = self.agent.init(key_train, hyperparameters, self.training_params)
+        state = self.agent.train_iterations(
+            state, hyperparameters, self.training_params, iterations
+        )
         return judge(state, key_evaluate)
 
     @property
@@ -190,16 +224,66 @@ class MetaTraining:
         return next(n for n in range(max(1, iterations // 5), 0, -1) if iterations % n == 0)
 
     def steps(self) -> EnvironmentSteps:
-        points = 1
-        if self.config.fitness == "area":
+        """Of one candidate; with random horizons the mean over them."""
+        config, points = self.config, 1
+        if config.fitness == "area":
             points = self.agent_config.num_iterations // self._area_every + 1
-        agents = self.config.agents_per_candidate
+        agents = config.agents_per_candidate
+        share = sum(config.horizons) / len(config.horizons) if config.horizons else 1.0
+        training = self.agent_config.num_iterations * self.agent_config.batch_size
         return EnvironmentSteps(
-            training=agents * self.agent_config.num_iterations * self.agent_config.batch_size,
+            training=round(agents * training * share),
             evaluation=agents
             * points
             * self.evaluation_episodes
             * int(self.evaluation_params.max_steps_in_episode),
+        )
+
+
+class MetaTraining:
+    """The evolution problem: a candidate is a drift's weights, worth what agents make of it on every task."""
+
+    def __init__(self, config: MetaTrainingConfig) -> None:
+        self.config = config
+        self.tasks = {name: TaskTraining(config, name) for name in config.tasks}
+
+    def initial_solution(self, key: jax.Array) -> dict[str, jax.Array]:
+        weights = self.config.drift.init(key)
+        return {**weights, "output": weights["output"] * self.config.initial_scale}
+
+    def evaluate(
+        self, candidate: Any, key: jax.Array, generation: jax.Array
+    ) -> dict[str, jax.Array]:
+        config = self.config
+        horizon: Any = 1.0
+        if config.horizons:
+            # One for the whole generation: candidates are compared on it, and no agent waits for
+            # another.
+            key_horizon = jax.random.fold_in(key, len(config.tasks))
+            horizon = jax.random.choice(key_horizon, jnp.asarray(config.horizons))
+        fitness = {
+            name: jax.vmap(lambda k, task=task: task.train_one(candidate, k, horizon))(
+                jax.random.split(
+                    key if i == 0 else jax.random.fold_in(key, i), config.agents_per_candidate
+                )
+            )
+            for i, (name, task) in enumerate(self.tasks.items())
+        }
+        apart = {} if len(fitness) == 1 else {f"fitness/{n}": x.mean() for n, x in fitness.items()}
+        return {"fitness": jnp.concatenate(list(fitness.values())), **apart}
+
+    def evaluate_mean(self, candidate: Any, key: jax.Array) -> dict[str, jax.Array]:
+        fitness = {
+            name: task.train_one(candidate, key if i == 0 else jax.random.fold_in(key, i))
+            for i, (name, task) in enumerate(self.tasks.items())
+        }
+        apart = {} if len(fitness) == 1 else {f"fitness/{n}": x for n, x in fitness.items()}
+        return {"fitness": jnp.stack(list(fitness.values())).mean(), **apart}
+
+    def steps(self) -> EnvironmentSteps:
+        counts = [task.steps() for task in self.tasks.values()]
+        return EnvironmentSteps(
+            training=sum(c.training for c in counts), evaluation=sum(c.evaluation for c in counts)
         )
 
 

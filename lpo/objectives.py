@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 
 from lpo.certificate import Certificate, certify
-from lpo.drift import FEATURES, ClipDrift, DPODrift, Drift, LearnedDrift, NoDrift
+from lpo.drift import TEMPORAL_FEATURES, ClipDrift, DPODrift, Drift, LearnedDrift, NoDrift
 from scb import artefacts
 from scb.errors import UserError, unknown_name
 
@@ -86,6 +86,7 @@ def _from_file(path: Path) -> Objective:
             hidden_size=family["hidden_size"],
             clip=family["clip"],
             xi=family["xi"],
+            temporal=features == TEMPORAL_FEATURES,
         )
     except KeyError as error:
         raise UserError(
@@ -95,10 +96,10 @@ def _from_file(path: Path) -> Objective:
         raise UserError(
             f"{path} does not describe a drift: its .json garbles config entry 'drift' ({error})."
         ) from error
-    if features != FEATURES:
+    if features != drift.features:
         raise UserError(
             f"{path} was learned on other features ({', '.join(map(str, features))}) than this version computes "
-            f"({', '.join(FEATURES)}): use the version that made it."
+            f"({', '.join(drift.features)}): use the version that made it."
         )
     artefacts.expect_shapes(artefact, drift.weight_shapes())
     parameters = jax.tree.map(jnp.asarray, dict(artefact.arrays))
@@ -122,7 +123,7 @@ def save_objective(
         "hidden_size": drift.hidden_size,
         "clip": drift.clip,
         "xi": drift.xi,
-        "features": list(FEATURES),
+        "features": list(drift.features),
     }
     full = {
         **metadata,

@@ -95,7 +95,8 @@ def run_pipeline(run: Run, settings: Mapping[str, Any], command: str) -> Path:
     meta: dict[str, Any] = {}
     if settings["objective"] is None:
         console.print(
-            f"[1/3] learning an objective on {config.environment}: {config.evolution.num_generations} generations of "
+            f"[1/3] learning an objective on {', '.join(config.tasks)}: "
+            f"{config.evolution.num_generations} generations of "
             f"{config.evolution.population_size}"
         )
         objective, meta = _learn(run, config, settings, command)
@@ -141,7 +142,8 @@ def check_settings(settings: Mapping[str, Any]) -> None:
     for evaluation in settings["evaluations"]:
         check_seeds(reporting_seeds(settings["seed"], evaluation["seeds"]))
     if settings["objective"] is None:
-        make(config.environment)
+        for name in config.tasks:
+            make(name)
     else:
         _with_references(load_objective(settings["objective"]))
 
@@ -190,7 +192,7 @@ def _learn(
     steps = problem.steps()
     on_environment = environment_problem(config).steps()
     meta = {
-        "environment": config.environment,
+        "environment": ", ".join(config.tasks),
         "fitness": config.fitness,
         "config": _plain(config),
         "seconds": round(run.seconds(), 1),
@@ -208,9 +210,9 @@ def _learn(
 
 
 def environment_problem(config: MetaTrainingConfig) -> MetaTraining:
-    """The same meta-training on the bandit's evaluation environment itself."""
-    name = home_of(config.environment) or config.environment
-    return MetaTraining(replace(config, environment=name, fitness="return", agent=None))
+    """The same meta-training on the bandits' evaluation environments themselves."""
+    homes = tuple(home_of(name) or name for name in config.tasks)
+    return MetaTraining(replace(config, tasks=homes, fitness="return", agent=None))
 
 
 def meta_training_artefact(
@@ -227,9 +229,10 @@ def meta_training_artefact(
         if key in ("mean/fitness", "final_mean/fitness")
     ]
     config = {"meta_training": _plain(problem.config), "settings": dict(settings)}
-    if isinstance(problem.env, SyntheticBandit):
+    bandits = [n for n, task in problem.tasks.items() if isinstance(task.env, SyntheticBandit)]
+    if bandits:
         # The name alone does not say which weights it stood for.
-        config["bandit_sha256"] = bandit_metadata(problem.config.environment)["sha256"]
+        config["bandit_sha256"] = {name: bandit_metadata(name)["sha256"] for name in bandits}
     return {
         "config": config,
         "seeds": {"meta_training": evolution.seed},
@@ -295,7 +298,7 @@ def _figures(
     if meta:
         drawn["meta_training"] = figures.meta_training_curve(
             meta["metrics"],
-            config.environment,
+            ", ".join(config.tasks),
             config.fitness,
             config.evolution.population_size,
             config.evolution.mean_evaluations,

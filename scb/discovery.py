@@ -5,6 +5,7 @@ hyperparameters drawn from the paper's lists so that the bandit suits any of the
 their return in the evaluation environment. The same search finds the paper's fully synthetic MDPs.
 """
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -72,6 +73,8 @@ class DiscoveryConfig:
       curriculum: of the evaluation episodes' length; None for the environment's own throughout.
       init: "random", or "expert" for the warm start.
       start: a bandit (name or file) whose weights to start from instead.
+      reward_scale: factor on the reward of the weights that the search starts from. Agents that
+        normalise advantages are indifferent to it; SAC, whose temperature starts at 1, is not.
       warm_start: its configuration.
       evolution: the outer loop's.
     """
@@ -92,6 +95,7 @@ class DiscoveryConfig:
     curriculum: CurriculumConfig | None = None
     init: str = "expert"
     start: str | None = None
+    reward_scale: float = 1.0
     warm_start: WarmStartConfig = field(default_factory=WarmStartConfig)
     evolution: EvolutionConfig = field(default_factory=lambda: EvolutionConfig(combine="ranks"))
 
@@ -111,6 +115,10 @@ class DiscoveryConfig:
         if self.lists and not self.sampled_hyperparameters:
             raise UserError(
                 "fixed hyperparameters are not drawn from lists: leave out the lists, or draw."
+            )
+        if not 0 < self.reward_scale < math.inf:
+            raise UserError(
+                f"reward_scale is {self.reward_scale}: it must be larger than 0, and finite."
             )
         for name in ("agents_per_candidate", "evaluation_episodes"):
             if getattr(self, name) < 1:
@@ -263,10 +271,12 @@ class BanditDiscovery:
 
     def initial_solution(self, key: jax.Array) -> Weights:
         if self._start is not None:
-            return self._start
-        if self.config.init == "random":
-            return self.bandit.init_weights(key)
-        return self._expert_fit
+            weights = self._start
+        elif self.config.init == "random":
+            weights = self.bandit.init_weights(key)
+        else:
+            weights = self._expert_fit
+        return scale_reward(weights, self.config.reward_scale)
 
     @cached_property
     def _expert_fit(self) -> Weights:
@@ -358,6 +368,15 @@ class BanditDiscovery:
             training=agents * training,
             evaluation=agents * evaluations * config.evaluation_episodes * limit,
         )
+
+
+def scale_reward(weights: Weights, factor: float) -> Weights:
+    """The same synthetic environment with every mean reward multiplied by `factor`."""
+    # The network's last layer, which is linear.
+    reward = dict(weights["reward"])
+    last = max(reward)
+    reward[last] = jax.tree.map(lambda x: x * factor, reward[last])
+    return {**weights, "reward": reward}
 
 
 def check_fits(

@@ -56,9 +56,20 @@ class Agent(ABC):
         return self.train_iterations(state, hyperparameters, env_params, self.config.num_iterations)
 
     def train_iterations(
-        self, state: Any, hyperparameters: Any, env_params: Any, num_iterations: int
+        self, state: Any, hyperparameters: Any, env_params: Any, num_iterations: int | jax.Array
     ) -> Any:
-        """`num_iterations` times: collect, then learn. A segment of a longer training."""
+        """`num_iterations` times: collect, then learn. A segment of a longer training.
+
+        A traced number makes one program for all lengths; where a population shares it, only as many
+        iterations are computed.
+        """
+        if isinstance(num_iterations, jax.Array):
+            return jax.lax.fori_loop(
+                0,
+                num_iterations,
+                lambda _, state: self.iterate(state, hyperparameters, env_params),
+                state,
+            )
 
         def iteration(state: Any, _: None) -> tuple[Any, None]:
             return self.iterate(state, hyperparameters, env_params), None

@@ -106,6 +106,8 @@ class PPOHyperparameters:
     """What is only a number: traced, and so vmapped over a population. Defaults are the paper's underlined values.
 
     `drift` holds the drift's parameters, whatever pytree it takes; for PPO itself the clip epsilon.
+    `horizon` is the number of iterations that the fraction of training done refers to; the
+    configuration's where None.
     """
 
     learning_rate: ArrayLike = 5e-3
@@ -115,6 +117,7 @@ class PPOHyperparameters:
     value_coefficient: ArrayLike = 0.5
     max_grad_norm: ArrayLike = 10.0
     drift: Any = 0.2
+    horizon: ArrayLike | None = None
 
 
 @struct.dataclass
@@ -352,7 +355,8 @@ class PPO(Agent):
         config = self.config
         policy, value = self._networks(env_params)
         batch = batch._replace(observation=self._inputs(state, batch.observation))
-        progress = state.iteration / config.num_iterations
+        horizon = hyperparameters.horizon
+        progress = state.iteration / (config.num_iterations if horizon is None else horizon)
         fraction_left = 1.0 - progress if config.anneal_learning_rate else 1.0
         optimizer = _optimizer(hyperparameters)
 

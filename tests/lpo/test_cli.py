@@ -581,7 +581,7 @@ def test_flags_of_meta_train_reach_the_configuration():
     }
     config = commands.meta_training_config(flags)
     evolution = config.evolution
-    assert (config.environment, config.fitness) == ("Pendulum-v1", "area")
+    assert (config.tasks, config.fitness) == (("Pendulum-v1",), "area")
     assert (config.reward_noise, config.drift.base, config.contexts) == (1.5, "none", 40)
     assert (config.agents_per_candidate, config.evaluation_episodes) == (3, 8)
     assert (config.backend, evolution.strategy, evolution.seed) == ("spring", "SNES", 9)

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+from lpo.certificate import certify
 from lpo.drift import (
     BASES,
     FEATURES,
@@ -302,3 +303,41 @@ def test_a_drift_refuses_numbers_that_make_none(make_drift, message):
     with pytest.raises(UserError) as error:
         make_drift()
     assert message in str(error.value)
+
+
+# -- temporal awareness ---------------------------------------------------------------------------
+
+
+def test_a_temporal_drift_is_another_one_at_another_fraction_of_training(batch_of_ratios):
+    log_ratio, advantage = batch_of_ratios
+    drift = LearnedDrift(base="none", hidden_size=HIDDEN, temporal=True)
+    assert len(drift.features) == 16
+    weights = drift.init(jax.random.key(0))
+    assert weights["hidden"].shape == (16, HIDDEN)
+    plain = LearnedDrift(base="none", hidden_size=HIDDEN)
+    first, second = weights["hidden"][:8], weights["hidden"][8:]
+    for fraction in (0.0, 0.25, 1.0):
+        # (x, f x) [W1; W2] = x (W1 + f W2): a plain drift whose weights move with training.
+        moved = {"hidden": first + fraction * second, "output": weights["output"]}
+        progress = jnp.full_like(log_ratio, fraction)
+        np.testing.assert_allclose(
+            drift(weights, log_ratio, advantage, progress),
+            plain(moved, log_ratio, advantage, progress),
+            rtol=1e-4,
+            atol=1e-5,
+        )
+    early, late = (
+        drift(weights, log_ratio, advantage, jnp.full_like(log_ratio, f)) for f in (0.0, 1.0)
+    )
+    assert float(jnp.abs(early - late).max()) > 0.01
+
+
+def test_a_temporal_drift_is_certified():
+    drift = LearnedDrift(hidden_size=HIDDEN, temporal=True)
+    assert certify(drift, drift.init(jax.random.key(0)), 51, 11).holds
+
+
+@pytest.fixture
+def batch_of_ratios():
+    key_ratio, key_advantage = jax.random.split(jax.random.key(5))
+    return jax.random.normal(key_ratio, (64,)), 2.0 * jax.random.normal(key_advantage, (64,))

@@ -10,7 +10,13 @@ from gymnax.environments import spaces
 
 from lpo import meta_training
 from lpo.drift import LearnedDrift
-from lpo.meta_training import MetaTraining, MetaTrainingConfig, inner_loop, meta_train
+from lpo.meta_training import (
+    MetaTraining,
+    MetaTrainingConfig,
+    TaskTraining,
+    inner_loop,
+    meta_train,
+)
 from scb.agents.ppo import PPOConfig
 from scb.agents.settings import environment_setting
 from scb.environments.synthetic import BanditConfig, SyntheticBandit
@@ -18,6 +24,7 @@ from scb.errors import UserError
 from scb.evaluation import Episodes
 from scb.evolution import EvolutionConfig
 
+PENDULUM = "Synthetic-Pendulum-v1"
 EVOLUTION = EvolutionConfig(
     strategy="Open_ES", population_size=2, num_generations=2, mean_evaluations=2, seed=1
 )
@@ -26,7 +33,7 @@ EVOLUTION = EvolutionConfig(
 @pytest.fixture(scope="module")
 def config(tiny_agent, tiny_drift) -> MetaTrainingConfig:
     return MetaTrainingConfig(
-        environment="Synthetic-Pendulum-v1",
+        tasks=("Synthetic-Pendulum-v1",),
         drift=tiny_drift,
         fitness="return",
         agent=tiny_agent,
@@ -91,7 +98,7 @@ def test_the_same_code_trains_on_the_environment_itself(config):
     agent = PPOConfig(
         num_envs=2, num_steps=10, num_epochs=2, num_minibatches=1, total_steps=20, hidden_sizes=(4,)
     )
-    values = check_run(replace(config, environment="Pendulum-v1", agent=agent))
+    values = check_run(replace(config, tasks=("Pendulum-v1",), agent=agent))
     assert WORST_PENDULUM_RETURN < min(values) <= max(values) < -100
 
 
@@ -100,7 +107,7 @@ def test_area_is_the_mean_over_the_training_without_the_untrained_agent(config):
         def train_with_evaluations(self, *arguments, every):
             return None, jnp.array([100.0, 1.0, 2.0, 6.0])
 
-    problem = MetaTraining(replace(config, fitness="area", reward_noise=0.0))
+    problem = TaskTraining(replace(config, fitness="area", reward_noise=0.0), PENDULUM)
     problem.agent = Recorded()
     # (1 + 2 + 6) / 3 = 3, and 27.25 with the untrained agent's 100.
     assert float(problem.train_one({}, jax.random.key(0))) == 3.0
@@ -131,7 +138,7 @@ def test_the_inner_loop_on_a_bandit_keeps_the_number_of_updates():
 @pytest.mark.parametrize("environment", ["Synthetic-Pendulum-v1", "Pendulum-v1"])
 def test_hyperparameters_are_the_evaluation_environments_own(config, environment):
     # An objective is learned under the learning rate under which it will be used.
-    problem = MetaTraining(replace(config, environment=environment, reward_noise=0.0))
+    problem = TaskTraining(replace(config, reward_noise=0.0), environment)
     assert problem.base_hyperparameters == environment_setting("Pendulum-v1").hyperparameters
 
 
@@ -147,7 +154,7 @@ def test_inner_agents_draw_from_the_lists_or_take_the_settings_own(config):
             return Episodes(jnp.array([total]), jnp.array([1]))
 
     def worth(**lists):
-        problem = MetaTraining(replace(config, reward_noise=0.0, **lists))
+        problem = TaskTraining(replace(config, reward_noise=0.0, **lists), PENDULUM)
         problem.agent = Echo()
         return jax.vmap(lambda key: problem.train_one({}, key))(
             jax.random.split(jax.random.key(0), 50)
@@ -174,8 +181,8 @@ def test_inner_agents_draw_from_the_lists_or_take_the_settings_own(config):
         # Left open, it is 50 episodes of one step, or 20 of more: 3 x 50 x 1 and 3 x 20 x 200.
         ({"fitness": "return", "evaluation_episodes": None}, 72, 150),
         ({"fitness": "transfer", "evaluation_episodes": None}, 72, 12_000),
-        ({"environment": "Pendulum-v1", "fitness": "return"}, 72, 3000),
-        ({"environment": "Pendulum-v1", "fitness": "area"}, 72, 12_000),
+        ({"tasks": ("Pendulum-v1",), "fitness": "return"}, 72, 3000),
+        ({"tasks": ("Pendulum-v1",), "fitness": "area"}, 72, 12_000),
         # Pendulum's image on the bandit: 3 agents x 15 batches of 50.
         ({"fitness": "return", "agent": None, "contexts": 50}, 2250, 15),
         # A fifth of 15 batches is 3, which divides them: 5 points and the start, 3 x 6 x 5.
@@ -196,6 +203,98 @@ def test_area_of_a_training_with_a_prime_number_of_batches_has_equal_distances(c
     assert problem.steps().evaluation == 14 * 2
 
 
+# -- several tasks -------------------------------------------------------------------------------
+
+
+class Worth:
+    """A task whose agents are worth what its number says, whatever trains them."""
+
+    def __init__(self, number: float) -> None:
+        self.number = number
+
+    def train_one(self, candidate, key, horizon=1.0):
+        return candidate["output"].sum() * self.number + 0.0 * jax.random.uniform(key)
+
+
+def test_every_task_gives_its_own_entries_of_fitness(config):
+    problem = MetaTraining(replace(config, tasks=(PENDULUM, "Pendulum-v1"), agent=None))
+    assert [task.env.name for task in problem.tasks.values()] == [PENDULUM, "Pendulum-v1"]
+    problem.tasks = {"a": Worth(1.0), "b": Worth(-100.0)}
+    problem.config = replace(config, agents_per_candidate=3)
+    candidate = {"output": jnp.full((2, 1), 2.0)}
+    result = problem.evaluate(candidate, jax.random.key(0), jnp.int32(0))
+    assert result["fitness"].tolist() == [4.0] * 3 + [-400.0] * 3
+    assert (float(result["fitness/a"]), float(result["fitness/b"])) == (4.0, -400.0)
+    judged = problem.evaluate_mean(candidate, jax.random.key(0))
+    assert {name: float(x) for name, x in judged.items()} == {
+        "fitness": -198.0,
+        "fitness/a": 4.0,
+        "fitness/b": -400.0,
+    }
+
+
+def test_tasks_of_other_shapes_learn_one_objective(config):
+    # Three observations and a torque, four observations and two actions; ranks, since a pendulum
+    # earns thousands below zero and a pole one a step.
+    tasks = (PENDULUM, "Synthetic-CartPole-v1")
+    evolution = replace(EVOLUTION, combine="ranks")
+    several = replace(config, tasks=tasks, agent=None, contexts=20, evolution=evolution)
+    outcome = meta_train(several, quiet=True)
+    line = outcome.metrics[-1]
+    assert {f"candidates/fitness/{task}" for task in tasks} <= set(line)
+    assert {f"final_mean/fitness/{task}" for task in tasks} <= set(line)
+    alone = [MetaTraining(replace(several, tasks=(task,))).steps() for task in tasks]
+    assert MetaTraining(several).steps().total == sum(steps.total for steps in alone)
+    # Two generations of two candidates.
+    assert line["steps/total"] == 4 * sum(steps.total for steps in alone)
+
+
+# -- horizons ------------------------------------------------------------------------------------
+
+
+def test_inner_agents_train_for_the_horizon_and_know_how_far_they_are(config):
+    seen = []
+
+    def watch(parameters, log_ratio, advantage, progress):
+        jax.debug.callback(lambda p: seen.append(float(p)), progress[0])
+        return jnp.zeros_like(log_ratio)
+
+    task = TaskTraining(replace(config, horizons=(0.5, 1.0, 2.0), reward_noise=0.0), PENDULUM)
+    task.agent = replace(task.agent, drift=watch)
+    hyperparameters = task.base_hyperparameters
+    for horizon, fractions in (
+        (1 / 3, {0.0}),  # one batch of three
+        (1.0, {0.0, 1 / 3, 2 / 3}),
+        (2.0, {0.0, 1 / 6, 2 / 6, 3 / 6, 4 / 6, 5 / 6}),
+    ):
+        seen.clear()
+        jax.block_until_ready(jax.jit(task.train_one)(0.0, jax.random.key(0), horizon))
+        jax.effects_barrier()
+        assert set(np.round(seen, 5)) == set(np.round(list(fractions), 5))
+    assert hyperparameters.horizon is None
+
+
+def test_a_generation_has_one_horizon_and_generations_differ(config):
+    problem = MetaTraining(replace(config, horizons=(0.5, 1.0, 2.0), agents_per_candidate=3))
+
+    class Echo:
+        def train_one(self, candidate, key, horizon=1.0):
+            return horizon
+
+    problem.tasks = {"a": Echo()}
+    drawn = [
+        problem.evaluate({}, jax.random.key(i), jnp.int32(i))["fitness"].tolist() for i in range(20)
+    ]
+    assert all(len(set(generation)) == 1 for generation in drawn)
+    assert {generation[0] for generation in drawn} == {0.5, 1.0, 2.0}
+
+
+def test_steps_with_horizons_are_their_mean(config):
+    # Three batches of eight, half, all or twice of them: 24 x 3.5 / 3.
+    steps = MetaTraining(replace(config, horizons=(0.5, 1.0, 2.0), reward_noise=0.0)).steps()
+    assert (steps.training, steps.evaluation) == (28, 2)
+
+
 # -- reward noise -------------------------------------------------------------------------------
 
 
@@ -214,7 +313,7 @@ def test_reward_noise_is_given_in_the_bandits_own_standard_deviations(config, mo
         monkeypatch.setattr(
             meta_training, "make", lambda name, b=scaled, **_: (b, b.default_params)
         )
-        problem = MetaTraining(replace(config, reward_noise=5.0))
+        problem = TaskTraining(replace(config, reward_noise=5.0), PENDULUM)
         noise[factor] = float(problem.training_params.reward_noise)
         assert problem.evaluation_params.reward_noise == 0.0
     # 4000 samples know a standard deviation to about 1 / sqrt(2 * 4000) = 1 %.
@@ -229,7 +328,7 @@ def test_reward_noise_enters_training_and_not_evaluation(config):
     keys = jax.random.split(jax.random.key(0), 16)
     start = config.drift.init(jax.random.key(1))
     with_noise, without = (
-        jax.jit(jax.vmap(MetaTraining(c).train_one, (None, 0)))(start, keys)
+        jax.jit(jax.vmap(TaskTraining(c, PENDULUM).train_one, (None, 0)))(start, keys)
         for c in (
             replace(config, learning_rates=(0.0, 0.1), reward_noise=noise) for noise in (5.0, 0.0)
         )
@@ -239,7 +338,7 @@ def test_reward_noise_enters_training_and_not_evaluation(config):
 
 
 def test_environments_take_no_reward_noise(config):
-    problem = MetaTraining(replace(config, environment="Pendulum-v1", reward_noise=5.0))
+    problem = TaskTraining(replace(config, reward_noise=5.0), "Pendulum-v1")
     assert problem.training_params is problem.env_params
 
 
@@ -264,7 +363,7 @@ def test_physics_go_to_the_environment_and_not_to_its_bandit(
         return bandit(), bandit().default_params
 
     monkeypatch.setattr(meta_training, "make", record)
-    MetaTraining(replace(config, environment=environment, fitness=fitness, backend="x"))
+    MetaTraining(replace(config, tasks=(environment,), fitness=fitness, backend="x"))
     assert calls == made
 
 
@@ -276,9 +375,20 @@ def test_physics_go_to_the_environment_and_not_to_its_bandit(
     [
         ({"fitness": "retrun"}, "unknown fitness 'retrun': did you mean return"),
         (
-            {"environment": "Pendulum-v1", "fitness": "transfer"},
+            {"tasks": ("Pendulum-v1",), "fitness": "transfer"},
             "fitness 'transfer' asks for a bandit, and 'Pendulum-v1' is none: use 'return' or "
             "'area', or train on 'Synthetic-Pendulum-v1'.",
+        ),
+        ({"tasks": ()}, "the list of tasks is empty: give at least one bandit or environment."),
+        ({"tasks": ("a", "b", "a")}, "the task a is there twice: give each once."),
+        (
+            {"tasks": ("a", "b"), "agent": PPOConfig()},
+            "one agent configuration does not fit several tasks",
+        ),
+        ({"horizons": (0.5, 0.0)}, "a horizon is 0.0: it must be larger than 0"),
+        (
+            {"horizons": (0.5,), "fitness": "area"},
+            "fitness 'area' needs trainings of one length: leave out the horizons",
         ),
         ({"agents_per_candidate": 0}, "agents_per_candidate is 0: it must be at least 1."),
         ({"evaluation_episodes": -1}, "evaluation_episodes is -1: it must be at least 1."),
@@ -297,8 +407,8 @@ def test_a_configuration_that_cannot_be_is_refused(arguments, message, one_sente
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"environment": "Synthetic-Pendulm-v1"}, "did you mean Synthetic-Pendulum-v1"),
-        ({"environment": "Pendulum-v1", "backend": "spring"}, "does not take {'backend': 'spring'"),
+        ({"tasks": ("Synthetic-Pendulm-v1",)}, "did you mean Synthetic-Pendulum-v1"),
+        ({"tasks": ("Pendulum-v1",), "backend": "spring"}, "does not take {'backend': 'spring'"),
     ],
 )
 def test_an_environment_that_cannot_be_is_refused(config, changes, message, one_sentence):
@@ -310,5 +420,5 @@ def test_an_environment_that_cannot_be_is_refused(config, changes, message, one_
 def test_defaults_take_a_bandit_with_noise():
     # What the library recommends: documentation and the shipped objective rest on it.
     default = MetaTrainingConfig()
-    assert (default.environment, default.reward_noise) == ("Synthetic-Pendulum-v1", 5.0)
+    assert (default.tasks, default.reward_noise) == (("Synthetic-Pendulum-v1",), 5.0)
     assert (default.drift, default.evolution.strategy) == (LearnedDrift(base="ppo"), "Open_ES")

@@ -241,3 +241,13 @@ def test_an_objective_of_the_zoo_says_how_it_was_made(name):
     assert metadata["command"]
     assert metadata["cost"]["environment_steps_training"] > 0
     assert metadata["results"]
+
+
+def test_a_temporal_objective_comes_back_as_one(tmp_path):
+    drift = LearnedDrift(hidden_size=4, temporal=True)
+    parameters = drift.init(jax.random.key(0))
+    path, certificate = save_objective(tmp_path / "late.npz", drift, parameters, METADATA)
+    loaded = load_objective(path)
+    assert loaded.drift == drift
+    assert certificate.holds
+    np.testing.assert_array_equal(loaded.parameters["hidden"], parameters["hidden"])

@@ -499,6 +499,23 @@ def test_a_discovery_starts_from_a_bandit_in_a_file(tmp_path):
     np.testing.assert_array_equal(flat(start), flat(weights))
 
 
+@pytest.mark.parametrize("factor", [0.5, 8.0])
+def test_the_start_can_be_scaled(factor):
+    plain, scaled = (
+        BanditDiscovery(replace(CONFIG, reward_scale=f)).initial_solution(jax.random.key(1))
+        for f in (1.0, factor)
+    )
+    bandit = bandit_for(*make("CartPole-v1"), BanditConfig(4), "Synthetic-CartPole-v1")
+    observations = jax.random.normal(jax.random.key(2), (20, 4))
+    rewards = [
+        jax.vmap(bandit.mean_reward, (0, None, None))(observations, 1, bandit.params(weights))
+        for weights in (plain, scaled)
+    ]
+    np.testing.assert_allclose(rewards[1], factor * rewards[0], rtol=1e-5)
+    for a, b in zip(*(jax.tree.leaves(w["initial_state"]) for w in (plain, scaled)), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
 @pytest.mark.parametrize(
     ("environment", "size", "message"),
     [
@@ -582,6 +599,8 @@ def test_the_inner_loop_is_the_papers_where_no_agent_is_given():
             "unknown environment 'Pendulum-v2': did you mean Pendulum",
         ),
         ({"start": "Synthetic-Pendulum"}, "unknown bandit 'Synthetic-Pendulum'"),
+        ({"reward_scale": 0.0}, "reward_scale is 0.0: it must be larger than 0, and finite."),
+        ({"reward_scale": float("inf")}, "reward_scale is inf: it must be larger than 0"),
         ({"mode": "al"}, "unknown mode 'al': did you mean all"),
         ({"parameterization": "IT"}, "unknown parameterization 'IT': did you mean"),
         ({"parameterization": "T", "init": "expert"}, "cannot be fitted to an expert: use init ra"),
