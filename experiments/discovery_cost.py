@@ -105,7 +105,10 @@ def _run(folder: Path) -> dict[str, Any] | str:
     evolution = config.get("evolution", config)
     return {
         "name": folder.resolve().name,
-        "environment": environment,
+        # Brax with its physics, without which its return says nothing.
+        "environment": f"{environment} ({config['backend']})"
+        if config.get("backend")
+        else environment,
         "start": start,
         "seed": evolution.get("seed") or 0,
         "settings": {name: config.get(name, evolution.get(name)) for name in SETTINGS},
@@ -171,7 +174,7 @@ def _lines(path: Path) -> list[dict[str, Any]]:
 
 
 def _place(run: Mapping[str, Any]) -> tuple[Any, ...]:
-    name = run["environment"]
+    name = run["environment"].split(" (")[0]
     rank = ENVIRONMENTS.index(name) if name in ENVIRONMENTS else len(ENVIRONMENTS)
     return (rank, name, STARTS.index(run["start"]), run["seed"], run["name"])
 

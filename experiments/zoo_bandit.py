@@ -15,11 +15,11 @@ from pathlib import Path
 from typing import Any
 
 
-def results_of(table: Mapping[str, Any], sha256: str) -> dict[str, Any]:
-    """{"PPO": {...}, ...} of the bandit with this checksum; empty where the table doesn't hold it."""
+def results_of(table: Mapping[str, Any], sha256: str, backend: str | None = None) -> dict[str, Any]:
+    """{"PPO": {...}, ...} of the bandit with this checksum, in its physics; empty where the table has none."""
     results = {}
     for entry in table.get("entries", []):
-        if entry["sha256"] != sha256 or entry["bandit"] != "ours":
+        if (entry["sha256"], entry["bandit"], entry["backend"]) != (sha256, "ours", backend):
             continue
         result: dict[str, Any] = {
             "agents": entry["agents"],
@@ -53,7 +53,8 @@ def main() -> int:
         bandit = load_bandit(path)
         metadata = dict(bandit_metadata(str(path)))
         # The weights' bytes decide the checksum, so that it stays the same in every folder.
-        metadata["results"] = results_of(table, metadata["sha256"]) or metadata["results"]
+        backend = metadata["config"].get("backend")
+        metadata["results"] = results_of(table, metadata["sha256"], backend) or metadata["results"]
         for own in ("schema_version", "name", "versions", "sha256", "kind"):
             metadata.pop(own)
         weights = bandit.default_params.weights

@@ -281,10 +281,10 @@ def differences(entries: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
 
     protocol = ("agents", "episodes", "seed", "backend", "inner_loop")
     rows = []
-    for (environment, algorithm), pair in _pairs(entries).items():
+    for (name, algorithm), pair in _pairs(entries).items():
         if len(pair) < 2 or any(pair["ours"].get(x) != pair["published"].get(x) for x in protocol):
             continue
-        row: dict[str, Any] = {"environment": environment, "algorithm": algorithm}
+        row: dict[str, Any] = {"environment": name, "algorithm": algorithm}
         for actions in ACTIONS:
             both = [pair[kind][actions] for kind in BANDITS]
             if all(x["iqm"] is not None for x in both):
@@ -297,11 +297,17 @@ def differences(entries: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
 def _pairs(
     entries: Sequence[Mapping[str, Any]],
 ) -> dict[tuple[str, str], dict[str, Mapping[str, Any]]]:
-    """{(environment, algorithm): {"ours": entry, "published": entry}}, in the table's order."""
+    """{(label, algorithm): {"ours": entry, "published": entry}}, in the table's order."""
     pairs: dict[tuple[str, str], dict[str, Mapping[str, Any]]] = {}
     for entry in sorted(entries, key=_place):
-        pairs.setdefault((entry["environment"], entry["algorithm"]), {})[entry["bandit"]] = entry
+        pairs.setdefault((label(entry), entry["algorithm"]), {})[entry["bandit"]] = entry
     return pairs
+
+
+def label(entry: Mapping[str, Any]) -> str:
+    """The environment, and for Brax its physics: one bandit can be measured in several."""
+    physics = entry["backend"]
+    return entry["environment"] if physics is None else f"{entry['environment']} ({physics})"
 
 
 def _environment_rank(name: str) -> tuple[int, str]:
@@ -311,6 +317,7 @@ def _environment_rank(name: str) -> tuple[int, str]:
 def _place(entry: Mapping[str, Any]) -> tuple[Any, ...]:
     return (
         _environment_rank(entry["environment"]),
+        entry["backend"] or "",
         BANDITS.index(entry["bandit"]),
         ALGORITHMS.index(entry["algorithm"]),
     )
@@ -344,18 +351,22 @@ def markdown(report: Mapping[str, Any]) -> str:
         "| published, sampled | paper | target |",
         "| --- | --- | --- | --- | --- | --- | --- | --- |",
     ]
-    for (environment, algorithm), pair in _pairs(entries).items():
+    for (name, algorithm), pair in _pairs(entries).items():
+        entry = next(iter(pair.values()))
+        environment = entry["environment"]
         cells = [
             _cell(pair[kind][actions]["iqm"]) if kind in pair else ""
             for kind in BANDITS
             for actions in ACTIONS
         ]
         paper = PAPER.get(environment, {}).get(algorithm)
+        if entry["backend"] not in (None, "generalized"):
+            paper = None  # theirs are of the generalized physics
         target = _target_cell(environment, pair.get("ours"))
         cells += ["" if paper is None else _number(paper), target]
-        lines.append(f"| {environment} | {algorithm.upper()} | {' | '.join(cells)} |")
+        lines.append(f"| {name} | {algorithm.upper()} | {' | '.join(cells)} |")
     failed = [
-        f"{entry['algorithm'].upper()} on {entry['environment']} ({entry['bandit']}, {ACTIONS[actions]}): "
+        f"{entry['algorithm'].upper()} on {label(entry)} ({entry['bandit']}, {ACTIONS[actions]}): "
         f"{entry[actions]['failed']} of {entry['agents']}"
         for entry in entries
         for actions in ACTIONS
@@ -505,7 +516,7 @@ def figure(report: Mapping[str, Any]) -> "Figure":
                         markersize=6,
                         linestyle="",
                     )
-            expert = PAPER_EXPERT.get(environment)
+            expert = _paper_expert(environment)
             if expert is not None:
                 axes.axvline(expert, color=figures.BLACK, linewidth=1.4, linestyle=":")
             axes.set_yticks(range(len(algorithms)), [a.upper() for a in algorithms])
@@ -534,7 +545,7 @@ def figure(report: Mapping[str, Any]) -> "Figure":
             for actions in ACTIONS
         ]
         names = [f"{kind}, {text}" for kind in kinds for text in ACTIONS.values()]
-        if any(environment in PAPER_EXPERT for environment in environments):
+        if any(_paper_expert(environment) is not None for environment in environments):
             handles.append(Line2D([], [], color=figures.BLACK, linewidth=1.4, linestyle=":"))
             names.append("SAC trained on the environment (paper)")
         agents = " or ".join(str(n) for n in sorted({entry["agents"] for entry in entries}))
@@ -546,13 +557,17 @@ def figure(report: Mapping[str, Any]) -> "Figure":
     return drawn
 
 
+def _paper_expert(name: str) -> float | None:
+    """By label; the paper's Brax has the generalized physics."""
+    return PAPER_EXPERT.get(name.removesuffix(" (generalized)"))
+
+
 def _panel_title(environment: str, entries: Sequence[Mapping[str, Any]]) -> str:
-    of_it = [entry for entry in entries if entry["environment"] == environment]
-    physics = {entry["backend"] for entry in of_it} - {None}
-    if not physics:
+    of_it = [entry for entry in entries if label(entry) == environment]
+    if of_it[0]["backend"] is None:
         return environment
     episodes = " or ".join(str(n) for n in sorted({entry["episodes"] for entry in of_it}))
-    return f"{environment} ({' or '.join(sorted(physics))}, {episodes} episodes)"
+    return f"{environment.removesuffix(')')}, {episodes} episodes)"
 
 
 def render(report: Mapping[str, Any], docs: Path) -> None:

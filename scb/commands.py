@@ -107,7 +107,7 @@ def discover_command(
     construction: str | None = None,
     min_spread: float | None = None,
     from_bandit: str | None = None,
-    reward_scale: float | None = None,
+    reward_std: float | None = None,
     strategy: str | None = None,
     population_size: int | None = None,
     generations: int | None = None,
@@ -154,8 +154,8 @@ def discover_command(
       construction: of the expert fit: action_distance, advantage or q.
       min_spread: stretch entries of the expert's states to at least this standard deviation.
       from_bandit: start from this bandit (a zoo name or file.npz) instead.
-      reward_scale: factor on the reward that the search starts from; SAC, whose temperature starts
-        at 1, explores less and learns sooner where it is larger.
+      reward_std: scale the reward that the search starts from to this standard deviation, and shift
+        it to mean zero: of use to SAC, whose temperature starts at 1.
       strategy: any of evosax's, by name (SNES, Open_ES, ...).
       population_size: candidates a generation.
       generations: how many.
@@ -199,7 +199,7 @@ def discover_command(
         "construction": construction,
         "min_spread": min_spread,
         "from_bandit": from_bandit,
-        "reward_scale": reward_scale,
+        "reward_std": reward_std,
         "strategy": strategy,
         "population_size": population_size,
         "generations": generations,
@@ -369,7 +369,7 @@ def discovery_config(settings: Mapping[str, Any]) -> DiscoveryConfig:
             "agents_per_candidate",
             "evaluation_episodes",
             "mode_actions",
-            "reward_scale",
+            "reward_std",
             start="from_bandit",
         ),
         **more,

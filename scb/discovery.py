@@ -73,8 +73,10 @@ class DiscoveryConfig:
       curriculum: of the evaluation episodes' length; None for the environment's own throughout.
       init: "random", or "expert" for the warm start.
       start: a bandit (name or file) whose weights to start from instead.
-      reward_scale: factor on the reward of the weights that the search starts from. Agents that
-        normalise advantages are indifferent to it; SAC, whose temperature starts at 1, is not.
+      reward_std: standard deviation, over contexts and uniform actions, that the reward of the
+        weights that the search starts from is scaled to, and shifted to mean zero; None leaves it
+        as it is. PPO, which normalises advantages, is nearly indifferent; SAC is not: its
+        temperature starts at 1 and its critics near 0.
       warm_start: its configuration.
       evolution: the outer loop's.
     """
@@ -95,7 +97,7 @@ class DiscoveryConfig:
     curriculum: CurriculumConfig | None = None
     init: str = "expert"
     start: str | None = None
-    reward_scale: float = 1.0
+    reward_std: float | None = None
     warm_start: WarmStartConfig = field(default_factory=WarmStartConfig)
     evolution: EvolutionConfig = field(default_factory=lambda: EvolutionConfig(combine="ranks"))
 
@@ -116,9 +118,13 @@ class DiscoveryConfig:
             raise UserError(
                 "fixed hyperparameters are not drawn from lists: leave out the lists, or draw."
             )
-        if not 0 < self.reward_scale < math.inf:
+        if self.reward_std is not None and not 0 < self.reward_std < math.inf:
             raise UserError(
-                f"reward_scale is {self.reward_scale}: it must be larger than 0, and finite."
+                f"reward_std is {self.reward_std}: it must be larger than 0, and finite."
+            )
+        if self.reward_std is not None and self.parameterization != "I":
+            raise UserError(
+                f"reward_std is for bandits, and parameterization {self.parameterization} is none: leave it out."
             )
         for name in ("agents_per_candidate", "evaluation_episodes"):
             if getattr(self, name) < 1:
@@ -276,7 +282,10 @@ class BanditDiscovery:
             weights = self.bandit.init_weights(key)
         else:
             weights = self._expert_fit
-        return scale_reward(weights, self.config.reward_scale)
+        if self.config.reward_std is None:
+            return weights
+        assert isinstance(self.bandit, SyntheticBandit)
+        return standardize_reward(self.bandit, weights, self.config.reward_std)
 
     @cached_property
     def _expert_fit(self) -> Weights:
@@ -370,12 +379,26 @@ class BanditDiscovery:
         )
 
 
-def scale_reward(weights: Weights, factor: float) -> Weights:
-    """The same synthetic environment with every mean reward multiplied by `factor`."""
-    # The network's last layer, which is linear.
+def standardize_reward(
+    bandit: SyntheticBandit, weights: Weights, std: float, num_samples: int = 10_000
+) -> Weights:
+    """The bandit whose reward is an affine function of the given one: of mean zero and standard deviation `std`.
+
+    Both are over its contexts and uniform actions. What agents should do in it stays the same.
+    """
+    params = bandit.params(weights)
+    key_context, key_action = jax.random.split(jax.random.key(0))
+    contexts, _ = jax.vmap(bandit.reset_env, in_axes=(0, None))(
+        jax.random.split(key_context, num_samples), params
+    )
+    actions = jax.vmap(bandit.action_space().sample)(jax.random.split(key_action, num_samples))
+    rewards = jax.vmap(bandit.mean_reward, in_axes=(0, 0, None))(contexts, actions, params)
+    factor = std / rewards.std()
+    # Through the network's last layer, which is linear.
     reward = dict(weights["reward"])
-    last = max(reward)
-    reward[last] = jax.tree.map(lambda x: x * factor, reward[last])
+    name = max(reward)
+    last = jax.tree.map(lambda x: x * factor, reward[name])
+    reward[name] = {**last, "bias": last["bias"] - factor * rewards.mean()}
     return {**weights, "reward": reward}
 
 

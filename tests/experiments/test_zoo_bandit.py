@@ -27,7 +27,9 @@ def test_only_what_was_measured_with_these_weights_counts():
 
 
 def test_a_brax_result_says_its_backend():
-    [result] = zoo_bandit.results_of({"entries": [entry(backend="spring")]}, "a").values()
+    table = {"entries": [entry(backend="spring"), entry(backend="generalized")]}
+    [result] = zoo_bandit.results_of(table, "a", "spring").values()
+    assert zoo_bandit.results_of(table, "a") == {}
     assert (result["backend"], result["hyperparameters"]) == ("spring", "fixed")
 
 

@@ -263,3 +263,25 @@ def test_the_digest_is_of_the_arrays_and_not_of_their_packing(tmp_path):
         zoo_table.arrays_digest(tmp_path / f"{x}.npz") for x in ("one", "two", "three")
     )
     assert one == two != three
+
+
+def test_a_bandit_stands_in_the_table_once_for_every_physics():
+    both = [
+        entry("hopper", "ppo", kind, [x, x, x], [x, x, x], episodes=5, backend=physics)
+        for physics, x in (("generalized", 1.0), ("spring", 5.0))
+        for kind in ("ours", "published")
+    ]
+    text = zoo_table.markdown(report(*both))
+    rows = [line for line in text.splitlines() if line.startswith("| hopper")]
+    assert [row.split(" | ")[0] for row in rows[:2]] == [
+        "| hopper (generalized)",
+        "| hopper (spring)",
+    ]
+    # What the paper states is of the generalized physics.
+    assert "853.5" in rows[0] and "853.5" not in rows[1]
+    titles = [axes.get_title(loc="left") for axes in zoo_table.figure(report(*both)).axes]
+    assert titles == ["hopper (generalized, 5 episodes)", "hopper (spring, 5 episodes)"]
+    assert [row["environment"] for row in zoo_table.differences(both)] == [
+        "hopper (generalized)",
+        "hopper (spring)",
+    ]

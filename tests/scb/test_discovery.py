@@ -123,9 +123,10 @@ def test_agents_trained_in_a_bandit_do_in_the_environment_what_the_bandit_reward
 @pytest.mark.parametrize("name", zoo_names())
 def test_a_bandit_of_the_zoo_is_worth_what_it_says(name):
     # On seeds that were not reported: within the reported interval, widened by its own width.
-    claimed = bandit_metadata(name)["results"]["PPO"]["sampled_actions"]
-    target = name.removeprefix(PREFIX)
-    env, env_params = make(target)
+    metadata = bandit_metadata(name)
+    claimed = metadata["results"]["PPO"]["sampled_actions"]
+    target, physics = name.removeprefix(PREFIX), metadata["config"].get("backend")
+    env, env_params = make(target, **({} if physics is None else {"backend": physics}))
     bandit, params = make(name)
     inner = inner_loop("ppo", target, bandit.action_space())
     training = SyntheticTraining(bandit, env, env_params, inner)
@@ -499,21 +500,31 @@ def test_a_discovery_starts_from_a_bandit_in_a_file(tmp_path):
     np.testing.assert_array_equal(flat(start), flat(weights))
 
 
-@pytest.mark.parametrize("factor", [0.5, 8.0])
-def test_the_start_can_be_scaled(factor):
+@pytest.mark.parametrize("environment", ["CartPole-v1", "Pendulum-v1"])
+def test_the_starts_reward_can_be_standardized(environment):
+    config = replace(CONFIG, environment=environment, configs={})
     plain, scaled = (
-        BanditDiscovery(replace(CONFIG, reward_scale=f)).initial_solution(jax.random.key(1))
-        for f in (1.0, factor)
+        BanditDiscovery(replace(config, reward_std=std)).initial_solution(jax.random.key(1))
+        for std in (None, 8.0)
     )
-    bandit = bandit_for(*make("CartPole-v1"), BanditConfig(4), "Synthetic-CartPole-v1")
-    observations = jax.random.normal(jax.random.key(2), (20, 4))
-    rewards = [
-        jax.vmap(bandit.mean_reward, (0, None, None))(observations, 1, bandit.params(weights))
-        for weights in (plain, scaled)
-    ]
-    np.testing.assert_allclose(rewards[1], factor * rewards[0], rtol=1e-5)
-    for a, b in zip(*(jax.tree.leaves(w["initial_state"]) for w in (plain, scaled)), strict=True):
-        np.testing.assert_array_equal(a, b)
+    env, env_params = make(environment)
+    bandit = bandit_for(env, env_params, BanditConfig(4), f"Synthetic-{environment}")
+    keys, keys_action = jax.random.split(jax.random.key(2), (2, 5000))
+    actions = jax.vmap(bandit.action_space().sample)(keys_action)
+    rewards = []
+    for weights in (plain, scaled):
+        params = bandit.params(weights)
+        contexts, _ = jax.vmap(bandit.reset_env, (0, None))(keys, params)
+        rewards.append(
+            np.asarray(jax.vmap(bandit.mean_reward, (0, 0, None))(contexts, actions, params))
+        )
+    # 5000 other samples know the mean to 8 / sqrt(5000) = 0.11 and the deviation to 1 %.
+    assert abs(rewards[1].mean()) < 0.5
+    assert rewards[1].std() == pytest.approx(8.0, rel=0.05)
+    # An affine function of the same reward in the same contexts.
+    slope, offset = np.polyfit(rewards[0], rewards[1], 1)
+    np.testing.assert_allclose(rewards[1], slope * rewards[0] + offset, atol=1e-3)
+    assert slope > 0
 
 
 @pytest.mark.parametrize(
@@ -599,8 +610,9 @@ def test_the_inner_loop_is_the_papers_where_no_agent_is_given():
             "unknown environment 'Pendulum-v2': did you mean Pendulum",
         ),
         ({"start": "Synthetic-Pendulum"}, "unknown bandit 'Synthetic-Pendulum'"),
-        ({"reward_scale": 0.0}, "reward_scale is 0.0: it must be larger than 0, and finite."),
-        ({"reward_scale": float("inf")}, "reward_scale is inf: it must be larger than 0"),
+        ({"reward_std": 0.0}, "reward_std is 0.0: it must be larger than 0, and finite."),
+        ({"reward_std": float("inf")}, "reward_std is inf: it must be larger than 0"),
+        ({"reward_std": 1.0, "parameterization": "TI"}, "reward_std is for bandits, and"),
         ({"mode": "al"}, "unknown mode 'al': did you mean all"),
         ({"parameterization": "IT"}, "unknown parameterization 'IT': did you mean"),
         ({"parameterization": "T", "init": "expert"}, "cannot be fitted to an expert: use init ra"),

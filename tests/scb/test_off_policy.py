@@ -927,6 +927,7 @@ def test_classic_control_is_solved_by_the_general_settings(environment, algorith
         state = agent.train(key_train, setting.hyperparameters, params)
         return agent.evaluate(state, key_evaluate, 10, mode=True).returns.mean()
 
-    keys = jax.random.split(jax.random.key(7), 3)
-    found = map_population(returns, 3, (0,))(keys)
+    # Of five seeds the interquartile mean leaves out the best and the worst.
+    keys = jax.random.split(jax.random.key(7), 5)
+    found = map_population(returns, 5, (0,))(keys)
     assert iqm(found) >= least, found
