@@ -1,131 +1,144 @@
-"""Does a bandit rank objectives as the environment does?
+"""Which inner loop on a bandit ranks objectives as an environment does, and does the choice hold elsewhere.
 
     python -m experiments.alignment
 
-Nine known drifts train PPO agents on Pendulum-v1, and in several regimes of the shipped Pendulum
-bandit. A regime is useful for meta-training if its fitness ranks the drifts as Pendulum's final
-return does (Spearman's correlation). The interval resamples the agents of each drift; nine drifts
-are few, so read it with care.
+First the choice: the family of known drifts and the zoo's learned ones train agents on Pendulum-v1,
+and in regimes of the Pendulum bandit that differ from the default in one thing each (reward noise,
+contexts, iterations, epochs, minibatches, learning rate, bandit). Then the confirmation, on seeds,
+environments and objectives that chose nothing: the same regimes' correlation with the outcome on other
+environments, each with its own bandit. `--adversaries FILES` adds objectives that evolution found.
+Stages that --out holds already are kept.
 """
 
 import argparse
 import json
 import sys
-import time
 from pathlib import Path
 from typing import Any
 
 from lpo.cli import configure_jax
 
-REGIMES: list[dict[str, Any]] = [
-    {"contexts": 200, "reward_noise": 0.0, "fitness": "return"},
-    {"contexts": 200, "reward_noise": 2.0, "fitness": "return"},
-    {"contexts": 200, "reward_noise": 5.0, "fitness": "return"},
-    {"contexts": 200, "reward_noise": 2.0, "fitness": "transfer"},
-    {"contexts": 200, "reward_noise": 5.0, "fitness": "transfer"},
-    {"contexts": 1000, "reward_noise": 5.0, "fitness": "return"},
-    {"contexts": 1000, "reward_noise": 5.0, "fitness": "transfer"},
+PENDULUM = "Synthetic-Pendulum-v1"
+# One thing changed at a time.
+VARIATIONS: list[dict[str, Any]] = [
+    *({"reward_noise": x} for x in (0.0, 1.0, 2.0, 5.0, 10.0)),
+    *({"contexts": x} for x in (50, 1000)),
+    *({"iterations": x} for x in (5, 45)),
+    *({"epochs": x} for x in (1, 4)),
+    *({"minibatches": x} for x in (1, 4)),
+    *({"learning_rate": x} for x in (3e-4, 3e-3)),
+    # The paper's own inner loop: no noise, 20 batches of 500, a learning rate of 0.005.
+    {"reward_noise": 0.0, "contexts": 500, "iterations": 20, "learning_rate": 5e-3},
 ]
 FIRST_SEED = 500  # neither the seeds that meta-training sees nor those that report
+CONFIRMATION_SEED = 700
+CONFIRMATIONS = {
+    "CartPole-v1": "Synthetic-CartPole-v1",
+    "MountainCarContinuous-v0": "Synthetic-MountainCarContinuous-v0",
+}
+CONFIRMED: list[dict[str, Any]] = [{"reward_noise": x} for x in (0.0, 2.0, 5.0)]
+
+
+def markdown(report: dict[str, Any]) -> str:
+    """The page with the tables."""
+    from lpo.alignment import FITNESSES, correlation_text
+
+    lines = [
+        "# Which bandit regime ranks objectives as the environment does",
+        "",
+        f"`{report['command']}`",
+        "",
+        "Every objective of the family trains PPO on the environment and in each regime of a bandit. The table "
+        "gives Spearman's correlation between a regime's fitness and the environment's final return (IQM), with "
+        "95 % bootstrap intervals over agents. A regime differs from the default (reward noise 5, 200 contexts, the "
+        "environment's own number of iterations, epochs, minibatches and learning rate) in what its name says.",
+    ]
+    for stage in report["stages"].values():
+        family = ", ".join(
+            f"{name} {value:.0f}".replace("-", "\u2212", 1) if value < 0 else f"{name} {value:.0f}"
+            for name, value in stage["outcome_iqm"].items()
+        )
+        lines += [
+            "",
+            f"## {stage['environment']}: {stage['role']}",
+            "",
+            f"Seeds {stage['first_seed']} to {stage['first_seed'] + stage['agents'] - 1}. Final return of the "
+            f"family (IQM): {family}.",
+            "",
+            f"![Correlations with {stage['environment']}](figures/alignment_{stage['environment']}.png)",
+            "",
+            "| regime | " + " | ".join(FITNESSES) + " |",
+            "| --- |" + " --- |" * len(FITNESSES),
+            *(
+                f"| {row['name']} | "
+                + " | ".join(correlation_text(row["alignment"][f]) for f in FITNESSES)
+                + " |"
+                for row in stage["regimes"]
+            ),
+        ]
+    machine = next(iter(report["stages"].values()))["machine"]
+    lines += ["", f"Measured on {machine['cores']} cores, {machine['processor']}.", ""]
+    return "\n".join(lines)
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--agents", type=int, default=16, help="agents of each drift")
-    parser.add_argument("--out", type=Path, default=Path("runs/alignment.json"))
+    parser.add_argument("--agents", type=int, default=16, help="agents of each objective")
+    parser.add_argument("--adversaries", nargs="*", default=[], help="learned objectives' files")
+    parser.add_argument("--skip-confirmation", action="store_true")
+    parser.add_argument("--out", type=Path, default=Path("docs/data/alignment.json"))
+    parser.add_argument("--page", type=Path, default=Path("docs/alignment.md"))
     arguments = parser.parse_args()
     configure_jax()
 
-    import jax
-    import numpy as np
+    from lpo import figures
+    from lpo.alignment import Regime, known_drifts, measure_alignment
+    from lpo.objectives import load_objective, zoo_names
 
-    from lpo.drift import ClipDrift, DPODrift, Drift, NoDrift
-    from lpo.generalization import learning_curves
-    from lpo.meta_training import MetaTrainingConfig, TaskTraining
-    from lpo.objectives import Objective
-    from scb.artefacts import machine_description, package_versions
-    from scb.evolution import map_population
-    from scb.statistics import iqm, spearman
-
-    family: dict[str, Drift] = {
-        **{f"ppo-{clip:g}": ClipDrift(clip) for clip in (0.05, 0.1, 0.2, 0.5, 1.0)},
-        "none": NoDrift(),
-        "dpo (1, 0.3)": DPODrift(1.0, 0.3),
-        "dpo (2, 0.6)": DPODrift(),
-        "dpo (4, 1.2)": DPODrift(4.0, 1.2),
+    learned = [load_objective(name) for name in [*zoo_names(), *arguments.adversaries]]
+    report: dict[str, Any] = {
+        "command": " ".join(["python -m experiments.alignment", *sys.argv[1:]]),
+        "stages": {},
     }
-    parameters = {name: drift.init(jax.random.key(0)) for name, drift in family.items()}
-    seeds = list(range(FIRST_SEED, FIRST_SEED + arguments.agents))
-    outcome = {}
-    for name, drift in family.items():
-        objective = Objective(name, drift, parameters[name])
-        outcome[name] = learning_curves("Pendulum-v1", objective, seeds, points=1).final
-        print(f"Pendulum-v1 with {name}: IQM {iqm(outcome[name]):.0f}", flush=True)
+    if arguments.out.exists():
+        report["stages"] = json.loads(arguments.out.read_text())["stages"]
 
-    rows = []
-    random = np.random.default_rng(0)
-    for regime in REGIMES:
-        start = time.perf_counter()
-        fitness = {}
-        for name, drift in family.items():
-            # MetaTraining takes any member of the contract: the known drifts stand in for a
-            # candidate.
-            problem = TaskTraining(
-                MetaTrainingConfig(drift=drift, **regime), "Synthetic-Pendulum-v1"
-            )  # type: ignore[arg-type]
-            train = map_population(
-                lambda key, p=problem, w=parameters[name]: p.train_one(w, key),
-                arguments.agents,
-                (0,),
+    def stage(
+        name: str, environment: str, role: str, regimes: list[Regime], family: Any, seed: int
+    ) -> None:
+        if name not in report["stages"]:
+            seeds = range(seed, seed + arguments.agents)
+            measured = measure_alignment(
+                regimes,
+                family,
+                environment,
+                list(seeds),
+                tell=lambda line: print(line, flush=True),
             )
-            fitness[name] = np.asarray(
-                train(jax.random.split(jax.random.key(FIRST_SEED), arguments.agents))
+            report["stages"][name] = {"role": role, **measured}
+            arguments.out.parent.mkdir(parents=True, exist_ok=True)
+            arguments.out.write_text(json.dumps(report, indent=1) + "\n")
+        path = arguments.page.parent / "figures" / f"alignment_{environment}.png"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        figures.save(figures.alignment_heatmap(report["stages"][name]), path)
+
+    variations = [Regime(PENDULUM, **variation) for variation in VARIATIONS]
+    stage("choice", "Pendulum-v1", "the choice", variations, known_drifts() + learned, FIRST_SEED)
+    for environment, bandit in CONFIRMATIONS.items():
+        if not arguments.skip_confirmation:
+            regimes = [Regime(bandit, **variation) for variation in CONFIRMED]
+            regimes += [Regime(PENDULUM, **variation) for variation in CONFIRMED]
+            stage(
+                environment,
+                environment,
+                "the confirmation",
+                regimes,
+                known_drifts() + learned,
+                CONFIRMATION_SEED,
             )
-
-        def correlation(pick: Any = slice(None), fitness: Any = fitness) -> float:
-            return float(
-                spearman(
-                    [fitness[n][pick].mean() for n in family],
-                    [iqm(outcome[n][pick]) for n in family],
-                )
-                or 0.0
-            )
-
-        resampled = [
-            correlation(random.integers(0, arguments.agents, arguments.agents)) for _ in range(500)
-        ]
-        low, high = np.percentile(resampled, [2.5, 97.5])
-        rows.append(
-            {
-                **regime,
-                "spearman": correlation(),
-                "low": float(low),
-                "high": float(high),
-                "mean_fitness": {n: float(x.mean()) for n, x in fitness.items()},
-                "seconds": round(time.perf_counter() - start, 1),
-            }
-        )
-        print(f"{regime}: {rows[-1]['spearman']:.2f} [{low:.2f}, {high:.2f}]", flush=True)
-
-    print("\n| contexts | reward noise | fitness | Spearman [95 %] |\n| --- | --- | --- | --- |")
-    for row in rows:
-        print(
-            f"| {row['contexts']} | {row['reward_noise']:g} | {row['fitness']} "
-            f"| {row['spearman']:.2f} [{row['low']:.2f}, {row['high']:.2f}] |"
-        )
-    arguments.out.parent.mkdir(parents=True, exist_ok=True)
-    result = {
-        "environment": "Pendulum-v1",
-        "agents": arguments.agents,
-        "first_seed": FIRST_SEED,
-        "outcome_iqm": {n: float(iqm(x)) for n, x in outcome.items()},
-        "regimes": rows,
-        "versions": package_versions(),
-        "machine": machine_description(),
-    }
-    arguments.out.write_text(json.dumps(result, indent=2) + "\n")
+    arguments.page.write_text(markdown(report))
     return 0
 
 

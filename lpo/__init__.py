@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from lpo.generalization import compare, learning_curves
     from lpo.meta_training import MetaTrainingConfig, meta_train
     from lpo.objectives import Objective, load_objective, save_objective
+    from lpo.portable import drift_function, numpy_drift, torch_drift, torch_loss
 
 _HOME = {
     "Certificate": "lpo.certificate",
@@ -29,6 +30,10 @@ _HOME = {
     "Objective": "lpo.objectives",
     "load_objective": "lpo.objectives",
     "save_objective": "lpo.objectives",
+    "drift_function": "lpo.portable",
+    "numpy_drift": "lpo.portable",
+    "torch_drift": "lpo.portable",
+    "torch_loss": "lpo.portable",
 }
 
 __all__ = [
@@ -42,10 +47,14 @@ __all__ = [
     "Objective",
     "certify",
     "compare",
+    "drift_function",
     "learning_curves",
     "load_objective",
     "meta_train",
+    "numpy_drift",
     "save_objective",
+    "torch_drift",
+    "torch_loss",
 ]
 
 

@@ -66,7 +66,9 @@ def _lpo_commands() -> dict[str, Any]:
         "meta-train": commands.meta_train_command,
         "train": commands.train,
         "evaluate": commands.evaluate,
+        "align": commands.align,
         "certify": commands.certify_command,
+        "distill": commands.distill_command,
     }
 
 

@@ -1,5 +1,7 @@
 """What the subcommands of `lpo` do. Their docstrings are the command line's help."""
 
+import itertools
+import json
 import os
 import shlex
 import sys
@@ -9,14 +11,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import tyro
 from rich.console import Console
 from rich.table import Table
 
 from lpo import figures
+from lpo.alignment import FITNESSES, Regime, correlation_text, known_drifts, measure_alignment
 from lpo.certificate import certify
+from lpo.distill import DistillConfig, distill
 from lpo.drift import LearnedDrift
 from lpo.generalization import (
     Comparison,
+    LearningCurves,
     check_names,
     compare,
     learning_curves,
@@ -26,7 +32,10 @@ from lpo.meta_training import MetaTraining, MetaTrainingConfig
 from lpo.objectives import Objective, load_objective, save_objective
 from lpo.pipeline import PRESETS as RUN_PRESETS
 from lpo.pipeline import check_settings, meta_training_artefact, run_pipeline
-from scb.artefacts import package_versions
+from lpo.suite import run_suite
+from lpo.suite import suite as suite_environments
+from scb.artefacts import machine_description, package_versions
+from scb.environments.zoo import home_of
 from scb.errors import UserError
 from scb.evolution import EvolutionConfig, evolve
 from scb.runs import Run, command_of, settle, write_json
@@ -303,7 +312,8 @@ def train(
 
 
 def evaluate(
-    environment: str = "Pendulum-v1",
+    environment: str | None = None,
+    suite: str | None = None,
     objectives: tuple[str, ...] = ("ppo", "dpo"),
     steps: int | None = None,
     seeds: int = 10,
@@ -315,7 +325,9 @@ def evaluate(
     """Compare objectives: train PPO with each on the same seeds, and print final scores with intervals.
 
     Args:
-      environment: where to train.
+      environment: where to train; Pendulum-v1 where neither this nor a suite is given.
+      suite: train in every environment of classic, minatar, brax or all, and aggregate normalised
+        scores; a folder given as --out that holds a part of them already is completed.
       objectives: any of ppo, ppo-0.3, dpo, none, zoo names, files; the first is the reference of
         the differences.
       steps: environment steps; the environment's own setting where left out.
@@ -328,6 +340,14 @@ def evaluate(
     if not objectives:
         raise UserError("no objectives: give at least one, such as --objectives ppo dpo.")
     loaded = _named_apart(objectives)
+    if suite is not None:
+        if environment is not None:
+            raise UserError(
+                f"the environment {environment} and the suite {suite} are both given: leave one out."
+            )
+        _evaluate_suite(suite, loaded, seed_list(seeds, seed), steps, backend, sampled_actions, out)
+        return
+    environment = environment or "Pendulum-v1"
     if out is not None:
         _make_folder(out)
     comparison = compare(
@@ -347,6 +367,224 @@ def evaluate(
     Console().print(table)
     if out is not None:
         _write_comparison(out, comparison)
+
+
+def _evaluate_suite(
+    name: str,
+    objectives: Sequence[Objective],
+    seeds: Sequence[int],
+    steps: int | None,
+    backend: str | None,
+    sampled_actions: bool,
+    out: Path | None,
+) -> None:
+    settings = {
+        "suite": name,
+        "objectives": [objective.name for objective in objectives],
+        "seeds": list(seeds),
+        "steps": steps,
+        "backend": backend,
+        "sampled_actions": sampled_actions,
+    }
+    environments = suite_environments(name)
+    done: dict[str, Comparison] = {}
+    if out is not None:
+        done = _stored_comparisons(out, settings, environments)
+
+    def keep(environment: str, comparison: Comparison) -> None:
+        if out is not None:
+            write_json(out / "comparisons" / f"{environment}.json", comparison.as_dict())
+
+    console = Console()
+    scores, comparisons = run_suite(
+        name,
+        objectives,
+        seeds,
+        backend,
+        tell=console.print,
+        done=done,
+        keep=keep,
+        steps=steps,
+        mode_actions=not sampled_actions,
+    )
+    reference = objectives[0].name
+    table = Table(
+        "environment",
+        *scores.objectives,
+        title="final return, IQM [95 %]",
+        caption="suite: " + name,
+    )
+    for environment, comparison in comparisons.items():
+        table.add_row(environment, *(str(estimate(c.final)) for c in comparison.curves))
+    console.print(table)
+    aggregate = Table("objective", "normalised score, IQM [95 %]", f"difference to {reference}")
+    differences = scores.differences()
+    for i, (objective, score) in enumerate(zip(scores.objectives, scores.aggregate(), strict=True)):
+        aggregate.add_row(objective, str(score), str(differences[i]) if i else "")
+    console.print(aggregate)
+    if scores.left_out:
+        console.print(f"left out, nobody beat random actions: {', '.join(scores.left_out)}")
+    if out is not None:
+        write_json(
+            out / "suite.json",
+            {**settings, **scores.as_dict(), "versions": package_versions()},
+        )
+        figures.save(figures.suite_scores(scores), out / "suite.png")
+
+
+def _stored_comparisons(
+    out: Path, settings: Mapping[str, Any], environments: Sequence[str]
+) -> dict[str, Comparison]:
+    """What a folder holds of a suite with these settings; a new folder holds nothing."""
+    path = out / "settings.json"
+    if not path.exists():
+        _make_folder(out)
+        write_json(path, settings)
+        (out / "comparisons").mkdir()
+        return {}
+    try:
+        stored = json.loads(path.read_text())
+    except (OSError, ValueError) as error:
+        raise UserError(f"{path} cannot be read ({error}): choose another --out.") from error
+    if stored != settings:
+        names = [
+            k for k in settings if not isinstance(stored, dict) or stored.get(k) != settings[k]
+        ]
+        raise UserError(
+            f"{out} holds a suite run with other {', '.join(names)}: choose another --out, or the same settings."
+        )
+    found = {}
+    for name in environments:
+        file = out / "comparisons" / f"{name}.json"
+        if file.exists():
+            curves = json.loads(file.read_text())["curves"]
+            found[name] = Comparison([LearningCurves.from_dict(curve) for curve in curves])
+    return found
+
+
+def align(
+    bandits: tuple[str, ...] = ("Synthetic-Pendulum-v1",),
+    environment: str | None = None,
+    objectives: tuple[str, ...] = (),
+    reward_noise: tuple[float, ...] = (0.0, 2.0, 5.0),
+    contexts: tuple[int, ...] = (200,),
+    iterations: tuple[int, ...] = (),
+    learning_rates: tuple[float, ...] = (),
+    epochs: tuple[int, ...] = (),
+    minibatches: tuple[int, ...] = (),
+    steps: int | None = None,
+    agents: int = 16,
+    seed: int = 500,
+    backend: str | None = None,
+    out: Path | None = None,
+) -> None:
+    """Measure which inner loop on a bandit ranks objectives as an environment does.
+
+    Trains agents with a family of known objectives on the environment and in every combination of
+    the values given, and prints Spearman's correlation of each fitness with the environment's final
+    return. Choose a regime with it before meta-training.
+
+    Args:
+      bandits: zoo names or files.
+      environment: whose outcome counts; the first bandit's own where left out.
+      objectives: that join the family of PPO's clips, DPO's and none: zoo names, files.
+      reward_noise: in the bandit's standard deviations of reward.
+      contexts: of a batch.
+      iterations: of the inner loop; the environment's own setting where left out, as the following.
+      learning_rates: of the inner agents.
+      epochs: passes over a batch.
+      minibatches: of a batch.
+      steps: environment steps of the outcome's agents; the environment's own where left out.
+      agents: of each objective, in the environment and in each regime.
+      seed: the first of their seeds.
+      backend: Brax physics: generalized, positional or spring.
+      out: folder for alignment.json and alignment.png; must be new or empty.
+    """
+    family = [*known_drifts(), *_named_apart(objectives)]
+    regimes = [
+        Regime(*values)
+        for values in itertools.product(
+            bandits,
+            reward_noise,
+            contexts,
+            iterations or (None,),
+            epochs or (None,),
+            minibatches or (None,),
+            learning_rates or (None,),
+        )
+    ]
+    if not regimes:
+        raise UserError("no regimes: give at least one value of each.")
+    target = environment or str(home_of(regimes[0].bandit))
+    seeds = seed_list(agents, seed)
+    if out is not None:
+        _make_folder(out)
+    console = Console()
+    report = measure_alignment(regimes, family, target, seeds, steps, backend, console.print)
+    table = Table("regime", *FITNESSES, title=f"Spearman's correlation with {target} [95 %]")
+    for row in report["regimes"]:
+        cells = (row["alignment"][fitness] for fitness in FITNESSES)
+        table.add_row(row["name"], *(correlation_text(cell) for cell in cells))
+    console.print(table)
+    if out is not None:
+        write_json(out / "alignment.json", report)
+        figures.save(figures.alignment_heatmap(report), out / "alignment.png")
+
+
+def distill_command(
+    objective: tyro.conf.Positional[str],
+    samples: int = 1000,
+    population_size: int = 1000,
+    generations: int = 20,
+    seed: int = 0,
+    out: Path = Path("runs/distill"),
+) -> None:
+    """Write a learned objective down as a formula: symbolic regression with gplearn (extra `distill`).
+
+    Prints the formula, how well it fits the drift and its slope on points that the fit has not seen,
+    and its certificate. --out/closed_form.npz is an objective like any other.
+
+    Args:
+      objective: a zoo name or path.npz.
+      samples: points of the fit.
+      population_size: of the genetic programming.
+      generations: of the genetic programming.
+      seed: decides everything.
+      out: folder for closed_form.npz and closed_form.json; must be new or empty.
+    """
+    loaded = load_objective(objective)
+    config = DistillConfig(
+        samples=samples, population_size=population_size, generations=generations, seed=seed
+    )
+    _make_folder(out)
+    found = distill(loaded, config)
+    settings = {"samples": samples, "population-size": population_size}
+    settings |= {"generations": generations, "seed": seed}
+    flags = [f"--{name}={value}" for name, value in settings.items()]
+    path, certificate = save_objective(
+        out / "closed_form.npz",
+        found.drift,
+        found.parameters,
+        {
+            "config": {
+                "distill": config,
+                "of": loaded.name,
+                "of_sha256": loaded.metadata.get("sha256"),
+            },
+            "seeds": {"distill": seed},
+            "results": {"r2": found.r2, "base_r2": found.base_r2, "front": found.front},
+            "cost": {"seconds": round(found.seconds, 1), "machine": machine_description()},
+            # A file goes by its name: the folder it lay in is this machine's.
+            "command": shlex.join(["lpo", "distill", Path(objective).name, *flags]),
+        },
+    )
+    print(f"expression: {found.drift.expression}")
+    print(f"drift: relu({'base + ' if found.drift.base == 'ppo' else ''}expression - xi)")
+    print("R² on unseen points: " + ", ".join(f"{k} {v:.3f}" for k, v in found.r2.items()))
+    base = ", ".join(f"{k} {v:.3f}" for k, v in found.base_r2.items())
+    print(f"R² of the base ({found.drift.base}) alone: {base}")
+    print(f"it {certificate}")
+    print(f"objective: {path}")
 
 
 def certify_command(objective: str) -> None:

@@ -20,19 +20,21 @@ from matplotlib import colormaps
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
-from matplotlib.colors import LinearSegmentedColormap, Normalize
+from matplotlib.colors import LinearSegmentedColormap, ListedColormap, Normalize
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
-from matplotlib.ticker import EngFormatter, MaxNLocator, NullFormatter
+from matplotlib.ticker import EngFormatter, MaxNLocator, NullFormatter, NullLocator
 from numpy.typing import NDArray
 
+from lpo.understanding import CLIP, REGIONS, analyze, is_temporal
 from scb.errors import UserError
 from scb.statistics import estimate, iqm
 
 if TYPE_CHECKING:
     from lpo.generalization import LearningCurves
     from lpo.objectives import Objective
+    from lpo.suite import SuiteScores
 
 BLACK, ORANGE, SKY_BLUE, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"
 BLUE, VERMILLION, PURPLE = "#0072B2", "#D55E00", "#CC79A7"
@@ -42,6 +44,16 @@ WIDTH = 9.0  # inches; a page shows them at about 100 px an inch, so 10 pt are 1
 DPI = 200
 RATIOS = (0.4, 1.8)
 ADVANTAGES = (-3.0, 3.0)
+# Of `lpo.understanding.REGIONS`. What stops or turns an update is dark, what leaves it alone is pale.
+_REGION_COLORS = {
+    "rolls back": VERMILLION,
+    "flat": GREY,
+    "cautious": ORANGE,
+    "free": "#F2F2F2",
+    "optimistic": SKY_BLUE,
+    "amplified": GREEN,
+    "hindered": PURPLE,
+}
 # Below this a penalty or a gradient is drawn as none: rounding of 32-bit floats, or a dead zone.
 NEGLIGIBLE = 1e-3
 
@@ -443,6 +455,199 @@ def drift_surface(
         jnp.asarray(ratios, jnp.float32), jnp.asarray(advantages, jnp.float32)
     )
     return np.asarray(value), np.asarray(advantages)[:, None] - np.asarray(slope)
+
+
+def suite_scores(scores: "SuiteScores") -> Figure:
+    """Aggregate scores with intervals, and performance profiles, of objectives over a suite.
+
+    Args:
+      scores: of `lpo.suite.run_suite`.
+    """
+    style = looks(scores.objectives)
+    thresholds = np.linspace(-0.1, 1.3, 141)
+    share, low, high = scores.profile(thresholds)
+    with _style():
+        figure = Figure(figsize=(WIDTH, 4.0))
+        profile, aggregate = figure.subplots(1, 2, width_ratios=(2.0, 1))
+        for i, name in enumerate(scores.objectives):
+            look = style[name]
+            profile.plot(
+                thresholds, share[i], color=look.color, linestyle=look.linestyle, label=name
+            )
+            profile.fill_between(
+                thresholds, low[i], high[i], color=look.color, alpha=0.18, linewidth=0
+            )
+        profile.set_xlabel("normalised score \u03c4 (0: random actions, 1: reference)")
+        profile.set_ylabel("share of runs with a score above \u03c4")
+        profile.set_ylim(0.0, 1.0)
+        profile.set_title("Performance profiles: 95 % bands", fontsize=10, weight="normal")
+        for i, estimated in enumerate(scores.aggregate()):
+            look = style[scores.objectives[i]]
+            low_end = estimated.value if estimated.low is None else estimated.low
+            high_end = estimated.value if estimated.high is None else estimated.high
+            aggregate.plot([low_end, high_end], [i, i], color=look.color, linewidth=3)
+            aggregate.plot([estimated.value], [i], look.marker, color=look.color, markersize=7)
+        aggregate.set_yticks(range(len(scores.objectives)), scores.objectives)
+        aggregate.invert_yaxis()
+        aggregate.grid(axis="y", visible=False)
+        aggregate.set_xlabel("normalised score")
+        aggregate.set_title("Interquartile mean, 95 %", fontsize=10, weight="normal")
+        environments, seeds = scores.scores.shape[1:]
+        _title(figure, f"{environments} environments, {seeds} seeds each")
+        profile.legend(
+            loc="upper center", bbox_to_anchor=(0.5, -0.17), ncols=min(len(scores.objectives), 4)
+        )
+    return figure
+
+
+def alignment_heatmap(report: Mapping[str, Any]) -> Figure:
+    """Spearman's correlation of every regime's fitnesses with an environment's outcome.
+
+    Args:
+      report: of `lpo.alignment.measure_alignment`.
+    """
+    rows = report["regimes"]
+    fitnesses = list(rows[0]["alignment"])
+    values = np.array(
+        [
+            [
+                np.nan if c["spearman"] is None else c["spearman"]
+                for c in (row["alignment"][name] for name in fitnesses)
+            ]
+            for row in rows
+        ]
+    )
+    with _style():
+        figure = Figure(figsize=(WIDTH, 1.6 + 0.42 * len(rows)))
+        axes = figure.subplots()
+        image = axes.imshow(values, cmap="RdBu", vmin=-1.0, vmax=1.0, aspect="auto")
+        axes.set_xticks(range(len(fitnesses)), [name.replace(", ", ",\n") for name in fitnesses])
+        axes.set_yticks(range(len(rows)), [row["name"] for row in rows])
+        axes.grid(visible=False)
+        axes.tick_params(length=0)
+        for i, row in enumerate(rows):
+            for j, name in enumerate(fitnesses):
+                cell = row["alignment"][name]
+                text = "-" if cell["spearman"] is None else f"{cell['spearman']:.2f}"
+                axes.text(
+                    j,
+                    i,
+                    f"{text}\n[{cell['low']:.2f}, {cell['high']:.2f}]".replace("-", "\u2212"),
+                    ha="center",
+                    va="center",
+                    fontsize=8,
+                    color="white" if abs(values[i, j]) > 0.7 else "black",
+                )
+        bar = figure.colorbar(image, ax=axes)
+        bar.set_label("Spearman's correlation over objectives")
+        number = len(report["outcome_iqm"])
+        _title(
+            figure,
+            f"How the bandit's fitness ranks {number} objectives, against {report['environment']} "
+            f"(n = {report['agents']} agents each, 95 % intervals)",
+        )
+    return figure
+
+
+def drift_and_gradient(
+    objectives: "Sequence[Objective]", progress: Sequence[float] = (0.0, 0.5, 1.0)
+) -> Figure:
+    """What objectives charge, where that lets a policy move, and what it amounts to.
+
+    A row an objective; one that changes over the training has a row for each of its fractions.
+    Columns: the drift f, the gradient d/d(log r) (r A - f), and the regions of
+    `lpo.understanding.REGIONS`. The panels of a column share one scale.
+
+    Args:
+      objectives: from top to bottom.
+      progress: fractions of training done, for drifts that depend on it.
+    """
+    if not objectives:
+        raise UserError("there are no objectives to draw: give at least one.")
+    rows = [
+        (
+            o.name if len(fractions) == 1 else f"{o.name}\n{100 * fraction:g} % of training",
+            analyze(o, fraction),
+        )
+        for o in objectives
+        for fractions in [progress if is_temporal(o) else (0.5,)]
+        for fraction in fractions
+    ]
+    names = list(REGIONS)
+    with _style():
+        figure = Figure(figsize=(WIDTH, 1.7 + 1.9 * len(rows)))
+        grid = figure.subplots(len(rows), 3, sharex=True, sharey=True, squeeze=False)
+        pale_is_none = LinearSegmentedColormap.from_list(
+            "drift", colormaps["magma_r"](np.linspace(0.0, 0.85, 256))
+        )
+        penalty = _Scale(pale_is_none, Normalize(0.0, _largest([a.drift for _, a in rows])))
+        largest = _largest([np.abs(a.gradient) for _, a in rows])
+        direction = _Scale(colormaps["RdBu_r"], Normalize(-largest, largest))
+        classes = ListedColormap([_REGION_COLORS[name] for name in names])
+        for row, (label, analysis) in zip(grid, rows, strict=True):
+            ratios, advantages = np.exp(analysis.log_ratios), analysis.advantages
+            penalty.draw(row[0], ratios, advantages, analysis.drift)
+            direction.draw(row[1], ratios, advantages, analysis.gradient)
+            row[2].pcolormesh(
+                ratios,
+                advantages,
+                analysis.regions,
+                cmap=classes,
+                norm=Normalize(-0.5, len(names) - 0.5),
+                shading="nearest",
+                rasterized=True,
+            )
+            for axes in row:
+                for x, linestyle in ((1.0, "-"), (1.0 - CLIP, ":"), (1.0 + CLIP, ":")):
+                    axes.axvline(x, color=GREY, linewidth=0.9, linestyle=linestyle)
+                axes.axhline(0.0, color=GREY, linewidth=0.9)
+                axes.grid(visible=False)
+            row[0].set_ylabel("advantage A\n(standard deviations)", fontsize=9)
+            row[0].annotate(
+                label,
+                (-0.36, 0.5),
+                xycoords="axes fraction",
+                rotation=90,
+                ha="right",
+                va="center",
+                fontweight="bold",
+            )
+        grid[0, 0].set_xscale("log")
+        grid[0, 0].set_xticks([0.5, 0.8, 1.0, 1.2, 2.0], ["0.5", "0.8", "1", "1.2", "2"])
+        grid[0, 0].xaxis.set_minor_locator(NullLocator())
+        for axes, title in zip(
+            grid[0],
+            ("drift f (penalty)", "gradient d/d(log r) (r A − f)", "what that amounts to"),
+            strict=True,
+        ):
+            axes.set_title(title, fontsize=10, weight="normal")
+        for axes in grid[-1]:
+            axes.set_xlabel(r"ratio $r = \pi(a|s)\,/\,\pi_{\mathrm{old}}(a|s)$")
+        for column, scale, extend in ((0, penalty, "max"), (1, direction, "both")):
+            figure.colorbar(
+                ScalarMappable(scale.norm, scale.map),
+                ax=list(grid[:, column]),
+                location="bottom",
+                extend="neither" if scale.covers else extend,
+                aspect=18,
+                pad=0.02,
+            )
+        # The third column has its legend where the others have their scales.
+        shown = [i for i in range(len(names)) if any((a.regions == i).any() for _, a in rows)]
+        _title(figure, "What a drift charges, and what it does to the update")
+        _legend_below(
+            figure,
+            (
+                [
+                    Patch(facecolor=_REGION_COLORS[names[i]], edgecolor=GREY, linewidth=0.6)
+                    for i in shown
+                ]
+                + [Line2D([], [], color=GREY, linewidth=0.9, linestyle=":")],
+                [names[i] for i in shown] + ["PPO's clip, 0.2"],
+            ),
+            columns=4,
+        )
+    return figure
 
 
 def save(figure: Figure, path: str | Path) -> Path:

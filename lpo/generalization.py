@@ -5,7 +5,7 @@ episodes, so that differences are paired. Final scores are interquartile means w
 intervals.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -51,6 +51,16 @@ class LearningCurves:
     def area(self) -> np.ndarray:
         """[S] mean return over the training, the untrained agent left out."""
         return self.returns[:, 1:].mean(axis=1)
+
+    @classmethod
+    def from_dict(cls, stored: Mapping[str, Any]) -> "LearningCurves":
+        """What `as_dict` wrote."""
+        names = ("environment", "backend", "objective", "seeds", "episodes", "mode_actions")
+        return cls(
+            steps=np.asarray(stored["steps"]),
+            returns=np.asarray(stored["returns"]),
+            **{name: stored[name] for name in names},
+        )
 
     def as_dict(self) -> dict[str, Any]:
         return {

@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
 
-from lpo.drift import LearnedDrift
+from lpo.drift import Drift, LearnedDrift
 from scb.agents.ppo import PPO, PPOConfig, PPOState
 from scb.agents.settings import environment_setting
 from scb.environments.brax import BRAX_NAMES
@@ -144,9 +144,13 @@ class TaskTraining:
     Args:
       config: the meta-training's.
       environment: the task, one of the configuration's.
+      drift: the family that the drift parameters belong to; None for the configuration's. Any
+        member of the contract will do here.
     """
 
-    def __init__(self, config: MetaTrainingConfig, environment: str) -> None:
+    def __init__(
+        self, config: MetaTrainingConfig, environment: str, drift: Drift | None = None
+    ) -> None:
         self.config, self.environment = config, environment
         self.home = home_of(environment) or environment
 
@@ -163,7 +167,7 @@ class TaskTraining:
             self.env, self.env_params = make(environment, **physics(environment))
             self.evaluation_env, self.evaluation_params = self.env, self.env_params
         self.agent_config = config.agent or inner_loop(environment, config.contexts)
-        self.agent = PPO(self.env, self.agent_config, config.drift)
+        self.agent = PPO(self.env, self.agent_config, drift or config.drift)
         one_step = isinstance(self.evaluation_env, SyntheticBandit)
         self.evaluation_episodes = config.evaluation_episodes or (50 if one_step else 20)
         self.training_params = self.env_params
@@ -202,7 +206,7 @@ class TaskTraining:
 
         if config.fitness == "area":
             _, returns = self.agent.train_with_evaluations(
-                key_train, hyperparameters, self.training_params, judge, every=self._area_every
+                key_train, hyperparameters, self.training_params, judge, every=self.area_every
             )
             return returns[1:].mean()
         if not config.horizons:
@@ -218,8 +222,8 @@ class TaskTraining:
         return judge(state, key_evaluate)
 
     @property
-    def _area_every(self) -> int:
-        # About five points of the curve, at equal distances that divide the training.
+    def area_every(self) -> int:
+        """Iterations between about five points of the curve, at equal distances that divide the training."""
         iterations = self.agent_config.num_iterations
         return next(n for n in range(max(1, iterations // 5), 0, -1) if iterations % n == 0)
 
@@ -227,7 +231,7 @@ class TaskTraining:
         """Of one candidate; with random horizons the mean over them."""
         config, points = self.config, 1
         if config.fitness == "area":
-            points = self.agent_config.num_iterations // self._area_every + 1
+            points = self.agent_config.num_iterations // self.area_every + 1
         agents = config.agents_per_candidate
         share = sum(config.horizons) / len(config.horizons) if config.horizons else 1.0
         training = self.agent_config.num_iterations * self.agent_config.batch_size

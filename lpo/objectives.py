@@ -1,4 +1,4 @@
-"""Objectives by name or file: PPO's clip, DPO, no drift, and the learned ones of the zoo."""
+"""Objectives by name or file: PPO's clip, DPO, no drift, the learned ones of the zoo, and formulas."""
 
 import re
 from collections.abc import Mapping
@@ -9,8 +9,10 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from lpo.certificate import Certificate, certify
+from lpo.distill import ClosedFormDrift
 from lpo.drift import TEMPORAL_FEATURES, ClipDrift, DPODrift, Drift, LearnedDrift, NoDrift
 from scb import artefacts
 from scb.errors import UserError, unknown_name
@@ -80,6 +82,8 @@ def _from_file(path: Path) -> Objective:
     artefact = artefacts.load(path, KIND)
     try:
         family = artefact.metadata["config"]["drift"]
+        if "expression" in family:
+            return _formula(path, artefact, family)
         features = tuple(family["features"])
         drift = LearnedDrift(
             base=family["base"],
@@ -106,25 +110,50 @@ def _from_file(path: Path) -> Objective:
     return Objective(artefact.name, drift, parameters, artefact.metadata)
 
 
+def _formula(path: Path, artefact: artefacts.Artefact, family: Mapping[str, Any]) -> Objective:
+    drift = ClosedFormDrift(
+        expression=str(family["expression"]),
+        base=family["base"],
+        clip=family["clip"],
+        xi=family["xi"],
+    )
+    parameters = drift.init(jax.random.key(0))
+    artefacts.expect_shapes(artefact, {"constants": parameters["constants"].shape})
+    # The text is what a reader sees, so it must be what is computed.
+    if not np.array_equal(np.asarray(artefact.arrays["constants"]), parameters["constants"]):
+        raise UserError(
+            f"{path} holds other numbers than the expression in its .json: fetch or save both again."
+        )
+    return Objective(artefact.name, drift, parameters, artefact.metadata)
+
+
 def save_objective(
-    path: str | Path, drift: LearnedDrift, parameters: Any, metadata: Mapping[str, Any]
+    path: str | Path,
+    drift: LearnedDrift | ClosedFormDrift,
+    parameters: Any,
+    metadata: Mapping[str, Any],
 ) -> tuple[Path, Certificate]:
-    """Writes a learned objective with its certificate.
+    """Writes a learned objective, or a formula, with its certificate.
 
     Args:
       path: NAME.npz; NAME.json is written beside it.
-      drift, parameters: the learned drift.
+      drift, parameters: the drift.
       metadata: config (of the meta-training), seeds, results, cost, command.
     """
+    if isinstance(drift, ClosedFormDrift) and not np.array_equal(
+        drift.init(jax.random.key(0))["constants"], parameters["constants"]
+    ):
+        # Trained on: its text must say the numbers that it is saved with.
+        drift = drift.with_parameters(parameters)
+        parameters = drift.init(jax.random.key(0))
     certificate = certify(drift, parameters)
     config = dict(metadata.get("config", {}))
-    config["drift"] = {
-        "base": drift.base,
-        "hidden_size": drift.hidden_size,
-        "clip": drift.clip,
-        "xi": drift.xi,
-        "features": list(drift.features),
-    }
+    own: dict[str, Any]
+    if isinstance(drift, ClosedFormDrift):
+        own = {"expression": drift.expression}
+    else:
+        own = {"hidden_size": drift.hidden_size, "features": list(drift.features)}
+    config["drift"] = {"base": drift.base, "clip": drift.clip, "xi": drift.xi, **own}
     full = {
         **metadata,
         "kind": KIND,

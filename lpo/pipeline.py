@@ -9,7 +9,6 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from rich.console import Console
 
 from lpo import figures, report
@@ -260,7 +259,7 @@ def _compare(
     for objective in objectives:
         path = folder / "curves" / f"{evaluation['environment']}_{objective.name}.json"
         if path.exists():
-            curves.append(_stored_curves(path))
+            curves.append(LearningCurves.from_dict(json.loads(path.read_text())))
             continue
         result = learning_curves(
             evaluation["environment"],
@@ -274,17 +273,6 @@ def _compare(
         write_json(path, result.as_dict())
         curves.append(result)
     return Comparison(curves)
-
-
-def _stored_curves(path: Path) -> LearningCurves:
-    stored = json.loads(path.read_text())
-    fields = {
-        name: stored[name]
-        for name in ("environment", "backend", "objective", "seeds", "episodes", "mode_actions")
-    }
-    return LearningCurves(
-        steps=np.asarray(stored["steps"]), returns=np.asarray(stored["returns"]), **fields
-    )
 
 
 def _figures(

@@ -16,6 +16,7 @@ from gymnax.environments import spaces
 
 import lpo
 from lpo import cli, commands
+from lpo.alignment import FITNESSES
 from lpo.drift import NoDrift
 from lpo.generalization import LearningCurves
 from lpo.meta_training import MetaTrainingConfig
@@ -117,6 +118,11 @@ def test_a_number_out_of_range_is_told_its_range(refused, arguments, message):
     [
         ("train --backend spring", "'Pendulum-v1' does not take {'backend': 'spring'}"),
         ("meta-train --environment Pendulum-v1 --fitness transfer", "asks for a bandit"),
+        ("meta-train --tasks ,", "the list of tasks is empty"),
+        ("meta-train --environment a --tasks b,c", "the environment a and the tasks b,c are both"),
+        ("meta-train --horizons 0.5,x", "horizons '0.5,x' are no numbers"),
+        ("align --bandits Pendulum-v1", "'Pendulum-v1' is none"),
+        ("align --contexts 0", "contexts is 0: it must be at least 1."),
         ("evaluate --objectives", "no objectives: give at least one"),
         ("evaluate --objectives ppo ppo", "objective 'ppo' is there twice"),
         ("run --objective ppo", "objective 'ppo' is there twice"),
@@ -593,3 +599,44 @@ def test_flags_of_meta_train_reach_the_configuration():
     assert replace(unset, evolution=default.evolution) == default
     for name in ("strategy", "sigma", "learning_rate", "mean_evaluations"):
         assert getattr(unset.evolution, name) == getattr(default.evolution, name)
+
+
+def test_lists_of_meta_train_reach_the_configuration():
+    config = commands.meta_training_config(
+        {"tasks": "Synthetic-Pendulum-v1, Synthetic-CartPole-v1", "horizons": "0.5,2"}
+    )
+    assert config.tasks == ("Synthetic-Pendulum-v1", "Synthetic-CartPole-v1")
+    assert config.horizons == (0.5, 2.0)
+    # Returns of different tasks have different scales.
+    assert config.evolution.combine == "ranks"
+    temporal = commands.meta_training_config({"temporal": True})
+    assert temporal.drift.temporal
+    assert temporal.horizons == commands.TEMPORAL_HORIZONS
+    assert temporal.evolution.combine == "mean"
+
+
+def test_align_measures_every_combination_and_stores_it(monkeypatch, working_folder, capsys):
+    asked = []
+
+    def measure(regimes, objectives, environment, seeds, steps, backend, tell):
+        asked.extend(regimes)
+        assert {"ppo-0.2", "none", "lpo-pendulum"} <= {o.name for o in objectives}
+        assert (environment, seeds) == ("Pendulum-v1", [500, 501])
+        cell = {"spearman": 0.5, "low": 0.25, "high": 0.75}
+        rows = [{"name": str(r), "alignment": dict.fromkeys(FITNESSES, cell)} for r in regimes]
+        return {
+            "environment": environment,
+            "agents": 2,
+            "outcome_iqm": {o.name: 0.0 for o in objectives},
+            "regimes": rows,
+        }
+
+    monkeypatch.setattr(commands, "measure_alignment", measure)
+    flags = ["--objectives", "lpo-pendulum", "--agents=2", "--out=aligned"]
+    assert cli.main(["align", "--reward-noise", "0", "5", "--contexts", "50", "200", *flags]) == 0
+    assert [(r.reward_noise, r.contexts) for r in asked] == [(0, 50), (0, 200), (5, 50), (5, 200)]
+    output = capsys.readouterr().out
+    assert "0.50 [0.25," in output and "contexts 50" in output
+    stored = json.loads((working_folder / "aligned" / "alignment.json").read_text())
+    assert len(stored["regimes"]) == 4
+    assert (working_folder / "aligned" / "alignment.png").stat().st_size > 5000

@@ -1,0 +1,285 @@
+r"""What the drifts do to an update: PPO's clip, DPO's closed form and every learned one of the zoo.
+
+    python -m experiments.understanding
+
+writes docs/understanding.md, its figure and its numbers; all of its sentences are made from the
+numbers. Learned drifts that were written down as formulas join it with what they earn:
+
+    lpo distill lpo-pendulum --out runs/distill
+    lpo evaluate --objectives ppo dpo lpo-pendulum runs/distill/closed_form.npz --seed 31000 --out runs/formula
+    python -m experiments.understanding --formulas runs/distill/closed_form.npz \
+        --comparisons runs/formula/comparison.json
+
+What the file of numbers holds of formulas and comparisons is kept where they aren't given again.
+"""
+
+import argparse
+import json
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from lpo.cli import configure_jax
+
+PROGRESS = (0.0, 0.5, 1.0)
+
+
+def measure(names: Sequence[str]) -> list[dict[str, Any]]:
+    """The analyses of these objectives, temporal ones at every fraction of `PROGRESS`."""
+    from lpo.objectives import load_objective
+    from lpo.understanding import analyze, is_temporal
+
+    rows = []
+    for objective in map(load_objective, names):
+        temporal = is_temporal(objective)
+        for fraction in PROGRESS if temporal else (0.5,):
+            rows.append({**analyze(objective, fraction).as_dict(), "temporal": temporal})
+    return rows
+
+
+def read_formula(path: Path) -> dict[str, Any]:
+    """What the page says of a closed form, from its artefact."""
+    from lpo.distill import ClosedFormDrift
+    from lpo.objectives import load_objective
+    from scb.errors import UserError
+
+    objective = load_objective(path)
+    if not isinstance(objective.drift, ClosedFormDrift):
+        raise UserError(f"{path} is no formula: give what lpo distill wrote.")
+    metadata = objective.metadata
+    return {
+        "name": objective.name,
+        "of": metadata["config"].get("of"),
+        "expression": objective.drift.expression,
+        "base": objective.drift.base,
+        "r2": metadata["results"].get("r2"),
+        "base_r2": metadata["results"].get("base_r2"),
+        "certificate": metadata["certificate"],
+        "command": metadata["command"],
+        "cost": metadata["cost"],
+    }
+
+
+def read_comparison(path: Path) -> dict[str, Any]:
+    """What the page says of a comparison that `lpo evaluate` wrote."""
+    from scb.errors import UserError
+
+    try:
+        whole = json.loads(path.read_text())
+        curves = whole["curves"]
+        first = curves[0]
+        return {
+            "environment": first["environment"],
+            "backend": first["backend"],
+            "steps": first["steps"][-1],
+            "seeds": first["seeds"],
+            "episodes": first["episodes"],
+            "mode_actions": first["mode_actions"],
+            "reference": whole["reference"],
+            "final_iqm": {c["objective"]: c["final_iqm"] for c in curves},
+            "paired_differences": whole["paired_differences"],
+        }
+    except (OSError, KeyError, IndexError, TypeError, ValueError) as error:
+        raise UserError(
+            f"{path} is no comparison ({error}): give a comparison.json of lpo evaluate."
+        ) from error
+
+
+def markdown(report: Mapping[str, Any]) -> str:
+    """The page: the figure, the table, what it says in words, and the formulas."""
+    from lpo.understanding import REGIONS
+
+    rows = report["analyses"]
+    names = list(dict.fromkeys(row["objective"] for row in rows))
+    lines = [
+        "# What the drifts do to an update",
+        "",
+        f"![Drift, gradient of the objective and regions of {_listed(names)}]"
+        "(figures/understanding.png)",
+        "",
+        "`python -m experiments.understanding`. PPO maximises `mean(r·A − f)`, so all that a drift `f(r, A)`",
+        "does is to change the plain surrogate's gradient. The share that is left of it is",
+        "`h = d(r·A − f)/d(log r) / (r·A)`: 1 where nothing is charged, 0 where the update stops, negative where it",
+        "turns round. The table gives each region's share of ratios from 0.5 to 2, uniform in `log r`, and advantages",
+        "from −3 to 3, weighted by the standard normal density; *stops* is the first ratio on the way from 1 where",
+        "`h` falls to 0.05.",
+        "",
+        f"| objective | {' | '.join(REGIONS)} | stops, A = +1 | stops, A = −1 |",
+        f"| --- |{' --- |' * (len(REGIONS) + 2)}",
+    ]
+    for row in rows:
+        cells = [
+            _label(row),
+            *(_percent(row["fractions"][name]) for name in REGIONS),
+            *(_stop(row["stops"][sign]) for sign in ("+1", "-1")),
+        ]
+        lines.append(f"| {' | '.join(cells)} |")
+    lines += [
+        "",
+        *(f"- *{name}*: {meaning}.".replace("-0.05", "−0.05") for name, meaning in REGIONS.items()),
+        "",
+    ]
+    for row in rows:
+        lines += [f"**{_label(row)}.** {words(row)}", ""]
+    if report.get("formulas"):
+        lines += _formula_section(report)
+    lines += ["The numbers: [data/understanding.json](data/understanding.json).", ""]
+    return "\n".join(lines)
+
+
+def words(row: Mapping[str, Any]) -> str:
+    """Two or three sentences about an analysis, out of its numbers alone."""
+    fractions, beyond = row["fractions"], row["beyond"]
+    positive, negative = (_fate(beyond[sign]) for sign in ("positive", "negative"))
+    fate = (
+        f"{positive}, whatever the advantage's sign"
+        if positive == negative
+        else f"{positive} for positive advantages; for negative ones it {negative}"
+    )
+    sentences = [f"Where PPO's clip stops an update, this one {fate}."]
+    changed = {
+        name: fractions[name]
+        for name in ("cautious", "amplified", "hindered")
+        if fractions[name] >= 0.005
+    }
+    inside = _listed([f"{name} in {_percent(share)}" for name, share in changed.items()])
+    sentences.append(
+        f"Elsewhere it is {inside} of the grid, and leaves the gradient as it is in "
+        f"{_percent(fractions['free'])}."
+        if changed
+        else f"Elsewhere, {_percent(fractions['free'])} of the grid, it leaves the gradient as it is."
+    )
+    stops = [
+        f"at ratio {_stop(row['stops'][sign])} with an advantage of {shown}"
+        if row["stops"][sign] is not None
+        else f"nowhere {where} with an advantage of {shown}"
+        for sign, shown, where in (("+1", "+1", "up to ratio 2"), ("-1", "−1", "down to ratio 0.5"))
+    ]
+    sentences.append(f"It stops {stops[0]}, and {stops[1]}.")
+    return " ".join(sentences)
+
+
+def _fate(shares: Mapping[str, float]) -> str:
+    fates = [
+        (shares["optimistic"], "goes on"),
+        (shares["flat"], "stops"),
+        (shares["rolls back"], "turns round"),
+    ]
+    shown = [(what, share) for share, what in fates if share >= 0.005]
+    if len(shown) == 1:
+        return f"{shown[0][0]} everywhere"
+    return _listed([f"{what} in {_percent(share)}" for what, share in shown])
+
+
+def _formula_section(report: Mapping[str, Any]) -> list[str]:
+    lines = ["## As formulas", ""]
+    for formula in report["formulas"]:
+        r2, base, certificate = formula["r2"], formula["base_r2"], formula["certificate"]
+        added = "PPO's clip drift + " if formula["base"] == "ppo" else ""
+        lines += [
+            f"`{formula['command']}` wrote `{formula['of']}` down as `f = relu({added}e − ξ)` with",
+            "",
+            "```text",
+            f"e = {formula['expression']}",
+            "```",
+            "",
+            "where `d = r − 1` and `log_r = log r`. On points that the fit has not seen, log-ratios of standard",
+            f"deviation 0.3 and normal advantages, R² is {_r2(r2['drift'])} for the drift and {_r2(r2['slope'])} for",
+            f"its slope `df/d(log r)`; the base alone has {_r2(base['drift'])} and {_r2(base['slope'])}.",
+            f"The mirror-learning conditions {'hold' if certificate['holds'] else 'do NOT hold'} on the "
+            "certificate's grid.",
+            "",
+        ]
+    for comparison in report.get("comparisons", []):
+        seeds = comparison["seeds"]
+        actions = "mode" if comparison["mode_actions"] else "sampled"
+        lines += [
+            f"Trained with on {comparison['environment']}, {comparison['steps']} steps, seeds {min(seeds)} to "
+            f"{max(seeds)}, {comparison['episodes']} episodes of {actions} actions; interquartile means with 95 % "
+            "bootstrap intervals:",
+            "",
+            f"| objective | final return | paired difference to {comparison['reference']} |",
+            "| --- | --- | --- |",
+        ]
+        for name, score in comparison["final_iqm"].items():
+            difference = comparison["paired_differences"].get(name)
+            shown = _estimate(difference, signed=True) if difference else ""
+            lines.append(f"| {name} | {_estimate(score)} | {shown} |")
+        lines.append("")
+    return lines
+
+
+def _r2(value: float) -> str:
+    return f"{value:.3f}".replace("-", "−")
+
+
+def _estimate(value: Mapping[str, Any], signed: bool = False) -> str:
+    text = f"{value['value']:+.0f}" if signed else f"{value['value']:.0f}"
+    if value.get("low") is not None and value.get("high") is not None:
+        text += f" [{value['low']:.0f}, {value['high']:.0f}]"
+    return text.replace("-", "−")
+
+
+def _label(row: Mapping[str, Any]) -> str:
+    name = f"`{row['objective']}`"
+    return f"{name} at {100 * row['progress']:g} % of training" if row["temporal"] else name
+
+
+def _listed(parts: Sequence[str]) -> str:
+    return " and ".join([", ".join(parts[:-1]), parts[-1]] if len(parts) > 1 else parts)
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.1f} %" if 0.0 < share < 0.1 else f"{100 * share:.0f} %"
+
+
+def _stop(ratio: float | None) -> str:
+    return "never" if ratio is None else f"{ratio:.2f}"
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--objectives", nargs="+", help="ppo, dpo and the zoo if left out")
+    parser.add_argument("--formulas", type=Path, nargs="*", help="of lpo distill")
+    parser.add_argument("--comparisons", type=Path, nargs="*", help="of lpo evaluate")
+    parser.add_argument("--docs", type=Path, default=Path("docs"))
+    arguments = parser.parse_args(argv)
+    configure_jax()
+
+    from lpo import figures
+    from lpo.objectives import load_objective, zoo_names
+    from scb.artefacts import package_versions
+    from scb.errors import UserError
+    from scb.runs import write_json
+
+    out = arguments.docs / "data" / "understanding.json"
+    try:
+        kept = json.loads(out.read_text()) if out.exists() else {}
+        names = arguments.objectives or ["ppo", "dpo", *zoo_names()]
+        formulas, comparisons = arguments.formulas, arguments.comparisons
+        report = {
+            "versions": package_versions(),
+            "analyses": measure(names),
+            "formulas": kept.get("formulas", [])
+            if formulas is None
+            else [read_formula(path) for path in formulas],
+            "comparisons": kept.get("comparisons", [])
+            if comparisons is None
+            else [read_comparison(path) for path in comparisons],
+        }
+        figure = figures.drift_and_gradient([load_objective(name) for name in names], PROGRESS)
+    except UserError as error:
+        print(f"understanding: {error}", file=sys.stderr)
+        return 2
+    out.parent.mkdir(parents=True, exist_ok=True)
+    write_json(out, report)
+    (arguments.docs / "understanding.md").write_text(markdown(report))
+    figures.save(figure, arguments.docs / "figures" / "understanding.png")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,286 @@
+"""Does a bandit rank objectives as an environment does? Measured before an evolution is spent on it.
+
+An inner loop is useful for meta-training if what it calls fitness ranks objectives as the outcome on
+the environment does. Objectives that are already known (PPO's clip, DPO, none, learned ones) tell:
+each trains agents on the environment and in every regime of a bandit, and Spearman's correlation
+between the two is the regime's alignment.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lpo.drift import ClipDrift, DPODrift, NoDrift
+from lpo.generalization import check_names, check_seeds, learning_curves, training_setting
+from lpo.meta_training import MetaTrainingConfig, TaskTraining, inner_loop
+from lpo.objectives import Objective
+from scb.artefacts import machine_description, package_versions
+from scb.environments.registry import make
+from scb.environments.zoo import home_of
+from scb.errors import UserError
+from scb.evolution import map_population
+from scb.runs import Stopwatch
+from scb.statistics import iqm, spearman
+
+# What an agent trained in a regime can be judged by.
+FITNESSES = (
+    "return, sampled actions",
+    "return, mode actions",
+    "area under the curve",
+    "transfer",
+)
+
+
+@dataclass(frozen=True)
+class Regime:
+    """An inner loop on a bandit.
+
+    Attributes:
+      bandit: a zoo name or file.
+      reward_noise: in standard deviations of the bandit's reward.
+      contexts: of a batch.
+      iterations, epochs, minibatches, learning_rate: where None, those of the evaluation
+        environment's own setting.
+    """
+
+    bandit: str = "Synthetic-Pendulum-v1"
+    reward_noise: float = 5.0
+    contexts: int = 200
+    iterations: int | None = None
+    epochs: int | None = None
+    minibatches: int | None = None
+    learning_rate: float | None = None
+
+    def __post_init__(self) -> None:
+        if home_of(self.bandit) is None:
+            raise UserError(
+                f"a regime asks for a bandit, and {self.bandit!r} is none: give a name such as "
+                "Synthetic-Pendulum-v1, or a file of that name."
+            )
+        for name in ("iterations", "epochs", "minibatches", "contexts"):
+            value = getattr(self, name)
+            if value is not None and value < 1:
+                raise UserError(f"{name} is {value}: it must be at least 1.")
+
+    def task(self, objective: Objective) -> TaskTraining:
+        """The inner loop with this objective."""
+        agent = inner_loop(self.bandit, self.contexts)
+        agent = replace(
+            agent,
+            total_steps=self.contexts * (self.iterations or agent.num_iterations),
+            num_epochs=self.epochs or agent.num_epochs,
+            num_minibatches=self.minibatches or agent.num_minibatches,
+        )
+        config = MetaTrainingConfig(
+            tasks=(self.bandit,), agent=agent, reward_noise=self.reward_noise
+        )
+        task = TaskTraining(config, self.bandit, objective.drift)
+        if self.learning_rate is not None:
+            task.base_hyperparameters = replace(
+                task.base_hyperparameters, learning_rate=self.learning_rate
+            )
+        return task
+
+    def __str__(self) -> str:
+        """What differs from the default."""
+        default = Regime()
+        given = {k: v for k, v in asdict(self).items() if v != getattr(default, k)}
+        return ", ".join(f"{k.replace('_', ' ')} {v}" for k, v in given.items()) or "default"
+
+
+def known_drifts() -> list[Objective]:
+    """Clips from 0.05 to 1, no drift, and DPO over alpha and beta: a family that spans the scale."""
+    key = jax.random.key(0)
+    clips = [ClipDrift(clip) for clip in (0.05, 0.1, 0.2, 0.3, 0.5, 1.0)]
+    closed = [DPODrift(alpha, beta) for alpha, beta in ((1.0, 0.3), (2.0, 0.6), (4.0, 1.2))]
+    return [
+        *(Objective(f"ppo-{drift.clip:g}", ClipDrift(), drift.init(key)) for drift in clips),
+        Objective("none", NoDrift(), NoDrift().init(key)),
+        *(
+            Objective(f"dpo ({drift.alpha:g}, {drift.beta:g})", DPODrift(), drift.init(key))
+            for drift in closed
+        ),
+    ]
+
+
+def outcomes(
+    environment: str,
+    objectives: Sequence[Objective],
+    seeds: Sequence[int],
+    steps: int | None = None,
+    backend: str | None = None,
+) -> dict[str, np.ndarray]:
+    """{objective: [S] return of PPO trained with it}, mode actions; arguments as `learning_curves`."""
+    check_names(objectives)
+    setting = training_setting(environment, steps)
+    return {
+        objective.name: learning_curves(
+            environment, objective, seeds, setting, backend=backend, points=1
+        ).final
+        for objective in objectives
+    }
+
+
+def regime_fitness(
+    regime: Regime, objective: Objective, seeds: Sequence[int]
+) -> dict[str, np.ndarray]:
+    """{fitness: [S]} of agents trained in a regime with an objective, one a seed; see `FITNESSES`.
+
+    Returns are without reward noise. "area under the curve" is the mean over the training of the
+    return with mode actions; "transfer" is the return in the bandit's evaluation environment.
+    """
+    check_seeds(seeds)
+    task = regime.task(objective)
+    home, home_params = make(task.home)
+    hyperparameters = replace(task.base_hyperparameters, drift=objective.parameters)
+
+    def returns(state: Any, key: jax.Array, mode: bool) -> jax.Array:
+        episodes = task.agent.evaluate(
+            state, key, task.evaluation_episodes, task.env, task.env_params, mode=mode
+        )
+        return episodes.returns.mean()
+
+    def train(seed: jax.Array) -> jax.Array:
+        key_train, key_sampled, key_home = jax.random.split(jax.random.key(seed), 3)
+        state, curve = task.agent.train_with_evaluations(
+            key_train,
+            hyperparameters,
+            task.training_params,
+            lambda state, key: returns(state, key, mode=True),
+            every=task.area_every,
+        )
+        transferred = task.agent.evaluate(state, key_home, 20, home, home_params, mode=True)
+        return jnp.stack(
+            [
+                returns(state, key_sampled, mode=False),
+                curve[-1],
+                curve[1:].mean(),
+                transferred.returns.mean(),
+            ]
+        )
+
+    results = map_population(train, len(seeds), (0,))(np.asarray(seeds, np.uint32))
+    return dict(zip(FITNESSES, np.asarray(results, np.float64).T, strict=True))
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """Spearman's correlation between a fitness and an outcome over a family of objectives.
+
+    Attributes:
+      spearman: None where the fitness tells no two objectives apart.
+      low, high: 95 % bootstrap interval over each objective's agents. The family is not resampled:
+        the interval says how well this family's correlation is known, not how another's would be.
+    """
+
+    spearman: float | None
+    low: float
+    high: float
+
+
+def alignment(
+    fitness: Mapping[str, np.ndarray],
+    outcome: Mapping[str, np.ndarray],
+    num_resamples: int = 1000,
+    seed: int = 0,
+) -> Alignment:
+    """How a fitness ranks objectives, against how their outcome does.
+
+    Args:
+      fitness: {objective: [S]}, of which the mean counts, as in meta-training.
+      outcome: {objective: [S']} of the same objectives, of which the interquartile mean counts.
+      num_resamples, seed: of the bootstrap.
+
+    Raises:
+      UserError: other objectives in one than in the other, or fewer than three.
+    """
+    if set(fitness) != set(outcome):
+        raise UserError("fitness and outcome are of different objectives: measure the same ones.")
+    if len(outcome) < 3:
+        raise UserError(
+            f"there are {len(outcome)} objectives, which rank nothing: give at least 3."
+        )
+    names = list(outcome)
+    generator = np.random.default_rng(seed)
+
+    def correlation(resample: bool) -> float | None:
+        def drawn(x: np.ndarray) -> np.ndarray:
+            return x[generator.integers(0, len(x), len(x))] if resample else x
+
+        return spearman(
+            [float(drawn(fitness[n]).mean()) for n in names],
+            [float(iqm(drawn(outcome[n]))) for n in names],
+        )
+
+    resampled = [correlation(True) or 0.0 for _ in range(num_resamples)]
+    low, high = np.percentile(resampled, [2.5, 97.5])
+    return Alignment(correlation(False), float(low), float(high))
+
+
+def measure_alignment(
+    regimes: Sequence[Regime],
+    objectives: Sequence[Objective],
+    environment: str,
+    seeds: Sequence[int],
+    steps: int | None = None,
+    backend: str | None = None,
+    tell: Callable[[str], None] = print,
+) -> dict[str, Any]:
+    """The alignment of every regime's fitnesses with an environment's outcome, ready for JSON.
+
+    Args:
+      regimes: inner loops on bandits.
+      objectives: the family that is ranked.
+      environment, steps, backend: where the outcome is measured.
+      seeds: of the agents in the environment and in the regimes.
+      tell: takes a line when a regime has been measured.
+    """
+    outcome = outcomes(environment, objectives, seeds, steps, backend)
+    ranked = {name: float(iqm(returns)) for name, returns in outcome.items()}
+    tell(f"{environment}: " + ", ".join(f"{n} {x:.0f}" for n, x in ranked.items()))
+    rows = []
+    for regime in regimes:
+        watch = Stopwatch()
+        fitness = {o.name: regime_fitness(regime, o, seeds) for o in objectives}
+        correlations = {
+            name: asdict(alignment({o: x[name] for o, x in fitness.items()}, outcome))
+            for name in FITNESSES
+        }
+        rows.append(
+            {
+                "name": str(regime),
+                **asdict(regime),
+                "alignment": correlations,
+                "mean_fitness": {
+                    o: {name: float(x[name].mean()) for name in FITNESSES}
+                    for o, x in fitness.items()
+                },
+                "seconds": round(watch.lap(), 1),
+            }
+        )
+        tell(
+            f"{regime}: "
+            + "; ".join(f"{name} {correlation_text(c)}" for name, c in correlations.items())
+        )
+    return {
+        "environment": environment,
+        "steps": steps,
+        "backend": backend,
+        "agents": len(seeds),
+        "first_seed": min(seeds),
+        "outcome_iqm": ranked,
+        "regimes": rows,
+        "versions": package_versions(),
+        "machine": machine_description(),
+    }
+
+
+def correlation_text(correlation: Mapping[str, float | None]) -> str:
+    """Such as "0.93 [0.81, 0.98]"."""
+    interval = f"[{correlation['low']:.2f}, {correlation['high']:.2f}]"
+    value = correlation["spearman"]
+    return f"undefined {interval}" if value is None else f"{value:.2f} {interval}"

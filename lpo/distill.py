@@ -1,0 +1,882 @@
+"""Closed forms: a learned drift as a formula, found by symbolic regression, and a drift again.
+
+A network that was learned can be read off and written down, as its authors did when they found DPO
+(Lu et al., 2022); here genetic programming does the reading (gplearn, the extra `distill`), least
+squares sets the numbers, and what comes out is a member of the drift contract:
+
+    relu(base + expression - xi),
+
+where every term of the expression vanishes at ratio 1. A text is checked for that when it is read,
+by its structure, so the conditions of mirror learning hold whatever its numbers are.
+"""
+
+import math
+import re
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+
+from lpo.certificate import certify
+from lpo.drift import BASES, Base, LearnedDrift
+from scb.agents.ppo import MAX_LOG_RATIO, clipped_surrogate_drift
+from scb.errors import UserError, unknown_name
+
+if TYPE_CHECKING:
+    from lpo.objectives import Objective
+
+# What an expression is made of, beside numbers, +, -, * and parentheses: with its largest magnitude
+# in training, and for `d` and `log_r`, which are 0 at ratio 1. A minibatch of 10 000 has no
+# normalised advantage above 100.
+VARIABLES: dict[str, float] = {
+    "d": math.expm1(MAX_LOG_RATIO),  # r - 1
+    "log_r": MAX_LOG_RATIO,
+    "A": 100.0,
+    "progress": 1.0,  # the fraction of training done
+}
+VANISHING = ("d", "log_r")
+# All three are 0 at 0 and continuous, so that what vanishes inside vanishes outside.
+FUNCTIONS = ("tanh", "relu", "abs")
+# Float32 ends at 3e38; its gradient multiplies a term once more.
+LARGEST = 1e30
+LONGEST = 4000
+DEEPEST = 50
+
+_NUMBER = r"(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?"
+_TOKEN = re.compile(rf"\s*(?:({_NUMBER})|(\w+)|(.))", re.S)
+
+# Any: an array of NumPy, JAX or another library with abs and tanh.
+_Array: TypeAlias = Any
+
+
+@dataclass(frozen=True)
+class Node:
+    """An expression's part: `operator` is "number", "variable", "+", "*", "negative" or a function.
+
+    Sums and products have any number of arguments, so that a long text is no deep tree.
+
+    A number is held by its position among the expression's numbers, a variable by its name.
+    """
+
+    operator: str
+    arguments: tuple["Node", ...] = ()
+    position: int = -1
+    name: str = ""
+
+
+@dataclass(frozen=True)
+class Expression:
+    """A text, what it says, and its numbers in their order."""
+
+    text: str
+    root: Node
+    constants: tuple[float, ...]
+
+
+@lru_cache(maxsize=256)
+def parse(text: str) -> Expression:
+    """Reads an expression such as "0.5*A*d - tanh(2*A*log_r)"; nothing in it is ever run.
+
+    Raises:
+      UserError: says at which character it stops being one; or a term does not vanish at ratio 1, or
+        grows beyond 32-bit numbers.
+    """
+    if len(text) > LONGEST:
+        raise UserError(
+            f"the expression has {len(text)} characters: at most {LONGEST} are read, so shorten it."
+        )
+    expression = _Parser(text).expression()
+    if not _vanishes(expression.root):
+        raise UserError(
+            f"the expression {_quoted(text)} does not vanish at ratio 1 whatever its numbers are: give every "
+            "term a factor d (r - 1) or log_r."
+        )
+    bound = _bound(expression.root, expression.constants)
+    if not bound <= LARGEST:
+        raise UserError(
+            f"the expression {_quoted(text)} grows beyond 32-bit numbers at the largest ratios of training: "
+            "use lower powers, or tanh(d) in place of d."
+        )
+    return expression
+
+
+class _Parser:
+    """Recursive descent over sum := term ((+|-) term)*, term := factor (* factor)*."""
+
+    def __init__(self, text: str) -> None:
+        self.text = text
+        self.tokens = [
+            (m.group(1) or m.group(2) or m.group(3), m.start(m.lastindex or 0))
+            for m in _TOKEN.finditer(text.rstrip())
+        ]
+        self.next = 0
+        self.depth = 0
+        self.constants: list[float] = []
+
+    def expression(self) -> Expression:
+        root = self.sum()
+        if self.next < len(self.tokens):
+            raise self.unexpected("+, - or *")
+        return Expression(self.text, root, tuple(self.constants))
+
+    def peek(self) -> str:
+        return self.tokens[self.next][0] if self.next < len(self.tokens) else ""
+
+    def take(self, token: str) -> bool:
+        found = self.peek() == token
+        self.next += found
+        return found
+
+    def sum(self) -> Node:
+        terms = [self.term()]
+        while True:
+            if self.take("+"):
+                terms.append(self.term())
+            elif self.take("-"):
+                terms.append(Node("negative", (self.term(),)))
+            else:
+                return Node("+", tuple(terms)) if len(terms) > 1 else terms[0]
+
+    def term(self) -> Node:
+        factors = [self.factor()]
+        while self.take("*"):
+            factors.append(self.factor())
+        return Node("*", tuple(factors)) if len(factors) > 1 else factors[0]
+
+    def factor(self) -> Node:
+        self.depth += 1
+        if self.depth > DEEPEST:
+            raise UserError(
+                f"the expression {_quoted(self.text)} is nested more than {DEEPEST} deep: simplify it."
+            )
+        node = self.innermost()
+        self.depth -= 1
+        return node
+
+    def innermost(self) -> Node:
+        if self.take("-"):
+            return Node("negative", (self.factor(),))
+        if self.take("("):
+            return self.closed(self.sum())
+        token = self.peek()
+        if re.fullmatch(_NUMBER, token):
+            return self.number(float(token))
+        if token in VARIABLES:
+            self.next += 1
+            return Node("variable", name=token)
+        if token in FUNCTIONS:
+            self.next += 1
+            if not self.take("("):
+                raise self.unexpected(f"( after {token}")
+            return Node(token, (self.closed(self.sum()),))
+        raise self.unexpected(
+            f"a number, {', '.join(VARIABLES)}, {', '.join(FUNCTIONS)}, - or parentheses"
+        )
+
+    def number(self, value: float) -> Node:
+        if value > LARGEST:
+            raise self.unexpected(f"a number of at most {LARGEST:g}")
+        self.next += 1
+        self.constants.append(value)
+        return Node("number", position=len(self.constants) - 1)
+
+    def closed(self, node: Node) -> Node:
+        if not self.take(")"):
+            raise self.unexpected("+, -, * or )")
+        return node
+
+    def unexpected(self, expected: str) -> UserError:
+        if self.next < len(self.tokens):
+            token, start = self.tokens[self.next]
+            found = f"{_quoted(token)} at character {start + 1}"
+        else:
+            found = "its end"
+        return UserError(
+            f"the expression {_quoted(self.text)} has {found} where {expected} is expected: correct it there."
+        )
+
+
+def _quoted(text: str) -> str:
+    return repr(text if len(text) <= 60 else f"{text[:57]}...")
+
+
+def _vanishes(node: Node) -> bool:
+    """Whether a part is 0 at ratio 1, whatever the numbers, the advantage and the progress are."""
+    if node.operator == "variable":
+        return node.name in VANISHING
+    if node.operator == "number":
+        return False
+    combine = any if node.operator == "*" else all
+    return combine(_vanishes(argument) for argument in node.arguments)
+
+
+def _bound(node: Node, constants: Sequence[float]) -> float:
+    """A bound of every intermediate value's magnitude; infinite where one is beyond `LARGEST`."""
+    if node.operator == "variable":
+        return VARIABLES[node.name]
+    if node.operator == "number":
+        return abs(constants[node.position])
+    bounds = [_bound(argument, constants) for argument in node.arguments]
+    if any(bound > LARGEST for bound in bounds):
+        return math.inf
+    if node.operator == "tanh":
+        return min(1.0, bounds[0])
+    return math.prod(bounds) if node.operator == "*" else sum(bounds)
+
+
+def evaluate(
+    node: Node,
+    constants: Sequence[float] | _Array,
+    variables: Mapping[str, _Array],
+    library: Any,
+) -> _Array:
+    """The value of an expression.
+
+    Args:
+      node: its root.
+      constants: [K] numbers in their order.
+      variables: [B] arrays under the names of `VARIABLES`.
+      library: `jax.numpy`, `numpy`, or another with `abs` and `tanh`.
+
+    Returns:
+      [B].
+    """
+    if node.operator == "number":
+        return constants[node.position]
+    if node.operator == "variable":
+        return variables[node.name]
+    values = [evaluate(argument, constants, variables, library) for argument in node.arguments]
+    match node.operator:
+        case "+":
+            return sum(values[1:], start=values[0])
+        case "*":
+            return math.prod(values[1:], start=values[0])
+        case "negative":
+            return -values[0]
+        case function:
+            return _FUNCTIONS[function](values[0], library)
+
+
+_FUNCTIONS: dict[str, Callable[[_Array, Any], _Array]] = {
+    "tanh": lambda x, library: library.tanh(x),
+    "relu": lambda x, library: 0.5 * (x + library.abs(x)),
+    "abs": lambda x, library: library.abs(x),
+}
+
+
+@dataclass(frozen=True)
+class ClosedFormDrift:
+    """A formula as a drift: relu(base + expression - xi).
+
+    Its parameters are the formula's numbers, so they can be traced and evolved like a network's
+    weights. The conditions of mirror learning hold whatever they are: expression and base vanish at
+    ratio 1, both are continuous, and relu(. - xi) is flat around 0.
+
+    Attributes:
+      expression: in the language of `parse`: numbers, d (r - 1), log_r, A, progress; +, -, *, tanh,
+        relu, abs.
+      base, clip, xi: as `LearnedDrift`'s.
+
+    Raises:
+      UserError: as `parse`.
+    """
+
+    expression: str
+    base: Base = "none"
+    clip: float = 0.2
+    xi: float = 1e-6
+
+    def __post_init__(self) -> None:
+        parse(self.expression)
+        if self.base not in BASES:
+            raise unknown_name("drift base", self.base, BASES)
+        if not (self.clip > 0 and self.xi > 0):
+            raise UserError(f"clip and xi are {self.clip} and {self.xi}: both must be positive.")
+
+    @property
+    def temporal(self) -> bool:
+        """Whether it changes with the fraction of training done."""
+        return any(node.name == "progress" for node in _nodes(parse(self.expression).root))
+
+    def init(self, key: jax.Array) -> dict[str, jax.Array]:
+        """The numbers that the text has; nothing about them is random."""
+        return {"constants": jnp.asarray(parse(self.expression).constants, jnp.float32)}
+
+    def with_parameters(self, parameters: Any) -> "ClosedFormDrift":
+        """The same formula with these numbers in its text, which reads back to charge exactly the same.
+
+        A negative number becomes a minus sign and its magnitude, since numbers are read without one.
+        """
+        values = iter(np.asarray(parameters["constants"], np.float32))
+
+        def replaced(match: re.Match[str]) -> str:
+            if match.group(1) is None:
+                return match.group()
+            return match.group().removesuffix(match.group(1)) + str(next(values))
+
+        text = _TOKEN.sub(replaced, self.expression)
+        return replace(self, expression=text)
+
+    def __call__(
+        self, parameters: Any, log_ratio: jax.Array, advantage: jax.Array, progress: jax.Array
+    ) -> jax.Array:
+        chex.assert_equal_shape([log_ratio, advantage, progress])
+        variables = {
+            "d": jnp.expm1(log_ratio),
+            "log_r": log_ratio,
+            "A": advantage,
+            "progress": progress,
+        }
+        root = parse(self.expression).root
+        penalty = evaluate(root, parameters["constants"], variables, jnp)
+        if self.base == "ppo":
+            penalty = penalty + clipped_surrogate_drift(self.clip, log_ratio, advantage, progress)
+        return jax.nn.relu(penalty - self.xi)
+
+
+def _nodes(node: Node) -> Iterator[Node]:
+    yield node
+    for argument in node.arguments:
+        yield from _nodes(argument)
+
+
+# -- the search -----------------------------------------------------------------------------------
+
+# A sum of coefficients times products. A product's factors, sorted, are variables, "abs(A)", and
+# functions of further sums. Programs that are the same formula become the same sum, with no number
+# in two places.
+_Factor: TypeAlias = "str | tuple[str, _Sum]"
+_Sum: TypeAlias = "tuple[tuple[tuple[_Factor, ...], float], ...]"
+
+# What gplearn combines: each is 0 at ratio 1 and so is whatever it makes of them.
+_TERMINALS: tuple[tuple[str, ...], ...] = (
+    ("d",),
+    ("log_r",),
+    ("A", "d"),
+    ("A", "log_r"),
+    ("abs(A)", "d"),
+    ("abs(A)", "log_r"),
+)
+_MOST_TERMS = 12
+_UNITS = 60
+# In standard deviations of a term.
+_FIRST_STEPS = (-1.0, -0.3, -0.1, 0.1, 0.3, 1.0)
+_PROMISING = 4
+# Central differences over 2 % of the ratio: at a kink, both slopes are those of the same secant.
+_STEP = 0.01
+
+
+@dataclass(frozen=True)
+class DistillConfig:
+    """How a closed form is looked for.
+
+    Attributes:
+      samples: points that the fit sees; as many again, which it doesn't, judge the result.
+      population_size, generations: of the genetic programming.
+      parsimony: fitness (R²) that a program pays for each of its nodes.
+      candidates: formulas whose numbers are set by least squares, the best of each length.
+      grown: the best of these, to which further terms are added one by one.
+      numbers: that a formula may grow to.
+      tolerance: R² that a shorter formula may lack to be taken instead of the best, and that a
+        further term must add.
+      seed: decides everything.
+    """
+
+    samples: int = 1000
+    population_size: int = 1000
+    generations: int = 20
+    parsimony: float = 0.001
+    candidates: int = 40
+    grown: int = 4
+    numbers: int = 18
+    tolerance: float = 0.005
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name, least in (
+            ("samples", 100),
+            ("population_size", 20),
+            ("generations", 1),
+            ("candidates", 1),
+            ("grown", 1),
+            ("numbers", 1),
+        ):
+            if getattr(self, name) < least:
+                raise UserError(f"{name} is {getattr(self, name)}: it must be at least {least}.")
+        if self.parsimony < 0 or self.tolerance < 0:
+            raise UserError(
+                f"parsimony and tolerance are {self.parsimony} and {self.tolerance}: both must be 0 or larger."
+            )
+
+
+@dataclass(frozen=True)
+class Distillation:
+    """A closed form and how well it fits.
+
+    Attributes:
+      drift: the closed form.
+      parameters: its numbers.
+      r2: on points that the fit has not seen, of the "drift" and of its "slope" d f/d(log r), which
+        is all that training notices.
+      base_r2: the same of the base alone, with nothing added: what the formula must improve on.
+      front: {"size", "r2" (on the fit's points, value and slope together), "expression"}, of the
+        formulas that no shorter one equals; sizes count numbers, variables and functions.
+      seconds: that it took.
+    """
+
+    drift: ClosedFormDrift
+    parameters: dict[str, jax.Array]
+    r2: dict[str, float]
+    base_r2: dict[str, float]
+    front: list[dict[str, Any]]
+    seconds: float
+
+
+def distill(objective: "Objective", config: DistillConfig | None = None) -> Distillation:
+    """Fits a closed form to an objective's drift and to its slope.
+
+    gplearn looks for the structure, by the mean of the two R² of what the whole drift, base and
+    relu included, then is; least squares sets the numbers of the best formulas of each length; the
+    best of them get further terms as long as those help, and lose terms that hardly matter. Of all
+    these, the shortest within `tolerance` of the best is taken.
+
+    Args:
+      objective: a learned one as a rule, whose base is kept; any other is fitted without a base.
+      config: how to look.
+
+    Raises:
+      UserError: gplearn is not installed, or the drift charges nothing anywhere.
+    """
+    start = time.perf_counter()
+    config = config or DistillConfig()
+    drift = objective.drift
+    shape: dict[str, Any] = {"base": "none"}
+    if isinstance(drift, LearnedDrift | ClosedFormDrift):
+        shape = {"base": drift.base, "clip": drift.clip, "xi": drift.xi}
+    rng = np.random.default_rng(config.seed)
+    temporal = bool(getattr(drift, "temporal", False))
+    fit = _Data(objective, sample_updates(rng, config.samples), shape)
+    if not fit.drift.max() > 0.0:
+        raise UserError(
+            f"{objective.name} charges nothing where updates go: there is no drift to write as a formula."
+        )
+    programs = _programs(fit, config, temporal)
+    formulas = _formulas(programs, config.candidates)
+    tuned = [_tune(formula, fit) for formula in formulas]
+    tuned.sort(key=lambda found: -found[1])
+    library = _library(rng, temporal)
+    grown = [g for f in tuned[: config.grown] for g in _grow(*f, fit, library, config)]
+    # Dropping terms one by one takes long: only from the best.
+    longest = sorted([*tuned, *grown], key=lambda found: -found[1])[: config.grown]
+    shorter = [_drop_terms(*found, fit, config.tolerance) for found in longest]
+    front = _front([*tuned, *grown, *shorter])
+    held_out = sample_updates(rng, config.samples)
+    best = max(score for _, score, _ in front)
+    # Shortest first: the first that is good enough and holds. By construction, all of them hold.
+    for text, score, _ in front:
+        if score < best - config.tolerance:
+            continue
+        closed = ClosedFormDrift(text, **shape)
+        parameters = closed.init(jax.random.key(0))
+        if certify(closed, parameters).holds:
+            break
+    else:
+        raise UserError(
+            f"no formula for {objective.name} passes as a drift: search with another seed."
+        )
+    nothing = ClosedFormDrift("0*d", **shape)
+    return Distillation(
+        drift=closed,
+        parameters=parameters,
+        r2=fit_quality(objective, closed, parameters, held_out),
+        base_r2=fit_quality(objective, nothing, nothing.init(jax.random.key(0)), held_out),
+        front=[{"size": size, "r2": score, "expression": text} for text, score, size in front],
+        seconds=time.perf_counter() - start,
+    )
+
+
+def sample_updates(rng: np.random.Generator, samples: int) -> dict[str, NDArray[np.floating]]:
+    """Where updates go: [samples] each of log_ratio, advantage and progress.
+
+    Log-ratios are normal with a standard deviation of 0.3, a tenth of them with 0.6, cut off at
+    ±1.2; advantages are standard normal; training fractions are uniform. Heavier tails would leave
+    R² to a handful of points.
+    """
+    spread = np.where(rng.uniform(size=samples) < 0.1, 0.6, 0.3)
+    return {
+        "log_ratio": np.clip(rng.standard_normal(samples) * spread, -1.2, 1.2),
+        "advantage": rng.standard_normal(samples),
+        "progress": rng.uniform(size=samples),
+    }
+
+
+def fit_quality(
+    objective: "Objective",
+    drift: ClosedFormDrift,
+    parameters: Any,
+    points: Mapping[str, NDArray[np.floating]],
+) -> dict[str, float]:
+    """R² of a closed form: of the "drift", and of the "slope" d f/d(log r) by differentiation."""
+    x, a, p = (jnp.asarray(points[k], jnp.float32) for k in ("log_ratio", "advantage", "progress"))
+
+    def both(f: Any, parameters: Any) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
+        slope = jax.grad(lambda x: f(parameters, x, a, p).sum())(x)
+        return np.asarray(f(parameters, x, a, p), float), np.asarray(slope, float)
+
+    target, found = both(objective.drift, objective.parameters), both(drift, parameters)
+    return {name: _r2(t, f) for name, t, f in zip(("drift", "slope"), target, found, strict=True)}
+
+
+def _r2(target: NDArray[np.floating], found: NDArray[np.floating]) -> float:
+    spread = ((target - target.mean()) ** 2).sum()
+    return float(1.0 - ((target - found) ** 2).sum() / spread) if spread > 0 else 0.0
+
+
+class _Data:
+    """The points of the fit, thrice: at each log-ratio and a step to either side of it."""
+
+    def __init__(
+        self,
+        objective: "Objective",
+        points: Mapping[str, NDArray[np.floating]],
+        shape: Mapping[str, Any],
+    ) -> None:
+        x = points["log_ratio"]
+        x = np.concatenate([x, x + _STEP, x - _STEP])
+        a, p = np.tile(points["advantage"], 3), np.tile(points["progress"], 3)
+        # As the closed form will compute it: its own base, and nothing of the network's.
+        self.xi = float(shape.get("xi", ClosedFormDrift.xi))
+        self.base = np.zeros_like(x)
+        if shape["base"] == "ppo":
+            clip, ratio = shape["clip"], np.exp(x)
+            self.base = np.maximum((ratio - np.clip(ratio, 1.0 - clip, 1.0 + clip)) * a, 0.0)
+        self.variables = {"d": np.expm1(x), "log_r": x, "A": a, "abs(A)": np.abs(a), "progress": p}
+        f = objective.drift(objective.parameters, *(jnp.asarray(v, jnp.float32) for v in (x, a, p)))
+        self.drift, self.slope = self._split(np.asarray(f, float))
+        # Residuals in units of the standard deviation: 1 - R² is the mean of their squares.
+        self._scales = [max(float(v.std()), 1e-12) for v in (self.drift, self.slope)]
+
+    @staticmethod
+    def _split(f: NDArray[np.floating]) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
+        here, right, left = np.split(f, 3)
+        return here, (right - left) / (2.0 * _STEP)
+
+    def residuals(self, added: NDArray[np.floating]) -> NDArray[np.floating]:
+        """[3 S] values of an expression -> [2 S] scaled errors of drift and slope."""
+        drift, slope = self._split(np.maximum(self.base + added - self.xi, 0.0))
+        return np.concatenate(
+            [(drift - self.drift) / self._scales[0], (slope - self.slope) / self._scales[1]]
+        )
+
+    def score(self, added: NDArray[np.floating]) -> float:
+        """The mean of the two R²."""
+        return float(1.0 - np.mean(self.residuals(added) ** 2))
+
+
+def _programs(data: _Data, config: DistillConfig, temporal: bool) -> list[list[Any]]:
+    """The programs of all of gplearn's generations, best first, as lists in prefix notation."""
+    try:
+        from gplearn.fitness import make_fitness
+        from gplearn.functions import make_function
+        from gplearn.genetic import SymbolicRegressor
+    except ImportError as error:
+        raise UserError(
+            "distilling needs the package gplearn: install the extra `distill`."
+        ) from error
+    terminals = [*_TERMINALS, *((*t, "progress") for t in _TERMINALS if temporal)]
+    inputs = np.stack(
+        [np.prod([data.variables[name] for name in terminal], axis=0) for terminal in terminals],
+        axis=-1,
+    )
+
+    def fitness(
+        target: NDArray[np.floating], found: NDArray[np.floating], weight: NDArray[np.floating]
+    ) -> float:
+        # gplearn tries a new measure on two points of its own.
+        if found.shape != data.base.shape:
+            return 0.0
+        # A hopeless program must not overflow on its way out.
+        return max(data.score(np.clip(found, -1e6, 1e6)), -10.0)
+
+    def unary(name: str, function: Callable[[Any], Any]) -> Any:
+        return make_function(function=function, name=name, arity=1, wrap=False)
+
+    search = SymbolicRegressor(
+        population_size=config.population_size,
+        generations=config.generations,
+        tournament_size=max(2, config.population_size // 50),
+        # A number of its own would not vanish at ratio 1: programs multiply by these instead, and
+        # least squares finds the numbers afterwards.
+        const_range=None,
+        function_set=(
+            "add",
+            "sub",
+            "mul",
+            unary("tanh", lambda x: np.tanh(x)),
+            unary("relu", lambda x: np.maximum(x, 0.0)),
+            unary("half", lambda x: 0.5 * x),
+            unary("double", lambda x: 2.0 * x),
+        ),
+        init_depth=(1, 4),
+        metric=make_fitness(function=fitness, greater_is_better=True, wrap=False),
+        parsimony_coefficient=config.parsimony,
+        p_crossover=0.7,
+        p_subtree_mutation=0.1,
+        p_hoist_mutation=0.05,
+        p_point_mutation=0.1,
+        random_state=config.seed,
+    )
+    with np.errstate(all="ignore"):
+        search.fit(inputs, np.zeros(len(inputs)))
+    kept = [p for generation in search._programs for p in generation if p is not None]
+    kept.sort(key=lambda program: -program.raw_fitness_)
+    return [
+        [terminals[x] if isinstance(x, int) else (x.name, x.arity) for x in program.program]
+        for program in kept
+    ]
+
+
+def _formulas(programs: Sequence[Sequence[Any]], number: int) -> list[_Sum]:
+    """The best formulas, at most three of a size, each once; programs come best first."""
+    found: dict[Any, _Sum] = {}
+    sizes: dict[int, int] = {}
+    for program in programs:
+        formula = _as_sum(program)
+        if not formula or len(formula) > _MOST_TERMS:
+            continue
+        structure, size = _structure(formula), _size(formula)
+        if structure in found or sizes.get(size, 0) >= 3:
+            continue
+        found[structure] = formula
+        sizes[size] = sizes.get(size, 0) + 1
+        if len(found) == number:
+            break
+    return list(found.values())
+
+
+def _as_sum(program: Sequence[Any]) -> _Sum:
+    """A program in prefix notation as a sum, multiplied out; empty where it grew too long."""
+    stack: list[_Sum] = []
+    # Backwards: a function's arguments lie on the stack, the first on top, when it is met.
+    for symbol in reversed(program):
+        if symbol[0] not in _OPERATIONS:
+            stack.append(((tuple(sorted(symbol)), 1.0),))
+            continue
+        name, arity = symbol
+        arguments = [stack.pop() for _ in range(arity)]
+        made = _OPERATIONS[name](*arguments)
+        if len(made) > 4 * _MOST_TERMS:
+            return ()
+        stack.append(made)
+    return stack[0]
+
+
+def _collect(terms: "Sequence[tuple[tuple[_Factor, ...], float]]") -> _Sum:
+    total: dict[tuple[_Factor, ...], float] = {}
+    for factors, coefficient in terms:
+        total[factors] = total.get(factors, 0.0) + coefficient
+    return tuple(sorted(((k, v) for k, v in total.items() if v != 0.0), key=repr))
+
+
+def _scale(terms: _Sum, by: float) -> _Sum:
+    return tuple((factors, by * coefficient) for factors, coefficient in terms)
+
+
+def _product(left: _Sum, right: _Sum) -> _Sum:
+    return _collect([(tuple(sorted(f + g, key=repr)), c * k) for f, c in left for g, k in right])
+
+
+def _function(name: str) -> Callable[[_Sum], _Sum]:
+    def made(argument: _Sum) -> _Sum:
+        if not argument:
+            return ()
+        if name == "relu":  # a positive factor inside is the same as one outside
+            size = max(abs(c) for _, c in argument)
+            return (((("relu", _scale(argument, 1.0 / size)),), size),)
+        return ((((name, argument),), 1.0),)
+
+    return made
+
+
+_OPERATIONS: dict[str, Callable[..., _Sum]] = {
+    "add": lambda x, y: _collect([*x, *y]),
+    "sub": lambda x, y: _collect([*x, *_scale(y, -1.0)]),
+    "mul": _product,
+    "half": lambda x: _scale(x, 0.5),
+    "double": lambda x: _scale(x, 2.0),
+    "tanh": _function("tanh"),
+    "relu": _function("relu"),
+}
+
+
+def _structure(terms: _Sum) -> Any:
+    """A formula without its numbers."""
+    return tuple(
+        tuple(f if isinstance(f, str) else (f[0], _structure(f[1])) for f in factors)
+        for factors, _ in terms
+    )
+
+
+def _size(terms: _Sum) -> int:
+    """Numbers, variables and functions in a formula."""
+    return sum(
+        1 + sum(1 if isinstance(f, str) else 1 + _size(f[1]) for f in factors)
+        for factors, _ in terms
+    )
+
+
+def _numbers(terms: _Sum) -> list[float]:
+    """A formula's coefficients, each followed by those inside its term's functions."""
+    found = []
+    for factors, coefficient in terms:
+        found.append(coefficient)
+        for factor in factors:
+            if not isinstance(factor, str):
+                found += _numbers(factor[1])
+    return found
+
+
+def _with_numbers(terms: _Sum, numbers: Iterator[float]) -> _Sum:
+    """The inverse of `_numbers`."""
+    made = []
+    for factors, _ in terms:
+        coefficient = next(numbers)
+        inside = tuple(
+            f if isinstance(f, str) else (f[0], _with_numbers(f[1], numbers)) for f in factors
+        )
+        made.append((inside, float(coefficient)))
+    return tuple(made)
+
+
+def _value(terms: _Sum, variables: Mapping[str, NDArray[np.floating]]) -> NDArray[np.floating]:
+    total = np.zeros_like(variables["d"])
+    for factors, coefficient in terms:
+        term = np.full_like(total, coefficient)
+        for factor in factors:
+            if isinstance(factor, str):
+                term = term * variables[factor]
+            else:
+                term = term * _FUNCTIONS[factor[0]](_value(factor[1], variables), np)
+        total = total + term
+    return total
+
+
+def _tune(terms: _Sum, data: _Data, evaluations: int = 20) -> tuple[_Sum, float]:
+    """A formula with the numbers that fit best, and its score."""
+    from scipy.optimize import least_squares
+
+    def residuals(numbers: NDArray[np.floating]) -> NDArray[np.floating]:
+        value = _value(_with_numbers(terms, iter(numbers)), data.variables)
+        # The mean of squares must stay finite on the way.
+        return np.clip(data.residuals(np.clip(value, -1e6, 1e6)), -1e6, 1e6)
+
+    found = least_squares(residuals, _numbers(terms), max_nfev=evaluations).x
+    # Four digits are what the text keeps, and so what is scored.
+    rounded = _with_numbers(terms, (float(f"{x:.4g}") for x in found))
+    return rounded, data.score(_value(rounded, data.variables))
+
+
+def _library(rng: np.random.Generator, temporal: bool) -> list[_Sum]:
+    """Terms to grow by: products of at most two terminals, and tanh of random sums of three."""
+    terminals = [*_TERMINALS, *((*t, "progress") for t in _TERMINALS if temporal)]
+    singles: list[_Sum] = [((tuple(sorted(t)), 1.0),) for t in terminals]
+    pairs = [_product(x, y) for i, x in enumerate(singles) for y in singles[i:]]
+    tanh = _function("tanh")
+    units = []
+    for _ in range(_UNITS):
+        chosen = rng.choice(len(singles), 3, replace=False)
+        # Inputs are around 0.3: weights of 3 bring tanh to where it bends.
+        units.append(
+            tanh(_collect([(singles[i][0][0], 3.0 * rng.standard_normal()) for i in chosen]))
+        )
+    return [*singles, *pairs, *units]
+
+
+def _grow(
+    terms: _Sum, score: float, data: _Data, library: Sequence[_Sum], config: DistillConfig
+) -> list[tuple[_Sum, float]]:
+    """The formula with one more term, with two more, ..., as long as each adds the tolerance."""
+    values = [_value(term, data.variables) for term in library]
+    steps = [s / max(float(v.std()), 1e-12) for v in values for s in _FIRST_STEPS]
+    grown: list[tuple[_Sum, float]] = []
+    while True:
+        here = _value(terms, data.variables)
+        # One step along every term shows which are worth a fit of all numbers.
+        tried = [
+            (data.score(here + step * values[i // len(_FIRST_STEPS)]), i)
+            for i, step in enumerate(steps)
+        ]
+        promising = dict.fromkeys(
+            (i // len(_FIRST_STEPS), steps[i]) for _, i in sorted(tried, reverse=True)[:_PROMISING]
+        )
+        fits = [
+            _tune(longer, data)
+            for i, step in promising
+            for longer in [_collect([*terms, *_scale(library[i], step)])]
+            if len(_numbers(longer)) <= config.numbers
+        ]
+        best = max(fits, key=lambda found: found[1], default=None)
+        if best is None or best[1] < score + config.tolerance:
+            return grown
+        terms, score = best
+        grown.append(best)
+
+
+def _drop_terms(terms: _Sum, score: float, data: _Data, tolerance: float) -> tuple[_Sum, float]:
+    """Leaves out term after term while the score falls by less than a third of the tolerance in all."""
+    floor = score - tolerance / 3.0
+    while True:
+        shorter = [_tune(fewer, data, 10) for fewer in _one_fewer(terms)]
+        best = max(shorter, key=lambda found: found[1], default=None)
+        if best is None or best[1] < floor:
+            return terms, score
+        terms, score = best
+
+
+def _one_fewer(terms: _Sum) -> Iterator[_Sum]:
+    """The formulas that lack one term, of the sum or inside a function; never an empty sum."""
+    for i, (factors, coefficient) in enumerate(terms):
+        if len(terms) > 1:
+            yield (*terms[:i], *terms[i + 1 :])
+        for j, factor in enumerate(factors):
+            if not isinstance(factor, str):
+                for inside in _one_fewer(factor[1]):
+                    made = (*factors[:j], (factor[0], inside), *factors[j + 1 :])
+                    yield (*terms[:i], (made, coefficient), *terms[i + 1 :])
+
+
+def _front(found: Sequence[tuple[_Sum, float]]) -> list[tuple[str, float, int]]:
+    """(text, score, size) of the readable formulas that no shorter or equally long one matches, shortest first."""
+    front: list[tuple[str, float, int]] = []
+    for terms, score in sorted(found, key=lambda f: (_size(f[0]), -f[1])):
+        if not math.isfinite(score) or (front and score <= front[-1][1]):
+            continue
+        text = as_text(terms)
+        try:
+            parse(text)
+        except UserError:  # it grows too fast, or became too long or deep
+            continue
+        front.append((text, score, _size(terms)))
+    if not front:
+        raise UserError(
+            "the search found no formula that stays finite: give it more generations or another seed."
+        )
+    return front
+
+
+def as_text(terms: _Sum) -> str:
+    """A sum in the language of `parse`; a coefficient of 1 is left out."""
+    text = ""
+    for factors, coefficient in terms:
+        sign, size = ("-" if coefficient < 0 else "+"), f"{abs(coefficient):.4g}"
+        shown = [f if isinstance(f, str) else f"{f[0]}({as_text(f[1])})" for f in factors]
+        term = "*".join([*([] if size == "1" else [size]), *shown])
+        text += f" {sign} {term}" if text else (term if sign == "+" else f"-{term}")
+    return text

@@ -1,0 +1,225 @@
+"""Objectives outside this library: the drift as a plain function in JAX, NumPy or PyTorch.
+
+A PPO that is not this project's maximises `mean(ratio * advantage - drift)` in place of the mean of
+its clipped minimum (Lu et al., 2022). What a drift was learned on comes with it: log-ratios clipped
+at ±`MAX_LOG_RATIO`, and advantages that the caller has normalised over the minibatch.
+
+    policy_loss = lpo.torch_loss("lpo-pendulum")
+    loss = policy_loss(new_log_prob - old_log_prob, advantage, progress)
+"""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+
+from lpo.drift import ClipDrift, DPODrift, LearnedDrift, NoDrift
+from lpo.objectives import Objective, load_objective
+from scb.agents.ppo import MAX_LOG_RATIO
+from scb.errors import UserError
+
+if TYPE_CHECKING:
+    import torch
+
+    TorchFunction: TypeAlias = Callable[
+        [torch.Tensor, torch.Tensor, float | torch.Tensor], torch.Tensor
+    ]
+
+# Any: an array of either library, and the library, `numpy` or `torch`. Both follow the array API
+# standard in what is used here, so that each formula is written once.
+_Formula: TypeAlias = Callable[[Any, Any, Any, Any], Any]
+
+
+def drift_function(
+    objective: Objective | str | Path,
+) -> Callable[[ArrayLike, ArrayLike, ArrayLike], jax.Array]:
+    """The drift of an objective, its parameters filled in, for JAX: pure, to be jitted and differentiated.
+
+    Args:
+      objective: as from `load_objective`, or what that takes.
+
+    Returns:
+      (log_ratio, advantage, progress) -> penalty:
+        log_ratio: [...] log pi(a|s) - log pi_behaviour(a|s), in nats; clipped at ±MAX_LOG_RATIO.
+        advantage: [...] normalised over the minibatch.
+        progress: a number or [...], the fraction of training done, in [0, 1]. Only temporal drifts
+          depend on it.
+        penalty: [...], in units of the advantage.
+      It raises a UserError where log_ratio and advantage differ in shape.
+
+    Raises:
+      UserError: as `load_objective`.
+    """
+    objective = _loaded(objective)
+
+    def penalty(log_ratio: ArrayLike, advantage: ArrayLike, progress: ArrayLike) -> jax.Array:
+        log_ratio, advantage = jnp.asarray(log_ratio), jnp.asarray(advantage)
+        dtype = jnp.result_type(log_ratio, advantage, jnp.float32)
+        log_ratio, advantage = log_ratio.astype(dtype), advantage.astype(dtype)
+        _check_shapes(log_ratio, advantage)
+        log_ratio = jnp.clip(log_ratio, -MAX_LOG_RATIO, MAX_LOG_RATIO)
+        progress = jnp.broadcast_to(jnp.asarray(progress, dtype), log_ratio.shape)
+        return objective.drift(objective.parameters, log_ratio, advantage, progress)
+
+    return penalty
+
+
+def numpy_drift(
+    objective: Objective | str | Path,
+) -> Callable[[ArrayLike, ArrayLike, ArrayLike], np.ndarray]:
+    """The drift of an objective for NumPy; arguments and errors as for `drift_function`.
+
+    It computes in the floating-point type of what it is given, and in float64 for lists and
+    integers.
+
+    Raises:
+      UserError: as `load_objective`, or the drift is of a family that lpo does not know.
+    """
+    formula = _formula(_loaded(objective))
+
+    def penalty(log_ratio: ArrayLike, advantage: ArrayLike, progress: ArrayLike) -> np.ndarray:
+        log_ratio, advantage = np.asarray(log_ratio), np.asarray(advantage)
+        dtype = np.result_type(log_ratio, advantage, np.float32)
+        log_ratio, advantage = log_ratio.astype(dtype), advantage.astype(dtype)
+        return np.asarray(_evaluate(np, formula, log_ratio, advantage, progress))
+
+    return penalty
+
+
+def torch_drift(objective: Objective | str | Path) -> "TorchFunction":
+    """The drift of an objective for PyTorch, differentiable; arguments and errors as for `drift_function`.
+
+    It takes tensors and computes in log_ratio's type and on its device.
+
+    Raises:
+      UserError: as for `numpy_drift`, or PyTorch is not installed.
+    """
+    try:
+        import torch
+    except ImportError as error:
+        raise UserError(
+            "a drift for PyTorch needs the package torch: install the extra `torch`."
+        ) from error
+    formula = _formula(_loaded(objective))
+
+    def penalty(
+        log_ratio: "torch.Tensor", advantage: "torch.Tensor", progress: "float | torch.Tensor"
+    ) -> "torch.Tensor":
+        result: torch.Tensor = _evaluate(
+            torch, formula, log_ratio, advantage.to(log_ratio), progress
+        )
+        return result
+
+    return penalty
+
+
+def torch_loss(objective: Objective | str | Path) -> "TorchFunction":
+    """What takes the place of PPO's policy loss in PyTorch: the mean of drift - ratio * advantage, to be minimised.
+
+    Arguments and errors as for `torch_drift`; what is returned gives a scalar. The gradient of a
+    log-ratio beyond ±MAX_LOG_RATIO is zero, as in training.
+    """
+    drift = torch_drift(objective)
+
+    def loss(
+        log_ratio: "torch.Tensor", advantage: "torch.Tensor", progress: "float | torch.Tensor"
+    ) -> "torch.Tensor":
+        penalty = drift(log_ratio, advantage, progress)
+        ratio = log_ratio.clamp(-MAX_LOG_RATIO, MAX_LOG_RATIO).exp()
+        return (penalty - ratio * advantage).mean()
+
+    return loss
+
+
+def _loaded(objective: Objective | str | Path) -> Objective:
+    return objective if isinstance(objective, Objective) else load_objective(objective)
+
+
+def _check_shapes(log_ratio: Any, advantage: Any) -> None:
+    # [B, 1] against [B] would broadcast to [B, B] and train something else.
+    if log_ratio.shape != advantage.shape:
+        raise UserError(
+            f"log_ratio has shape {tuple(log_ratio.shape)} and advantage {tuple(advantage.shape)}: "
+            "a drift takes two of the same shape."
+        )
+
+
+def _evaluate(xp: Any, formula: _Formula, log_ratio: Any, advantage: Any, progress: Any) -> Any:
+    _check_shapes(log_ratio, advantage)
+    log_ratio = xp.clip(log_ratio, -MAX_LOG_RATIO, MAX_LOG_RATIO)
+    progress = xp.broadcast_to(_like(xp, log_ratio, progress), log_ratio.shape)
+    return formula(xp, log_ratio, advantage, progress)
+
+
+def _like(xp: Any, array: Any, values: Any) -> Any:
+    """Values as an array of another's type and device."""
+    return xp.asarray(values, dtype=array.dtype, device=array.device)
+
+
+def _relu(xp: Any, x: Any) -> Any:
+    # Not clip(x, 0), whose slope at 0 is 1 in torch and 0 in JAX. NumPy has no relu.
+    return xp.relu(x) if hasattr(xp, "relu") else xp.maximum(x, 0)
+
+
+def _formula(objective: Objective) -> _Formula:
+    """(numpy or torch, log_ratio, advantage, progress) -> penalty, as in lpo.drift and for the same parameters."""
+    drift, parameters = objective.drift, jax.device_get(objective.parameters)
+    match drift:
+        case NoDrift():
+            # Not zeros_like, which torch refuses to differentiate.
+            return lambda xp, log_ratio, advantage, progress: log_ratio - log_ratio
+        case ClipDrift():
+            clip = float(parameters)
+            return lambda xp, log_ratio, advantage, progress: _clip(xp, log_ratio, advantage, clip)
+        case DPODrift():
+            alpha, beta = float(parameters["alpha"]), float(parameters["beta"])
+            return lambda xp, log_ratio, advantage, progress: _dpo(
+                xp, log_ratio, advantage, alpha, beta
+            )
+        case LearnedDrift():
+            # Copied: what comes off a device is read-only, which torch warns of.
+            weights = {name: np.array(array) for name, array in parameters.items()}
+            return lambda xp, log_ratio, advantage, progress: _learned(
+                xp, log_ratio, advantage, progress, drift, weights
+            )
+    raise UserError(
+        f"{type(drift).__name__} has no form in NumPy and PyTorch: those that have are ClipDrift, DPODrift, NoDrift "
+        "and LearnedDrift; take `drift_function` for JAX, or write the formula out."
+    )
+
+
+def _clip(xp: Any, log_ratio: Any, advantage: Any, clip: float) -> Any:
+    ratio = xp.exp(log_ratio)
+    return _relu(xp, (ratio - xp.clip(ratio, 1.0 - clip, 1.0 + clip)) * advantage)
+
+
+def _dpo(xp: Any, log_ratio: Any, advantage: Any, alpha: float, beta: float) -> Any:
+    gain = xp.expm1(log_ratio) * advantage
+    loss = log_ratio * advantage
+    positive = _relu(xp, gain - alpha * xp.tanh(gain / alpha))
+    negative = _relu(xp, loss - beta * xp.tanh(loss / beta))
+    return xp.where(advantage >= 0, positive, negative)
+
+
+def _learned(
+    xp: Any,
+    log_ratio: Any,
+    advantage: Any,
+    progress: Any,
+    drift: LearnedDrift,
+    weights: dict[str, np.ndarray],
+) -> Any:
+    delta = -xp.expm1(log_ratio)
+    away = xp.stack([delta, delta**2, log_ratio, log_ratio**2], -1)
+    inputs = xp.concatenate([away, advantage[..., None] * away], -1)
+    if drift.temporal:
+        inputs = xp.concatenate([inputs, progress[..., None] * inputs], -1)
+    hidden, output = (_like(xp, log_ratio, weights[name]) for name in ("hidden", "output"))
+    penalty = (xp.tanh(inputs @ hidden) @ output)[..., 0]
+    if drift.base == "ppo":
+        penalty = penalty + _clip(xp, log_ratio, advantage, drift.clip)
+    return _relu(xp, penalty - drift.xi)

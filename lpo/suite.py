@@ -1,0 +1,272 @@
+"""Does an objective carry over to many environments? Normalised scores over a suite, with intervals.
+
+Agarwal et al. (2021): scores are normalised per environment, 0 a uniformly random policy and 1 a
+reference, and aggregated by the interquartile mean over all runs of all environments, with intervals
+from a bootstrap that resamples seeds within every environment.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import numpy as np
+from gymnax.environments import environment
+
+from lpo.generalization import Comparison, check_names, compare, training_setting
+from lpo.objectives import Objective
+from scb.environments.brax import BRAX_NAMES
+from scb.environments.registry import make
+from scb.errors import UserError, unknown_name
+from scb.evaluation import evaluate
+from scb.statistics import Estimate, iqm, normalized_score
+
+SUITES: dict[str, tuple[str, ...]] = {
+    "classic": (
+        "CartPole-v1",
+        "Acrobot-v1",
+        "MountainCar-v0",
+        "MountainCarContinuous-v0",
+        "Pendulum-v1",
+    ),
+    "minatar": ("Asterix-MinAtar", "Breakout-MinAtar", "Freeway-MinAtar", "SpaceInvaders-MinAtar"),
+    "brax": (
+        "hopper",
+        "walker2d",
+        "halfcheetah",
+        "reacher",
+        "inverted_pendulum",
+        "inverted_double_pendulum",
+    ),
+}
+SUITES["all"] = tuple(name for suite in tuple(SUITES.values()) for name in suite)
+
+# What Liesen et al. (2024) report of agents trained on the environment itself: SAC in classic control,
+# PPO in Brax ("generalized" physics).
+REFERENCES: dict[str, float] = {
+    "CartPole-v1": 500.0,
+    "Acrobot-v1": -76.7,
+    "MountainCar-v0": -117.7,
+    "MountainCarContinuous-v0": 94.9,
+    "Pendulum-v1": -137.4,
+}
+BRAX_REFERENCES: dict[str, float] = {
+    "hopper": 2521.9,
+    "walker2d": 2039.6,
+    "halfcheetah": 3487.1,
+}
+RANDOM_EPISODES = 256
+# Resampling is over seeds within environments, on [objectives, environments, seeds].
+RESAMPLES = 2000
+
+
+def suite(name: str) -> tuple[str, ...]:
+    """The environments of a suite: classic, minatar, brax or all."""
+    if name not in SUITES:
+        raise unknown_name("suite", name, SUITES)
+    return SUITES[name]
+
+
+def random_return(
+    env: environment.Environment[Any, Any], env_params: Any, episodes: int = RANDOM_EPISODES
+) -> float:
+    """Mean return of uniformly random actions."""
+    space = env.action_space(env_params)
+    result = jax.jit(
+        lambda key: evaluate(env, env_params, lambda _, k: space.sample(k), key, episodes)
+    )(jax.random.key(0))
+    return float(np.mean(result.returns))
+
+
+@dataclass(frozen=True)
+class SuiteScores:
+    """Normalised scores of several objectives over several environments.
+
+    Attributes:
+      environments: names, in order.
+      objectives: names, in order; the first is what the others are compared with.
+      scores: [objectives, environments, seeds] of final returns.
+      random, reference: [environments] returns that are 0 and 1.
+      sources: [environments] where the reference is from.
+      left_out: environments where no objective beat random actions, so that nothing normalises.
+    """
+
+    environments: list[str]
+    objectives: list[str]
+    scores: np.ndarray
+    random: list[float]
+    reference: list[float]
+    sources: list[str]
+    left_out: list[str]
+
+    def aggregate(self) -> list[Estimate]:
+        """Interquartile mean over environments and seeds, per objective."""
+        return self._estimates(0.0)
+
+    def differences(self) -> list[Estimate]:
+        """Each aggregate minus the first objective's, paired by seed."""
+        return self._estimates(1.0)
+
+    def _estimates(self, times_reference: float) -> list[Estimate]:
+        value, drawn = _aggregate(self.scores), _resampled(self.scores)
+        value = value - times_reference * value[0]
+        low, high = np.percentile(drawn - times_reference * drawn[:, :1], [2.5, 97.5], axis=0)
+        size = int(self.scores[0].size)
+        return [
+            Estimate(float(v), float(a), float(b), size)
+            for v, a, b in zip(value, low, high, strict=True)
+        ]
+
+    def profile(self, thresholds: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Performance profiles: the share of runs above each threshold, environments weighted alike.
+
+        Args:
+          thresholds: [T] normalised scores.
+
+        Returns:
+          ([objectives, T] shares, and the low and high ends of their 95 % intervals).
+        """
+        above = (self.scores[..., None] > thresholds).astype(np.float64)
+        share = above.mean(axis=(1, 2))
+        generator = np.random.default_rng(0)
+        drawn = np.stack([_draw(above, generator).mean(axis=(1, 2)) for _ in range(RESAMPLES // 4)])
+        low, high = np.percentile(drawn, [2.5, 97.5], axis=0)
+        return share, low, high
+
+    def as_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return {
+            "environments": [
+                {"name": name, "random": r, "reference": e, "source": s}
+                for name, r, e, s in zip(
+                    self.environments, self.random, self.reference, self.sources, strict=True
+                )
+            ],
+            "left_out": self.left_out,
+            "objectives": self.objectives,
+            "scores": self.scores.tolist(),
+            "aggregate": [x.as_dict() for x in self.aggregate()],
+            "differences": [x.as_dict() for x in self.differences()],
+        }
+
+
+def _draw(scores: np.ndarray, generator: np.random.Generator) -> np.ndarray:
+    """The same shape, seeds drawn anew within every environment, alike for all objectives."""
+    _, environments, seeds = scores.shape[:3]
+    picked = generator.integers(0, seeds, (environments, seeds))
+    return scores[:, np.arange(environments)[:, None], picked]
+
+
+def _aggregate(scores: np.ndarray) -> np.ndarray:
+    """[objectives] interquartile means over all runs."""
+    return np.asarray(iqm(scores.reshape(scores.shape[0], -1), axis=1))
+
+
+def _resampled(scores: np.ndarray) -> np.ndarray:
+    generator = np.random.default_rng(0)
+    return np.stack([_aggregate(_draw(scores, generator)) for _ in range(RESAMPLES)])
+
+
+def suite_scores(
+    comparisons: Mapping[str, Comparison],
+    random: Mapping[str, float],
+    references: Mapping[str, tuple[float, str]] | None = None,
+) -> SuiteScores:
+    """Normalises the final returns of comparisons that share objectives and numbers of seeds.
+
+    Args:
+      comparisons: {environment: Comparison}.
+      random: {environment: return of random actions}.
+      references: {environment: (return, source)} that is 1; `reference_of` where None.
+
+    Raises:
+      UserError: other objectives or numbers of seeds in one than in another; no environment left.
+    """
+    kept: list[str] = []
+    left_out: list[str] = []
+    scores, floors, ceilings, sources = [], [], [], []
+    objectives = [c.objective for c in next(iter(comparisons.values())).curves]
+    for name, comparison in comparisons.items():
+        if [c.objective for c in comparison.curves] != objectives:
+            raise UserError(f"{name} was run with other objectives than the rest: run all alike.")
+        finals = np.stack([c.final for c in comparison.curves])
+        reference, source = (
+            references[name] if references is not None else reference_of(name, comparison)
+        )
+        if not reference > random[name]:
+            left_out.append(name)
+            continue
+        kept.append(name)
+        scores.append(normalized_score(finals, random[name], reference))
+        floors.append(random[name])
+        ceilings.append(reference)
+        sources.append(source)
+    if not kept:
+        raise UserError("no objective is better than random actions anywhere: train longer.")
+    if len({s.shape for s in scores}) > 1:
+        raise UserError("environments were run with different numbers of seeds: run all alike.")
+    return SuiteScores(
+        kept, objectives, np.stack(scores, axis=1), floors, ceilings, sources, left_out
+    )
+
+
+def reference_of(name: str, comparison: Comparison) -> tuple[float, str]:
+    """The return that counts as 1, and where it is from: a published one, else the best of the comparison."""
+    physics = comparison.curves[0].backend
+    if name in REFERENCES:
+        return REFERENCES[name], "SAC, Liesen et al. (2024)"
+    if name in BRAX_REFERENCES and physics == "generalized":
+        return BRAX_REFERENCES[name], "PPO, Liesen et al. (2024)"
+    best = max(float(iqm(curve.final)) for curve in comparison.curves)
+    return best, "the best objective here"
+
+
+def run_suite(
+    name: str,
+    objectives: Sequence[Objective],
+    seeds: Sequence[int],
+    backend: str | None = None,
+    tell: Callable[[str], None] = print,
+    done: Mapping[str, Comparison] | None = None,
+    keep: Callable[[str, Comparison], None] = lambda name, comparison: None,
+    steps: int | None = None,
+    **arguments: Any,
+) -> tuple[SuiteScores, dict[str, Comparison]]:
+    """Trains PPO with every objective in every environment of a suite.
+
+    Args:
+      name: of the suite.
+      objectives: the first is what the others are compared with.
+      seeds: of the agents, the same everywhere.
+      backend: Brax physics, for the suite's Brax environments.
+      tell: takes a line when an environment is done.
+      done: comparisons that are there already and are not run again.
+      keep: is given every new comparison as it comes.
+      steps: environment steps of every training; each environment's own setting where None.
+      arguments: further ones of `learning_curves`.
+    """
+    check_names(objectives)
+    comparisons: dict[str, Comparison] = {}
+    random: dict[str, float] = {}
+    for environment_name in suite(name):
+        physics = backend if environment_name in BRAX_NAMES else None
+        env, env_params = make(
+            environment_name, **({} if physics is None else {"backend": physics})
+        )
+        random[environment_name] = random_return(env, env_params)
+        if done is not None and environment_name in done:
+            comparisons[environment_name] = done[environment_name]
+            continue
+        comparison = compare(
+            environment_name,
+            objectives,
+            seeds,
+            setting=training_setting(environment_name, steps),
+            backend=physics,
+            **arguments,
+        )
+        comparisons[environment_name] = comparison
+        keep(environment_name, comparison)
+        finals = ", ".join(f"{c.objective} {float(iqm(c.final)):.1f}" for c in comparison.curves)
+        tell(f"{environment_name} (random {random[environment_name]:.1f}): {finals}")
+    return suite_scores(comparisons, random), comparisons

@@ -1,0 +1,145 @@
+"""Which bandit regime ranks objectives as an environment does: the measure, and what it is measured on."""
+
+from dataclasses import replace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from lpo import alignment as module
+from lpo import figures
+from lpo.alignment import (
+    FITNESSES,
+    Regime,
+    alignment,
+    correlation_text,
+    known_drifts,
+    measure_alignment,
+    regime_fitness,
+)
+from lpo.generalization import training_setting
+from scb.errors import UserError
+
+TINY = Regime(reward_noise=0.0, contexts=10, iterations=4, epochs=1, minibatches=1)
+
+
+def returns(**means: float) -> dict[str, np.ndarray]:
+    """Four agents each, scattered by less than the objectives differ."""
+    return {name: mean + np.array([-0.1, 0.1, 0.0, 0.0]) for name, mean in means.items()}
+
+
+def test_alignment_is_one_where_the_orders_agree_and_minus_one_where_they_are_reversed():
+    outcome = returns(a=-900.0, b=-500.0, c=-200.0)
+    same = alignment(returns(a=0.1, b=5.0, c=7.0), outcome)
+    assert (same.spearman, same.low, same.high) == (1.0, 1.0, 1.0)
+    assert alignment(returns(a=3.0, b=2.0, c=1.0), outcome).spearman == -1.0
+    # One pair exchanged: 1 - 6 (0 + 1 + 1) / (3 (9 - 1)) = 0.5.
+    assert alignment(returns(a=1.0, b=3.0, c=2.0), outcome).spearman == pytest.approx(0.5)
+
+
+def test_agents_that_scatter_more_than_objectives_differ_leave_a_wide_interval():
+    generator = np.random.default_rng(0)
+    outcome = {name: generator.normal(0.0, 10.0, 8) for name in "abcde"}
+    fitness = {name: generator.normal(0.0, 10.0, 8) for name in "abcde"}
+    result = alignment(fitness, outcome)
+    assert result.high - result.low > 0.5
+    assert alignment(fitness, outcome) == result
+
+
+def test_a_fitness_that_tells_nothing_apart_has_no_correlation():
+    outcome = returns(a=1.0, b=2.0, c=3.0)
+    flat = {name: np.ones(4) for name in "abc"}
+    result = alignment(flat, outcome)
+    assert result.spearman is None
+    assert correlation_text({"spearman": None, "low": 0.0, "high": 0.0}).startswith("undefined")
+
+
+@pytest.mark.parametrize(
+    ("fitness", "outcome", "message"),
+    [
+        (returns(a=1, b=2, c=3), returns(a=1, b=2, d=3), "of different objectives"),
+        (returns(a=1, b=2), returns(a=1, b=2), "there are 2 objectives, which rank nothing"),
+    ],
+)
+def test_what_cannot_be_ranked_is_refused(fitness, outcome, message, one_sentence):
+    with pytest.raises(UserError) as error:
+        alignment(fitness, outcome)
+    assert message in one_sentence(str(error.value))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"bandit": "Pendulum-v1"}, "a regime asks for a bandit, and 'Pendulum-v1' is none"),
+        ({"iterations": 0}, "iterations is 0: it must be at least 1."),
+    ],
+)
+def test_a_regime_that_cannot_be_is_refused(arguments, message, one_sentence):
+    with pytest.raises(UserError) as error:
+        Regime(**arguments)
+    assert message in one_sentence(str(error.value))
+
+
+def test_a_regime_changes_what_it_names_and_keeps_the_settings_own():
+    ppo = known_drifts()[2]
+    own = training_setting("Pendulum-v1")
+    plain = Regime().task(ppo)
+    assert plain.agent_config.num_iterations == own.config.num_iterations == 15
+    assert plain.agent_config.batch_size == 200
+    assert plain.base_hyperparameters == own.hyperparameters
+    other = replace(TINY, learning_rate=0.5).task(ppo)
+    config = other.agent_config
+    assert (config.num_iterations, config.batch_size) == (4, 10)
+    assert (config.num_epochs, config.num_minibatches) == (1, 1)
+    assert other.base_hyperparameters.learning_rate == 0.5
+    assert str(Regime()) == "default"
+    assert str(Regime(reward_noise=0.0, contexts=50)) == "reward noise 0.0, contexts 50"
+
+
+def test_the_family_is_ppo_dpo_and_none_each_with_its_own_parameters():
+    family = {objective.name: objective for objective in known_drifts()}
+    assert {"ppo-0.2", "ppo-1", "none", "dpo (2, 0.6)", "dpo (4, 1.2)"} <= set(family)
+    log_ratio, advantage = jnp.full(1, 0.5), jnp.ones(1)
+
+    def charge(name):
+        objective = family[name]
+        return float(objective.drift(objective.parameters, log_ratio, advantage, jnp.zeros(1))[0])
+
+    # r = 1.649: a clip of 0.2 charges r - 1.2, one of 1 and none nothing.
+    assert charge("ppo-0.2") == pytest.approx(np.exp(0.5) - 1.2, rel=1e-5)
+    assert charge("ppo-1") == charge("none") == 0.0
+    assert charge("dpo (1, 0.3)") > charge("dpo (4, 1.2)") > 0.0
+
+
+def test_agents_of_a_regime_are_judged_in_every_way():
+    ppo = known_drifts()[2]
+    fitness = regime_fitness(TINY, ppo, [1, 2, 3])
+    assert tuple(fitness) == FITNESSES
+    assert all(x.shape == (3,) and np.isfinite(x).all() for x in fitness.values())
+    # In the bandit a return is one reward; on Pendulum 200 of down to -16.3.
+    assert np.abs(fitness["return, mode actions"]).max() < 100
+    assert -16.3 * 200 < fitness["transfer"].min() <= fitness["transfer"].max() < -100
+    again = regime_fitness(TINY, ppo, [3, 2])
+    np.testing.assert_allclose(again["transfer"], fitness["transfer"][[2, 1]], rtol=1e-4)
+
+
+def test_the_report_holds_every_regime_and_is_drawn(monkeypatch, tmp_path):
+    fixed = returns(**{"ppo-0.2": 1.0, "none": 2.0, "dpo (2, 0.6)": 3.0})
+    family = [objective for objective in known_drifts() if objective.name in fixed]
+    monkeypatch.setattr(module, "outcomes", lambda *arguments: fixed)
+    monkeypatch.setattr(
+        module,
+        "regime_fitness",
+        lambda regime, objective, seeds: {
+            name: regime.reward_noise * fixed[objective.name] for name in FITNESSES
+        },
+    )
+    regimes = [Regime(reward_noise=1.0), Regime(reward_noise=0.0)]
+    told: list[str] = []
+    report = measure_alignment(regimes, family, "Pendulum-v1", [7, 8], tell=told.append)
+    assert [row["name"] for row in report["regimes"]] == ["reward noise 1.0", "reward noise 0.0"]
+    aligned, flat = (row["alignment"]["transfer"]["spearman"] for row in report["regimes"])
+    assert (aligned, flat) == (1.0, None)
+    assert len(told) == 3
+    path = figures.save(figures.alignment_heatmap(report), tmp_path / "alignment.png")
+    assert path.stat().st_size > 5000

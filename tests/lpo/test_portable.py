@@ -1,0 +1,309 @@
+"""Drifts in NumPy and PyTorch are those of the contract, and the example trains with them."""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from lpo.drift import BASES, LearnedDrift
+from lpo.objectives import Objective, load_objective, objective_names
+from lpo.portable import drift_function, numpy_drift, torch_drift, torch_loss
+from scb.agents.ppo import MAX_LOG_RATIO
+from scb.errors import UserError
+
+ROOT = Path(__file__).parents[2]
+
+
+def random_objective(base: str, temporal: bool) -> Objective:
+    """A learned drift of random weights, three times the usual size so that it charges on many points."""
+    drift = LearnedDrift(base=base, hidden_size=8, temporal=temporal)
+    parameters = jax.tree.map(lambda w: 3 * w, drift.init(jax.random.key(5)))
+    return Objective(f"learned-{base}{'-temporal' if temporal else ''}", drift, parameters)
+
+
+OBJECTIVES = [load_objective(name) for name in [*objective_names(), "ppo-0.3"]] + [
+    random_objective(base, temporal) for base in BASES for temporal in (False, True)
+]
+every_objective = pytest.mark.parametrize("objective", OBJECTIVES, ids=lambda o: o.name)
+
+
+def points(largest_log_ratio: float, size: int = 400) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """[size] log-ratios, advantages and fractions of training; drawn, so on no kink."""
+    rng = np.random.default_rng(2)
+    log_ratio = rng.uniform(-largest_log_ratio, largest_log_ratio, size)
+    return log_ratio, rng.normal(scale=2.0, size=size), rng.uniform(size=size)
+
+
+def contract(objective: Objective, log_ratio, advantage, progress) -> jax.Array:
+    """The drift itself on log-ratios clipped as in training."""
+    clipped = jnp.clip(log_ratio, -MAX_LOG_RATIO, MAX_LOG_RATIO)
+    return objective.drift(objective.parameters, clipped, advantage, progress)
+
+
+def contract_slope(objective: Objective, log_ratio, advantage, progress) -> jax.Array:
+    """[B] derivative of the penalty with respect to the log-ratio."""
+    return jax.grad(lambda x: contract(objective, x, advantage, progress).sum())(log_ratio)
+
+
+# -- NumPy and JAX ------------------------------------------------------------------------------
+
+
+@every_objective
+@pytest.mark.parametrize("largest_log_ratio", [0.5, 3.0, 30.0])
+def test_numpy_and_jax_give_the_contracts_penalty(objective, largest_log_ratio):
+    batch = [x.astype(np.float32) for x in points(largest_log_ratio)]
+    expected = contract(objective, *map(jnp.asarray, batch))
+    for drift in (numpy_drift(objective), drift_function(objective)):
+        penalty = drift(*batch)
+        assert penalty.dtype == np.float32
+        np.testing.assert_allclose(penalty, expected, rtol=1e-5, atol=1e-5)
+
+
+@every_objective
+def test_a_far_ratio_costs_what_the_farthest_that_training_meets_costs(objective):
+    drift = numpy_drift(objective)
+    far, bound = np.float32([100.0, -100.0]), np.float32([MAX_LOG_RATIO, -MAX_LOG_RATIO])
+    advantage = np.float32([1.5, -1.5])
+    assert np.isfinite(drift(far, advantage, 0.5)).all()
+    np.testing.assert_array_equal(drift(far, advantage, 0.5), drift(bound, advantage, 0.5))
+
+
+@every_objective
+def test_one_progress_holds_for_the_whole_batch(objective):
+    log_ratio, advantage, _ = points(1.0)
+    for drift in (numpy_drift(objective), drift_function(objective)):
+        whole = drift(log_ratio, advantage, np.full_like(log_ratio, 0.25))
+        np.testing.assert_array_equal(drift(log_ratio, advantage, 0.25), whole)
+
+
+def test_only_a_temporal_drift_changes_with_progress():
+    log_ratio, advantage, _ = points(1.0)
+    changes = {}
+    for objective in OBJECTIVES:
+        drift = numpy_drift(objective)
+        early, late = drift(log_ratio, advantage, 0.0), drift(log_ratio, advantage, 1.0)
+        changes[objective.name] = bool(np.any(early != late))
+    assert {name for name, changed in changes.items() if changed} == {
+        f"learned-{base}-temporal" for base in BASES
+    }
+
+
+def test_lists_numbers_and_any_shape_will_do():
+    # PPO's clip 0.2, r = e^0.5 = 1.648721, A = 2: (1.648721 - 1.2) * 2 = 0.897443.
+    for make in (numpy_drift, drift_function):
+        drift = make("ppo")
+        assert float(drift(0.5, 2, 0)) == pytest.approx(0.897443, abs=1e-6)
+        np.testing.assert_allclose(drift([[0.5], [0.5]], [[2], [0]], 0), [[0.897443], [0]], 1e-6)
+        learned = make("lpo-pendulum")
+        flat = learned(np.linspace(-1, 1, 6), np.ones(6), 0.5)
+        square = learned(np.linspace(-1, 1, 6).reshape(2, 3), np.ones((2, 3)), 0.5)
+        np.testing.assert_allclose(square.ravel(), flat, rtol=1e-5)
+
+
+def test_a_function_for_jax_is_differentiated_and_compiled():
+    drift = drift_function("lpo-pendulum")
+    slope = jax.jit(jax.grad(lambda log_ratio: drift(log_ratio, 2.0, 0.0)))
+    assert float(slope(0.0)) == 0.0
+    assert float(slope(0.5)) > 0.0
+    assert float(slope(25.0)) == 0.0  # beyond the clip
+
+
+@pytest.mark.parametrize("make", [numpy_drift, drift_function])
+def test_shapes_that_would_broadcast_are_refused(make, one_sentence):
+    with pytest.raises(UserError) as error:
+        make("ppo")(np.zeros((5, 1)), np.zeros(5), 0.0)
+    message = one_sentence(str(error.value))
+    assert "(5, 1)" in message and "(5,)" in message
+
+
+@pytest.mark.parametrize("make", [numpy_drift, drift_function])
+def test_an_unknown_name_is_refused_as_everywhere(make):
+    with pytest.raises(UserError, match="unknown objective 'dppo'"):
+        make("dppo")
+
+
+def test_a_drift_of_another_family_has_a_form_in_jax_alone(one_sentence):
+    class Squared:
+        def init(self, key):
+            return jnp.float32(2.0)
+
+        def __call__(self, parameters, log_ratio, advantage, progress):
+            return parameters * log_ratio**2
+
+    objective = Objective("squared", Squared(), jnp.float32(2.0))
+    # 2 * 0.5^2 = 0.5
+    assert float(drift_function(objective)(0.5, 1.0, 0.0)) == 0.5
+    with pytest.raises(UserError) as error:
+        numpy_drift(objective)
+    assert "Squared" in one_sentence(str(error.value))
+
+
+def test_without_torch_one_sentence_says_what_to_install(monkeypatch, one_sentence):
+    monkeypatch.setitem(sys.modules, "torch", None)
+    for make in (torch_drift, torch_loss):
+        with pytest.raises(UserError) as error:
+            make("ppo")
+        assert "extra `torch`" in one_sentence(str(error.value))
+
+
+# -- PyTorch ------------------------------------------------------------------------------------
+
+
+def in_torch(function, log_ratio, advantage, progress) -> tuple[np.ndarray, np.ndarray]:
+    """Value and the derivative of its sum with respect to the log-ratio."""
+    import torch
+
+    leaf = torch.tensor(log_ratio, requires_grad=True)
+    value = function(leaf, torch.tensor(advantage), progress)
+    (slope,) = torch.autograd.grad(value.sum(), leaf)
+    return value.detach().numpy(), slope.numpy()
+
+
+class TestTorch:
+    @pytest.fixture(autouse=True)
+    def torch(self):
+        torch = pytest.importorskip("torch")
+        torch.set_num_threads(1)
+        return torch
+
+    @every_objective
+    @pytest.mark.parametrize("largest_log_ratio", [0.5, 3.0, 30.0])
+    def test_penalty_is_the_contracts(self, objective, largest_log_ratio, torch):
+        batch = [x.astype(np.float32) for x in points(largest_log_ratio)]
+        expected = contract(objective, *map(jnp.asarray, batch))
+        penalty = torch_drift(objective)(*map(torch.tensor, batch))
+        assert penalty.dtype == torch.float32
+        np.testing.assert_allclose(penalty, expected, rtol=1e-5, atol=1e-5)
+
+    @every_objective
+    def test_gradient_is_the_contracts(self, objective, torch):
+        batch = [x.astype(np.float32) for x in points(1.0)]
+        expected = contract_slope(objective, *map(jnp.asarray, batch))
+        _, slope = in_torch(torch_drift(objective), *batch[:2], torch.tensor(batch[2]))
+        np.testing.assert_allclose(slope, expected, rtol=1e-5, atol=1e-5)
+
+    @every_objective
+    def test_gradient_of_far_ratios_is_the_contracts_in_double_precision(self, objective, torch):
+        # In single precision 1 - tanh^2 of a saturated unit is rounding error, times a feature of
+        # up to e^40: neither library knows that slope.
+        batch = points(30.0)
+        with jax.enable_x64(True):
+            expected = np.asarray(contract_slope(objective, *map(jnp.asarray, batch)))
+        _, slope = in_torch(torch_drift(objective), *batch[:2], torch.tensor(batch[2]))
+        np.testing.assert_allclose(slope, expected, rtol=1e-5, atol=1e-5)
+
+    @every_objective
+    def test_where_an_update_starts_nothing_is_charged(self, objective):
+        # The first minibatch has ratio 1 everywhere, to the last bit.
+        advantage = points(1.0)[1].astype(np.float32)
+        value, slope = in_torch(torch_drift(objective), np.zeros_like(advantage), advantage, 0.5)
+        np.testing.assert_array_equal(value, 0.0)
+        np.testing.assert_array_equal(slope, 0.0)
+
+    @every_objective
+    def test_one_progress_holds_for_the_whole_batch(self, objective, torch):
+        log_ratio, advantage, _ = points(1.0)
+        drift = torch_drift(objective)
+        whole, _ = in_torch(drift, log_ratio, advantage, torch.full((len(log_ratio),), 0.25))
+        for progress in (0.25, np.float64(0.25), torch.tensor(0.25)):
+            value, _ = in_torch(drift, log_ratio, advantage, progress)
+            np.testing.assert_array_equal(value, whole)
+
+    def test_loss_of_ppo_is_the_clipped_loss_that_it_replaces(self, torch):
+        def clipped_loss(log_ratio, advantage, progress):
+            ratio = log_ratio.exp()
+            return torch.max(-advantage * ratio, -advantage * ratio.clamp(0.8, 1.2)).mean()
+
+        log_ratio, advantage, _ = points(1.0)
+        loss, slope = in_torch(torch_loss("ppo"), log_ratio, advantage, 0.0)
+        expected_loss, expected_slope = in_torch(clipped_loss, log_ratio, advantage, 0.0)
+        np.testing.assert_allclose(loss, expected_loss, rtol=1e-6)
+        np.testing.assert_allclose(slope, expected_slope, rtol=1e-6, atol=1e-9)
+
+    @every_objective
+    def test_loss_is_what_training_minimises(self, objective, torch):
+        batch = [x.astype(np.float32) for x in points(2.0)]
+
+        def surrogate(log_ratio, advantage, progress):
+            penalty = contract(objective, log_ratio, advantage, progress)
+            return -jnp.mean(jnp.exp(log_ratio) * advantage - penalty)
+
+        expected, expected_slope = jax.value_and_grad(surrogate)(*map(jnp.asarray, batch))
+        loss, slope = in_torch(torch_loss(objective), *batch[:2], torch.tensor(batch[2]))
+        assert float(loss) == pytest.approx(float(expected), rel=1e-5)
+        np.testing.assert_allclose(slope, expected_slope, rtol=1e-4, atol=1e-6)
+
+    def test_a_log_ratio_beyond_the_bound_is_not_pulled(self):
+        beyond = np.float32([30.0, -30.0])
+        loss, slope = in_torch(torch_loss("none"), beyond, np.float32([1.0, 1.0]), 0.0)
+        # -(e^20 + e^-20) / 2 = -242582597.7
+        assert float(loss) == pytest.approx(-242582597.7, rel=1e-6)
+        np.testing.assert_array_equal(slope, 0.0)
+
+    def test_shapes_that_would_broadcast_are_refused(self, torch):
+        with pytest.raises(UserError, match="same shape"):
+            torch_loss("ppo")(torch.zeros(5), torch.zeros(5, 1), 0.0)
+
+    @pytest.mark.slow
+    @pytest.mark.parametrize("objective", ["ppo", "dpo", "lpo-pendulum"])
+    def test_the_example_trains(self, objective):
+        pytest.importorskip("gymnasium")
+        answer = subprocess.run(
+            [
+                sys.executable,
+                "examples/cleanrl_ppo_pendulum.py",
+                f"--objective={objective}",
+                # Two batches, and episodes of 200 steps that end inside them.
+                *("--total-steps=1000", "--num-envs=4", "--num-steps=125"),
+                *("--num-epochs=2", "--num-minibatches=2", "--evaluation-episodes=2"),
+            ],
+            cwd=ROOT,
+            env={**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"},
+            capture_output=True,
+            text=True,
+            timeout=300,
+            check=False,
+        )
+        assert answer.returncode == 0, answer.stderr
+        lines = answer.stdout.splitlines()
+        assert lines[1].startswith("steps 1000 ")
+        found = re.fullmatch(
+            rf"{objective}, seed 1: return (-\d+\.\d) \(2 episodes, .*\)", lines[-1]
+        )
+        # A step of Pendulum costs at most pi^2 + 0.1 * 8^2 + 0.001 * 2^2 = 16.27, an episode 3255.
+        assert found and -3255 < float(found.group(1)) < 0
+
+
+# -- the page -----------------------------------------------------------------------------------
+
+PAGE = ROOT / "docs" / "elsewhere.md"
+BLOCKS = re.findall(r"^```python\n(.*?)^```$", PAGE.read_text(), re.MULTILINE | re.DOTALL)
+
+
+@pytest.mark.parametrize("block", BLOCKS, ids=lambda block: block.splitlines()[0])
+def test_the_pages_examples_run(block, monkeypatch):
+    if "import torch" in block:
+        pytest.importorskip("torch")
+    monkeypatch.chdir(ROOT)
+    exec(compile(block, str(PAGE), "exec"), {})
+
+
+def test_the_page_writes_the_drift_out_correctly(monkeypatch):
+    (block,) = [block for block in BLOCKS if "def drift" in block]
+    assert "lpo." not in block and "jax" not in block
+    monkeypatch.chdir(ROOT)
+    namespace: dict = {}
+    exec(compile(block, str(PAGE), "exec"), namespace)
+    log_ratio, advantage, _ = points(30.0)
+    np.testing.assert_allclose(
+        namespace["drift"](log_ratio, advantage),
+        numpy_drift("lpo-pendulum")(log_ratio, advantage, 0.0),
+        rtol=1e-5,
+        atol=1e-5,
+    )

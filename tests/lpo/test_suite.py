@@ -1,0 +1,176 @@
+"""Scores over a suite of environments: how they are normalised, aggregated, kept and refused."""
+
+import json
+
+import numpy as np
+import pytest
+
+from lpo import commands, figures, suite
+from lpo.generalization import Comparison, LearningCurves
+from lpo.objectives import load_objective
+from lpo.suite import RESAMPLES, SUITES, SuiteScores, random_return, run_suite, suite_scores
+from scb.environments.registry import environment_names, make
+from scb.errors import UserError
+
+
+def curves(environment: str, objective: str, finals, backend=None) -> LearningCurves:
+    finals = np.asarray(finals, np.float64)
+    returns = np.stack([np.zeros_like(finals), finals], axis=1)
+    seeds = list(range(len(finals)))
+    return LearningCurves(
+        environment, backend, objective, np.array([0, 100]), returns, seeds, 5, True
+    )
+
+
+def comparison(environment: str, **finals) -> Comparison:
+    return Comparison([curves(environment, name, x) for name, x in finals.items()])
+
+
+def test_every_environment_of_the_suites_can_be_made():
+    known = environment_names()
+    assert set(SUITES["all"]) <= set(known)
+    assert len(SUITES["brax"]) >= 6
+    assert {"CartPole-v1", "Pendulum-v1", "Breakout-MinAtar", "hopper"} <= set(SUITES["all"])
+
+
+def test_zero_is_random_and_one_is_the_reference():
+    scores = suite_scores(
+        {
+            "CartPole-v1": comparison("CartPole-v1", ppo=[20.0, 260.0], dpo=[500.0, 500.0]),
+            "made-up": comparison("made-up", ppo=[0.0, 10.0], dpo=[5.0, 15.0]),
+        },
+        {"CartPole-v1": 20.0, "made-up": 0.0},
+    )
+    # 500 is published for CartPole; what nobody published has the best objective's: IQM 10.
+    np.testing.assert_allclose(scores.scores[0], [[0.0, 0.5], [0.0, 1.0]])
+    np.testing.assert_allclose(scores.scores[1], [[1.0, 1.0], [0.5, 1.5]])
+    assert scores.reference == [500.0, 10.0]
+    assert scores.sources[1] == "the best objective here"
+
+
+def test_published_brax_returns_are_of_one_physics():
+    here = [curves("hopper", "ppo", [600.0, 700.0], backend="spring")]
+    there = [curves("hopper", "ppo", [600.0, 700.0], backend="generalized")]
+    assert suite.reference_of("hopper", Comparison(here))[0] == 650.0
+    assert suite.reference_of("hopper", Comparison(there))[0] == 2521.9
+
+
+def test_an_environment_that_nobody_learned_is_left_out_and_said_so():
+    scores = suite_scores(
+        {
+            "a": comparison("a", ppo=[1.0, 1.0], dpo=[2.0, 2.0]),
+            "b": comparison("b", ppo=[-5.0, -5.0], dpo=[-6.0, -6.0]),
+        },
+        {"a": 0.0, "b": -5.0},
+    )
+    assert (scores.environments, scores.left_out) == (["a"], ["b"])
+    with pytest.raises(UserError, match="no objective is better than random actions anywhere"):
+        suite_scores({"b": comparison("b", ppo=[-5.0, -5.0])}, {"b": -5.0})
+
+
+@pytest.mark.parametrize(
+    ("second", "message"),
+    [
+        (comparison("b", ppo=[1.0, 2.0]), "b was run with other objectives than the rest"),
+        (comparison("b", ppo=[1.0], dpo=[2.0]), "different numbers of seeds"),
+    ],
+)
+def test_what_does_not_compare_is_refused(second, message):
+    first = comparison("a", ppo=[1.0, 1.0], dpo=[2.0, 2.0])
+    with pytest.raises(UserError, match=message):
+        suite_scores({"a": first, "b": second}, {"a": 0.0, "b": 0.0})
+
+
+def scores_of(values) -> SuiteScores:
+    values = np.asarray(values, np.float64)
+    names = [f"e{i}" for i in range(values.shape[1])]
+    rest = [0.0] * len(names)
+    return SuiteScores(names, ["ppo", "dpo"], values, rest, rest, ["made up"] * len(names), [])
+
+
+def test_aggregates_are_interquartile_means_and_differences_are_paired():
+    # 8 runs: the two lowest and two highest are left out. What a seed does to both objectives
+    # cancels in their difference, which is the same everywhere.
+    base = np.array([[0.1, 0.2, 0.3, 0.4], [0.5, 0.6, 0.7, 0.8]])
+    scores = scores_of([base, base + 0.25])
+    first, second = scores.aggregate()
+    assert first.value == pytest.approx((0.3 + 0.4 + 0.5 + 0.6) / 4)
+    assert first.low < first.value < first.high
+    none, difference = scores.differences()
+    assert (none.value, none.low, none.high) == (0.0, 0.0, 0.0)
+    assert difference.value == pytest.approx(0.25)
+    assert difference.low == pytest.approx(0.25)
+    assert difference.high == pytest.approx(0.25)
+    assert second.n == 8
+    assert RESAMPLES >= 1000
+
+
+def test_a_profile_is_the_share_of_runs_above_a_threshold():
+    scores = scores_of([[[0.0, 0.4], [0.6, 1.0]], [[1.0, 1.0], [1.0, 1.0]]])
+    share, low, high = scores.profile(np.array([-0.1, 0.5, 0.9, 1.0]))
+    np.testing.assert_allclose(share, [[1.0, 0.5, 0.25, 0.0], [1.0, 1.0, 1.0, 0.0]])
+    assert np.all(low <= share) and np.all(share <= high)
+
+
+def test_random_actions_earn_what_they_earn():
+    env, env_params = make("CartPole-v1")
+    # Random actions keep a pole up for about 22 steps.
+    assert 19.0 < random_return(env, env_params) < 26.0
+
+
+@pytest.fixture
+def trained(monkeypatch):
+    """Trainings that are instantaneous; the list of those that were asked for."""
+    asked = []
+
+    def compare(environment, objectives, seeds, **arguments):
+        asked.append((environment, arguments["backend"]))
+        finals = {
+            o.name: 100.0 + 10.0 * i + np.arange(len(seeds)) for i, o in enumerate(objectives)
+        }
+        return comparison(environment, **finals)
+
+    monkeypatch.setattr(suite, "compare", compare)
+    monkeypatch.setattr(suite, "random_return", lambda *arguments: -1000.0)
+    monkeypatch.setitem(suite.SUITES, "classic", ("CartPole-v1", "Pendulum-v1"))
+    monkeypatch.setitem(suite.SUITES, "brax", ("hopper", "CartPole-v1"))
+    return asked
+
+
+def test_physics_are_for_brax_alone(trained):
+    objectives = [load_objective("ppo"), load_objective("dpo")]
+    scores, comparisons = run_suite("brax", objectives, [1, 2], "spring", tell=lambda _: None)
+    assert trained == [("hopper", "spring"), ("CartPole-v1", None)]
+    assert list(comparisons) == scores.environments == ["hopper", "CartPole-v1"]
+
+
+def test_a_suite_is_kept_as_it_comes_and_completed(trained, tmp_path, capsys):
+    out = tmp_path / "suite"
+    arguments = {"suite": "classic", "objectives": ("ppo", "dpo"), "seeds": 3, "out": out}
+    commands.evaluate(**arguments)
+    assert [name for name, _ in trained] == ["CartPole-v1", "Pendulum-v1"]
+    assert "normalised score" in capsys.readouterr().out
+    first = json.loads((out / "suite.json").read_text())
+    assert first["objectives"] == ["ppo", "dpo"]
+    assert (out / "suite.png").stat().st_size > 5000
+
+    (out / "comparisons" / "Pendulum-v1.json").unlink()
+    trained.clear()
+    commands.evaluate(**arguments)
+    assert [name for name, _ in trained] == ["Pendulum-v1"]
+    assert json.loads((out / "suite.json").read_text()) == first
+
+    with pytest.raises(UserError, match="holds a suite run with other seeds"):
+        commands.evaluate(**{**arguments, "seeds": 4})
+
+
+def test_a_suite_and_an_environment_do_not_go_together():
+    with pytest.raises(UserError, match="are both given: leave one out"):
+        commands.evaluate(environment="CartPole-v1", suite="classic")
+    with pytest.raises(UserError, match="unknown suite 'clasic': did you mean classic"):
+        commands.evaluate(suite="clasic")
+
+
+def test_scores_are_drawn(tmp_path):
+    scores = scores_of(np.random.default_rng(0).uniform(0.0, 1.2, (2, 5, 10)))
+    assert figures.save(figures.suite_scores(scores), tmp_path / "x.png").stat().st_size > 10_000
