@@ -330,8 +330,7 @@ def markdown(report: Mapping[str, Any]) -> str:
     lines = [
         "# The bandits, by environment and algorithm",
         "",
-        f"`{report['command']}`",
-        "",
+        *(f"`{command}`\n" for command in report["commands"]),
         *textwrap.wrap(
             f"{_protocol_text(entries)} Interquartile means with 95 % bootstrap intervals over agents.",
             width=118,
@@ -346,6 +345,17 @@ def markdown(report: Mapping[str, Any]) -> str:
         *(["agents on the same seeds."] if "published" in kinds else []),
         "*Paper* is the figure that Liesen et al. (2024) state for theirs, with their own agents. *Target* is the",
         "return aimed at, and whether ours reaches it with the most likely actions / with sampled ones.",
+        *(
+            [
+                "The released bandits of Brax were found on the *generalized* physics: in another, their rows say how they",
+                "carry over, not what they are worth at home.",
+            ]
+            if any(
+                entry["bandit"] == "published" and entry["backend"] not in (None, "generalized")
+                for entry in entries
+            )
+            else []
+        ),
         "",
         "| environment | algorithm | ours, most likely actions | ours, sampled | published, most likely actions "
         "| published, sampled | paper | target |",
@@ -642,7 +652,15 @@ def main(argv: Sequence[str] | None = None) -> int:
             report = read_report(arguments.out) if arguments.out.exists() else {}
             entries = report.get("entries", [])
             report = {
-                "command": command_text(arguments, published is not None),
+                # Entries that are there already stay, so several commands may have made them.
+                "commands": list(
+                    dict.fromkeys(
+                        [
+                            *report.get("commands", []),
+                            command_text(arguments, published is not None),
+                        ]
+                    )
+                ),
                 "versions": package_versions(),
                 "machine": machine_description(),
                 "targets": TARGETS,

@@ -364,7 +364,7 @@ _TERMINALS: tuple[tuple[str, ...], ...] = (
     ("abs(A)", "d"),
     ("abs(A)", "log_r"),
 )
-_MOST_TERMS = 12
+_MOST_TERMS = 48  # of a program that is being multiplied out
 _UNITS = 60
 # In standard deviations of a term.
 _FIRST_STEPS = (-1.0, -0.3, -0.1, 0.1, 0.3, 1.0)
@@ -383,7 +383,7 @@ class DistillConfig:
       parsimony: fitness (R²) that a program pays for each of its nodes.
       candidates: formulas whose numbers are set by least squares, the best of each length.
       grown: the best of these, to which further terms are added one by one.
-      numbers: that a formula may grow to.
+      numbers: that a formula may have.
       tolerance: R² that a shorter formula may lack to be taken instead of the best, and that a
         further term must add.
       seed: decides everything.
@@ -468,7 +468,7 @@ def distill(objective: "Objective", config: DistillConfig | None = None) -> Dist
             f"{objective.name} charges nothing where updates go: there is no drift to write as a formula."
         )
     programs = _programs(fit, config, temporal)
-    formulas = _formulas(programs, config.candidates)
+    formulas = _formulas(programs, config)
     tuned = [_tune(formula, fit) for formula in formulas]
     tuned.sort(key=lambda found: -found[1])
     library = _library(rng, temporal)
@@ -643,20 +643,20 @@ def _programs(data: _Data, config: DistillConfig, temporal: bool) -> list[list[A
     ]
 
 
-def _formulas(programs: Sequence[Sequence[Any]], number: int) -> list[_Sum]:
+def _formulas(programs: Sequence[Sequence[Any]], config: DistillConfig) -> list[_Sum]:
     """The best formulas, at most three of a size, each once; programs come best first."""
     found: dict[Any, _Sum] = {}
     sizes: dict[int, int] = {}
     for program in programs:
         formula = _as_sum(program)
-        if not formula or len(formula) > _MOST_TERMS:
+        if not formula or len(_numbers(formula)) > config.numbers:
             continue
         structure, size = _structure(formula), _size(formula)
         if structure in found or sizes.get(size, 0) >= 3:
             continue
         found[structure] = formula
         sizes[size] = sizes.get(size, 0) + 1
-        if len(found) == number:
+        if len(found) == config.candidates:
             break
     return list(found.values())
 
@@ -672,7 +672,7 @@ def _as_sum(program: Sequence[Any]) -> _Sum:
         name, arity = symbol
         arguments = [stack.pop() for _ in range(arity)]
         made = _OPERATIONS[name](*arguments)
-        if len(made) > 4 * _MOST_TERMS:
+        if len(made) > _MOST_TERMS:
             return ()
         stack.append(made)
     return stack[0]

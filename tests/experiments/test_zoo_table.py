@@ -40,7 +40,7 @@ def entry(environment, algorithm, kind, mode, sampled, **changes):
 
 def report(*entries):
     return {
-        "command": "python -m experiments.zoo_table",
+        "commands": ["python -m experiments.zoo_table"],
         "machine": MACHINE,
         "differences": zoo_table.differences(entries),
         "entries": list(entries),
