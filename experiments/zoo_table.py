@@ -347,7 +347,7 @@ def markdown(report: Mapping[str, Any]) -> str:
         "return aimed at, and whether ours reaches it with the most likely actions / with sampled ones.",
         *(
             [
-                "The released bandits of Brax were found on the *generalized* physics: in another, their rows say how they",
+                "The released bandits of Brax were found on *generalized* physics: in another, their rows say how they",
                 "carry over, not what they are worth at home.",
             ]
             if any(
