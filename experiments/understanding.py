@@ -20,6 +20,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from lpo.cli import configure_jax
 
 PROGRESS = (0.0, 0.5, 1.0)
@@ -61,14 +63,22 @@ def read_formula(path: Path) -> dict[str, Any]:
     }
 
 
-def read_comparison(path: Path) -> dict[str, Any]:
-    """What the page says of a comparison that `lpo evaluate` wrote."""
+def read_comparison(path: Path, formulas: Sequence[Mapping[str, Any]] = ()) -> dict[str, Any]:
+    """What the page says of a comparison of `lpo evaluate`; formulas are compared with what they were fitted to."""
     from scb.errors import UserError
+    from scb.statistics import paired_difference
 
     try:
         whole = json.loads(path.read_text())
         curves = whole["curves"]
         first = curves[0]
+        final = {c["objective"]: np.array(c["returns"])[:, -1] for c in curves}
+        to_original = {
+            f["name"]: {"of": f["of"]}
+            | paired_difference(final[f["name"]], final[f["of"]]).as_dict()
+            for f in formulas
+            if f["name"] in final and f["of"] in final
+        }
         return {
             "environment": first["environment"],
             "backend": first["backend"],
@@ -79,6 +89,7 @@ def read_comparison(path: Path) -> dict[str, Any]:
             "reference": whole["reference"],
             "final_iqm": {c["objective"]: c["final_iqm"] for c in curves},
             "paired_differences": whole["paired_differences"],
+            "to_original": to_original,
         }
     except (OSError, KeyError, IndexError, TypeError, ValueError) as error:
         raise UserError(
@@ -157,6 +168,10 @@ def words(row: Mapping[str, Any]) -> str:
         for sign, shown, where in (("+1", "+1", "up to ratio 2"), ("-1", "−1", "down to ratio 0.5"))
     ]
     sentences.append(f"It stops {stops[0]}, and {stops[1]}.")
+    if fractions["rolls back"] >= 0.005:
+        sentences.append(
+            f"In all, it turns round in {_percent(fractions['rolls back'])} of the grid."
+        )
     return " ".join(sentences)
 
 
@@ -207,6 +222,12 @@ def _formula_section(report: Mapping[str, Any]) -> list[str]:
             shown = _estimate(difference, signed=True) if difference else ""
             lines.append(f"| {name} | {_estimate(score)} | {shown} |")
         lines.append("")
+        for name, difference in comparison["to_original"].items():
+            lines += [
+                f"The formula's difference to the network's, `{name}` − `{difference['of']}`: "
+                f"{_estimate(difference, signed=True)}.",
+                "",
+            ]
     return lines
 
 
@@ -259,16 +280,19 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         kept = json.loads(out.read_text()) if out.exists() else {}
         names = arguments.objectives or ["ppo", "dpo", *zoo_names()]
-        formulas, comparisons = arguments.formulas, arguments.comparisons
+        comparisons = arguments.comparisons
+        formulas = (
+            kept.get("formulas", [])
+            if arguments.formulas is None
+            else [read_formula(path) for path in arguments.formulas]
+        )
         report = {
             "versions": package_versions(),
             "analyses": measure(names),
-            "formulas": kept.get("formulas", [])
-            if formulas is None
-            else [read_formula(path) for path in formulas],
+            "formulas": formulas,
             "comparisons": kept.get("comparisons", [])
             if comparisons is None
-            else [read_comparison(path) for path in comparisons],
+            else [read_comparison(path, formulas) for path in comparisons],
         }
         figure = figures.drift_and_gradient([load_objective(name) for name in names], PROGRESS)
     except UserError as error:

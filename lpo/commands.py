@@ -90,7 +90,7 @@ def run(
     chosen = {name: settings[name] for name in ("preset", "seed", "objective")}
     flags = [f"--{name}={value}" for name, value in chosen.items() if value is not None]
     report = run_pipeline(folder, settings, shlex.join(["lpo", "run", *flags]))
-    Console().print(f"report: {report}")
+    Console().print(f"report: {report}", soft_wrap=True)
 
 
 def meta_train_command(
@@ -114,6 +114,9 @@ def meta_train_command(
     learning_rate: float | None = None,
     contexts: int | None = None,
     evaluation_episodes: int | None = None,
+    validate: bool = False,
+    mean_evaluations: int | None = None,
+    evaluate_mean_every: int | None = None,
     backend: str | None = None,
     wandb: str | None = None,
 ) -> None:
@@ -147,6 +150,10 @@ def meta_train_command(
       learning_rate: of the outer loop's Adam.
       contexts: contexts that a batch of the bandit holds.
       evaluation_episodes: of each inner agent.
+      validate: judge the search distribution's mean by agents trained with it in the evaluation
+        environment, and keep the mean that was judged best, rather than the final one.
+      mean_evaluations: agents that judge the mean; with --validate 16 if left out.
+      evaluate_mean_every: generations between those judgements.
       backend: Brax physics, for Brax environments.
       wandb: project to log to, with the extra `wandb`.
     """
@@ -170,6 +177,9 @@ def meta_train_command(
             "learning_rate": learning_rate,
             "contexts": contexts,
             "evaluation_episodes": evaluation_episodes,
+            "validate": validate or None,
+            "mean_evaluations": mean_evaluations,
+            "evaluate_mean_every": evaluate_mean_every,
             "backend": backend,
         },
         META_TRAINING_PRESETS,
@@ -184,7 +194,7 @@ def meta_train_command(
     path, certificate = save_objective(
         folder.folder / "objective.npz",
         config.drift,
-        outcome.mean,
+        outcome.best_mean if config.validation else outcome.mean,
         meta_training_artefact(problem, outcome, settings, command_of("lpo", settings)),
     )
     figures.save(
@@ -194,11 +204,12 @@ def meta_train_command(
             config.fitness,
             config.evolution.population_size,
             config.evolution.mean_evaluations,
+            ", ".join(config.homes) if config.validation else None,
         ),
         folder.folder / "figures" / "meta_training.png",
     )
     console = Console()
-    console.print(f"objective: {path}")
+    console.print(f"objective: {path}", soft_wrap=True)
     console.print(f"it {certificate}")
 
 
@@ -225,7 +236,10 @@ def meta_training_config(settings: Mapping[str, Any]) -> MetaTrainingConfig:
             "strategy": default.evolution.strategy,
             "sigma": default.evolution.sigma,
             "learning_rate": default.evolution.learning_rate,
-            "mean_evaluations": default.evolution.mean_evaluations,
+            # A judgement on the environment costs a training there.
+            "mean_evaluations": 16
+            if settings.get("validate")
+            else default.evolution.mean_evaluations,
             "combine": "mean" if len(tasks) == 1 else "ranks",
             **given(
                 strategy="strategy",
@@ -234,6 +248,8 @@ def meta_training_config(settings: Mapping[str, Any]) -> MetaTrainingConfig:
                 sigma="sigma",
                 learning_rate="learning_rate",
                 combine="combine",
+                mean_evaluations="mean_evaluations",
+                evaluate_mean_every="evaluate_mean_every",
                 seed="seed",
             ),
         }
@@ -250,6 +266,7 @@ def meta_training_config(settings: Mapping[str, Any]) -> MetaTrainingConfig:
             agents_per_candidate="agents_per_candidate",
             contexts="contexts",
             evaluation_episodes="evaluation_episodes",
+            validation="validate",
             backend="backend",
         ),
     )

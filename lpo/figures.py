@@ -125,6 +125,7 @@ def meta_training_curve(
     fitness: str,
     population_size: int | None = None,
     mean_evaluations: int | None = None,
+    validated_on: str | None = None,
 ) -> Figure:
     """Fitness over the generations of an evolution.
 
@@ -134,6 +135,7 @@ def meta_training_curve(
       fitness: "return", "area" or "transfer".
       population_size, mean_evaluations: candidates a generation, and agents that judge the search
         distribution's mean; stated in the figure where given.
+      validated_on: where the mean was judged instead, on a scale of its own.
 
     Raises:
       UserError: no generation was logged.
@@ -168,9 +170,15 @@ def meta_training_curve(
         axes.plot(
             generations, best, color=GREY, linewidth=1.0, linestyle=":", label="population: best"
         )
+        judging = axes
         if judged:
             agents = "" if mean_evaluations is None else f" ({mean_evaluations} agents a point)"
-            axes.plot(
+            if validated_on is not None:
+                judging = axes.twinx()
+                judging.grid(visible=False)
+                judging.spines["right"].set_visible(True)
+                judging.set_ylabel(f"of the mean: return on {validated_on}")
+            judging.plot(
                 *zip(*judged, strict=True),
                 color=VERMILLION,
                 marker="o",
@@ -190,7 +198,11 @@ def meta_training_curve(
             top.set_xlabel("environment steps of the population (training + evaluation)")
         size = "" if population_size is None else f", population of {population_size}"
         _title(figure, f"Meta-training on {environment}{size}")
-        _legend_below(figure, axes.get_legend_handles_labels(), columns=2)
+        handles, labels = axes.get_legend_handles_labels()
+        if judged and judging is not axes:
+            of_mean = judging.get_legend_handles_labels()
+            handles, labels = handles + of_mean[0], labels + of_mean[1]
+        _legend_below(figure, (handles, labels), columns=2)
     return figure
 
 

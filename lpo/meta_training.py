@@ -18,6 +18,7 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 
 from lpo.drift import Drift, LearnedDrift
+from lpo.suite import REFERENCES, random_return
 from scb.agents.ppo import PPO, PPOConfig, PPOState
 from scb.agents.settings import environment_setting
 from scb.environments.brax import BRAX_NAMES
@@ -57,6 +58,12 @@ class MetaTrainingConfig:
       agents_per_candidate: inner agents whose mean is a candidate's fitness.
       evaluation_episodes: of each inner agent; None takes 50 where they are of one step, else 20.
       mode_actions: evaluate the most likely actions rather than sampled ones.
+      validation: judge the mean of the search distribution by agents trained with it in the tasks'
+        evaluation environments, on the settings of those, rather than by fitness; several count by
+        their normalised scores (`lpo.suite`). The longer a search
+        on a bandit, the more it learns about the bandit alone; the best judged mean
+        (`Outcome.best_mean`) is then where it carries over best. Takes environment steps, which
+        `MetaTraining.validation_steps` counts; the search itself still sees none of them.
       backend: Brax physics, where the environment is Brax's (with "transfer": the evaluation
         environment).
       evolution: the outer loop's.
@@ -75,6 +82,7 @@ class MetaTrainingConfig:
     agents_per_candidate: int = 4
     evaluation_episodes: int | None = None
     mode_actions: bool = True
+    validation: bool = False
     backend: str | None = None
     evolution: EvolutionConfig = field(
         default_factory=lambda: EvolutionConfig(
@@ -95,6 +103,12 @@ class MetaTrainingConfig:
                     f"fitness 'transfer' asks for a bandit, and {name!r} is none: use 'return' or 'area', or "
                     f"train on 'Synthetic-{name}'."
                 )
+        unknown = [name for name in self.homes if name not in REFERENCES]
+        if self.validation and len(self.homes) > 1 and unknown:
+            raise UserError(
+                f"validation on several environments needs a reference return of each, and {', '.join(unknown)} has "
+                f"none: take {', '.join(REFERENCES)}, or leave validation out."
+            )
         if self.agent is not None and len(self.tasks) > 1:
             raise UserError(
                 "one agent configuration does not fit several tasks: leave it out, and each takes its own."
@@ -116,6 +130,11 @@ class MetaTrainingConfig:
             raise UserError(
                 f"reward_noise is {self.reward_noise}: it must be 0 or larger, and finite."
             )
+
+    @property
+    def homes(self) -> tuple[str, ...]:
+        """The tasks' evaluation environments, each once."""
+        return tuple(dict.fromkeys(home_of(name) or name for name in self.tasks))
 
 
 def inner_loop(environment: str, contexts: int) -> PPOConfig:
@@ -250,6 +269,19 @@ class MetaTraining:
     def __init__(self, config: MetaTrainingConfig) -> None:
         self.config = config
         self.tasks = {name: TaskTraining(config, name) for name in config.tasks}
+        self.judges = self.tasks
+        # {judge: (return that counts as 0, return that counts as 1)}.
+        self.scales = dict.fromkeys(config.tasks, (0.0, 1.0))
+        if config.validation:
+            homes = config.homes
+            own = replace(config, tasks=homes, fitness="return", agent=None, horizons=())
+            self.judges = {name: TaskTraining(own, name) for name in homes}
+            self.scales = dict.fromkeys(homes, (0.0, 1.0))
+            if len(homes) > 1:
+                self.scales = {
+                    name: (random_return(judge.env, judge.env_params), REFERENCES[name])
+                    for name, judge in self.judges.items()
+                }
 
     def initial_solution(self, key: jax.Array) -> dict[str, jax.Array]:
         weights = self.config.drift.init(key)
@@ -279,10 +311,30 @@ class MetaTraining:
     def evaluate_mean(self, candidate: Any, key: jax.Array) -> dict[str, jax.Array]:
         fitness = {
             name: task.train_one(candidate, key if i == 0 else jax.random.fold_in(key, i))
-            for i, (name, task) in enumerate(self.tasks.items())
+            for i, (name, task) in enumerate(self.judges.items())
         }
         apart = {} if len(fitness) == 1 else {f"fitness/{n}": x for n, x in fitness.items()}
-        return {"fitness": jnp.stack(list(fitness.values())).mean(), **apart}
+        scores = [
+            (x - zero) / (one - zero)
+            for x, (zero, one) in zip(fitness.values(), self.scales.values(), strict=True)
+        ]
+        return {"fitness": jnp.stack(scores).mean(), **apart}
+
+    def validation_steps(self) -> EnvironmentSteps:
+        """Environment steps of all judgements of a whole search; none without validation."""
+        if not self.config.validation:
+            return EnvironmentSteps(0, 0)
+        evolution = self.config.evolution
+        judgements = -(-evolution.num_generations // evolution.evaluate_mean_every) + 1
+        agents = judgements * evolution.mean_evaluations
+        one = [
+            TaskTraining(replace(judge.config, agents_per_candidate=1), name).steps()
+            for name, judge in self.judges.items()
+        ]
+        return EnvironmentSteps(
+            training=agents * sum(c.training for c in one),
+            evaluation=agents * sum(c.evaluation for c in one),
+        )
 
     def steps(self) -> EnvironmentSteps:
         counts = [task.steps() for task in self.tasks.values()]

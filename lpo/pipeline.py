@@ -239,6 +239,14 @@ def meta_training_artefact(
         "cost": {
             "environment_steps_training": evaluations * steps.training,
             "environment_steps_evaluation": evaluations * steps.evaluation,
+            **(
+                {
+                    "environment_steps_validation": problem.validation_steps().total,
+                    "generation": outcome.best_mean_generation,
+                }
+                if problem.config.validation
+                else {}
+            ),
             "seconds": round(outcome.seconds, 1),
             "machine": machine_description(),
         },

@@ -268,7 +268,7 @@ def discover_command(
         path = save_bandit(path, problem.bandit, weights, metadata)
     else:
         path = save_synthetic_mdp(path, problem.bandit, weights, metadata)
-    Console().print(f"bandit: {path}")
+    Console().print(f"bandit: {path}", soft_wrap=True)
 
 
 def judge_all(

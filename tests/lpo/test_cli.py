@@ -609,6 +609,9 @@ def test_lists_of_meta_train_reach_the_configuration():
     assert config.horizons == (0.5, 2.0)
     # Returns of different tasks have different scales.
     assert config.evolution.combine == "ranks"
+    judged = commands.meta_training_config({"validate": True, "evaluate_mean_every": 5})
+    assert (judged.validation, judged.evolution.mean_evaluations) == (True, 16)
+    assert judged.evolution.evaluate_mean_every == 5
     temporal = commands.meta_training_config({"temporal": True})
     assert temporal.drift.temporal
     assert temporal.horizons == commands.TEMPORAL_HORIZONS

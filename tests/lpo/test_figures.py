@@ -323,3 +323,18 @@ def test_a_saved_figure_depends_on_its_data_alone(tmp_path: Path):
         assert chunk not in first.read_bytes()
     other = figures.save(figures.learning_curves([curve("dpo")]), tmp_path / "other.png")
     assert other.read_bytes() != first.read_bytes()
+
+
+def test_a_validated_mean_has_a_scale_of_its_own():
+    metrics = [
+        {"generation": 0, "fitness/mean": -0.6, "fitness/std": 0.1, "fitness/max": -0.4},
+        {"generation": 1, "fitness/mean": -0.5, "fitness/std": 0.1, "fitness/max": -0.3},
+    ]
+    metrics[0]["mean/fitness"], metrics[1]["final_mean/fitness"] = -900.0, -300.0
+    drawn = figures.meta_training_curve(
+        metrics, "Synthetic-Pendulum-v1", "return", validated_on="Pendulum-v1"
+    )
+    fitness, judged = drawn.axes[:2]
+    assert judged.get_ylabel() == "of the mean: return on Pendulum-v1"
+    assert fitness.get_ylim()[0] > -10.0
+    np.testing.assert_array_equal(judged.lines[0].get_ydata(), [-900.0, -300.0])

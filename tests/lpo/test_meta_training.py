@@ -219,7 +219,7 @@ class Worth:
 def test_every_task_gives_its_own_entries_of_fitness(config):
     problem = MetaTraining(replace(config, tasks=(PENDULUM, "Pendulum-v1"), agent=None))
     assert [task.env.name for task in problem.tasks.values()] == [PENDULUM, "Pendulum-v1"]
-    problem.tasks = {"a": Worth(1.0), "b": Worth(-100.0)}
+    problem.tasks = problem.judges = {"a": Worth(1.0), "b": Worth(-100.0)}
     problem.config = replace(config, agents_per_candidate=3)
     candidate = {"output": jnp.full((2, 1), 2.0)}
     result = problem.evaluate(candidate, jax.random.key(0), jnp.int32(0))
@@ -247,6 +247,50 @@ def test_tasks_of_other_shapes_learn_one_objective(config):
     assert MetaTraining(several).steps().total == sum(steps.total for steps in alone)
     # Two generations of two candidates.
     assert line["steps/total"] == 4 * sum(steps.total for steps in alone)
+
+
+# -- validation ----------------------------------------------------------------------------------
+
+
+def test_validation_judges_the_mean_on_the_environment_and_the_search_never_sees_it(
+    config, monkeypatch
+):
+    validated = replace(config, validation=True)
+    setting = environment_setting("Pendulum-v1").config
+    short = replace(setting, num_envs=2, num_steps=10, total_steps=20, num_minibatches=2)
+    monkeypatch.setattr(
+        meta_training,
+        "inner_loop",
+        lambda name, contexts, own=inner_loop: (
+            short if name == "Pendulum-v1" else own(name, contexts)
+        ),
+    )
+    outcome = meta_train(validated, quiet=True)
+    plain = meta_train(config, quiet=True)
+    for line, other in zip(outcome.metrics, plain.metrics, strict=True):
+        assert line["fitness/mean"] == other["fitness/mean"]
+        assert line["steps/total"] == other["steps/total"]
+    judged = [outcome.metrics[0]["mean/fitness"], outcome.metrics[-1]["final_mean/fitness"]]
+    # A pendulum that hangs, and not one reward of the bandit.
+    assert WORST_PENDULUM_RETURN < min(judged) <= max(judged) < -100
+    np.testing.assert_array_equal(outcome.mean["output"], plain.mean["output"])
+    # Judged twice, before and after two generations, by two agents: 20 steps, and 2 episodes of 200.
+    steps = MetaTraining(validated).validation_steps()
+    assert (steps.training, steps.evaluation) == (4 * 20, 4 * 2 * 200)
+    assert MetaTraining(config).validation_steps().total == 0
+
+
+def test_several_environments_validate_by_their_normalised_scores(config):
+    tasks = (PENDULUM, "Synthetic-CartPole-v1")
+    problem = MetaTraining(replace(config, tasks=tasks, agent=None, validation=True))
+    assert list(problem.judges) == ["Pendulum-v1", "CartPole-v1"]
+    assert problem.judges["CartPole-v1"].env.name == "CartPole-v1"
+    zero, one = problem.scales["CartPole-v1"]
+    assert 19.0 < zero < 26.0 and one == 500.0
+    problem.judges = {"Pendulum-v1": Worth(-137.4), "CartPole-v1": Worth(zero)}
+    # One agent at the expert's return, one at that of random actions: (1 + 0) / 2.
+    judged = problem.evaluate_mean({"output": jnp.ones((1, 1))}, jax.random.key(0))
+    assert float(judged["fitness"]) == pytest.approx(0.5, abs=1e-6)
 
 
 # -- horizons ------------------------------------------------------------------------------------
@@ -384,6 +428,10 @@ def test_physics_go_to_the_environment_and_not_to_its_bandit(
         (
             {"tasks": ("a", "b"), "agent": PPOConfig()},
             "one agent configuration does not fit several tasks",
+        ),
+        (
+            {"tasks": ("Synthetic-hopper", "Pendulum-v1"), "validation": True},
+            "needs a reference return of each, and hopper has none: take CartPole-v1",
         ),
         ({"horizons": (0.5, 0.0)}, "a horizon is 0.0: it must be larger than 0"),
         (

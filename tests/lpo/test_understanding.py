@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from matplotlib.collections import QuadMesh
 
+from experiments.understanding import words
 from lpo import figures
 from lpo.drift import LearnedDrift
 from lpo.objectives import Objective, load_objective
@@ -176,6 +177,16 @@ def test_the_figure_has_a_row_for_every_fraction_of_a_temporal_drift():
     assert low == -high < 0.0  # white is no gradient
     regions = analyze(load_objective("ppo")).regions
     np.testing.assert_array_equal(np.asarray(meshes[2].get_array()).reshape(regions.shape), regions)
+
+
+def test_sentences_say_the_numbers():
+    said = words(analyze(load_objective("ppo")).as_dict())
+    assert "this one stops everywhere, whatever the advantage's sign." in said
+    # 1 - 0.3538, by the arithmetic above.
+    assert "Elsewhere, 65 % of the grid, it leaves the gradient as it is." in said
+    said = words(analyze(load_objective("none")).as_dict())
+    assert "this one goes on everywhere" in said
+    assert "It stops nowhere up to ratio 2 with an advantage of +1" in said
 
 
 def test_a_figure_of_nothing_is_refused():

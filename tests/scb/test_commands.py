@@ -96,8 +96,7 @@ def test_a_discovery_says_what_its_bandit_is_worth_and_where_it_lies(discovered)
     for algorithm in ("PPO", "SAC", "DQN"):
         assert f"{algorithm} on CartPole-v1: sampled actions IQM " in text
     assert text.count("; mode actions IQM ") == 3
-    path = "".join(lines[-2:]).split("bandit: ")[1]
-    assert Path(path) == folder / "Synthetic-CartPole-v1.npz"
+    assert Path(lines[-1].removeprefix("bandit: ")) == folder / "Synthetic-CartPole-v1.npz"
     assert "generation 2/2: fitness" in result.err
 
 

@@ -390,7 +390,8 @@ def watched(small):
 
 
 def test_every_hyperparameter_has_an_effect(population):
-    assert set(CHANGED) == set(PPOHyperparameters.__dataclass_fields__)
+    # The horizon has one only where a drift or an annealed learning rate asks how far training is.
+    assert set(CHANGED) == set(PPOHyperparameters.__dataclass_fields__) - {"horizon"}
     base, *others = (jax.tree.map(itemgetter(i), population[1].params) for i in range(8))
     for name, other in zip(CHANGED, others, strict=True):
         assert np.abs(displacement(base, other)).max() > 1e-5, name
