@@ -15,7 +15,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from experiments.zoo_table import ENVIRONMENTS, TARGETS, read_report
+from experiments.zoo_table import ENVIRONMENTS, TARGETS, label, read_report
 from lpo.cli import configure_jax
 
 if TYPE_CHECKING:
@@ -106,9 +106,7 @@ def _run(folder: Path) -> dict[str, Any] | str:
     return {
         "name": folder.resolve().name,
         # Brax with its physics, without which its return says nothing.
-        "environment": f"{environment} ({config['backend']})"
-        if config.get("backend")
-        else environment,
+        "environment": label({"environment": environment, "backend": config.get("backend")}),
         "start": start,
         "seed": evolution.get("seed") or 0,
         "settings": {name: config.get(name, evolution.get(name)) for name in SETTINGS},
@@ -307,7 +305,7 @@ def figure(report: Mapping[str, Any]) -> "Figure":
         "warm": figures.Look(figures.VERMILLION, "-", "o"),
         "random": figures.Look(figures.BLUE, "--", "s"),
     }
-    with figures._style():
+    with figures.figure_style():
         drawn = Figure(figsize=(figures.WIDTH, 2.4 * len(environments) + 1.2))
         grid = drawn.subplots(len(environments), 2, sharey="row", squeeze=False)
         for row, environment in zip(grid, environments, strict=True):

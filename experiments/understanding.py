@@ -42,7 +42,7 @@ def measure(names: Sequence[str]) -> list[dict[str, Any]]:
 
 def read_formula(path: Path) -> dict[str, Any]:
     """What the page says of a closed form, from its artefact."""
-    from lpo.distill import ClosedFormDrift
+    from lpo.formula import ClosedFormDrift
     from lpo.objectives import load_objective
     from scb.errors import UserError
 

@@ -306,8 +306,8 @@ def _pairs(
 
 def label(entry: Mapping[str, Any]) -> str:
     """The environment, and for Brax its physics: one bandit can be measured in several."""
-    physics = entry["backend"]
-    return entry["environment"] if physics is None else f"{entry['environment']} ({physics})"
+    physics = entry.get("backend")
+    return f"{entry['environment']} ({physics})" if physics else entry["environment"]
 
 
 def _environment_rank(name: str) -> tuple[int, str]:
@@ -500,7 +500,7 @@ def figure(report: Mapping[str, Any]) -> "Figure":
     }
     columns = min(2, len(environments))
     rows = math.ceil(len(environments) / columns)
-    with figures._style():
+    with figures.figure_style():
         drawn = Figure(figsize=(figures.WIDTH, 2.1 * rows + 1.1))
         grid = drawn.subplots(rows, columns, squeeze=False).flat
         for panel, (axes, environment) in enumerate(zip(grid, environments, strict=False)):

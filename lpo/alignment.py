@@ -15,14 +15,22 @@ import jax.numpy as jnp
 import numpy as np
 
 from lpo.drift import ClipDrift, DPODrift, NoDrift
-from lpo.generalization import check_names, check_seeds, learning_curves, training_setting
+from lpo.generalization import (
+    check_names,
+    check_seeds,
+    compare,
+    families,
+    over_objectives,
+    training_setting,
+)
 from lpo.meta_training import MetaTrainingConfig, TaskTraining, inner_loop
 from lpo.objectives import Objective
+from scb.agents.ppo import PPOHyperparameters
+from scb.agents.settings import environment_setting
 from scb.artefacts import machine_description, package_versions
 from scb.environments.registry import make
 from scb.environments.zoo import home_of
 from scb.errors import UserError
-from scb.evolution import map_population
 from scb.runs import Stopwatch
 from scb.statistics import iqm, spearman
 
@@ -43,8 +51,8 @@ class Regime:
       bandit: a zoo name or file.
       reward_noise: in standard deviations of the bandit's reward.
       contexts: of a batch.
-      iterations, epochs, minibatches, learning_rate: where None, those of the evaluation
-        environment's own setting.
+      iterations, epochs, minibatches, learning_rate, policy_output_scale: where None, those of the
+        evaluation environment's own setting.
     """
 
     bandit: str = "Synthetic-Pendulum-v1"
@@ -54,6 +62,7 @@ class Regime:
     epochs: int | None = None
     minibatches: int | None = None
     learning_rate: float | None = None
+    policy_output_scale: float | None = None
 
     def __post_init__(self) -> None:
         if home_of(self.bandit) is None:
@@ -78,12 +87,13 @@ class Regime:
         config = MetaTrainingConfig(
             tasks=(self.bandit,), agent=agent, reward_noise=self.reward_noise
         )
-        task = TaskTraining(config, self.bandit, objective.drift)
-        if self.learning_rate is not None:
-            task.base_hyperparameters = replace(
-                task.base_hyperparameters, learning_rate=self.learning_rate
-            )
-        return task
+        return TaskTraining(config, self.bandit, objective.drift)
+
+    def hyperparameters(self) -> PPOHyperparameters:
+        """Of its agents: the setting's own but for what is given here."""
+        own = environment_setting(str(home_of(self.bandit))).hyperparameters
+        given = {name: getattr(self, name) for name in ("learning_rate", "policy_output_scale")}
+        return replace(own, **{name: x for name, x in given.items() if x is not None})
 
     def __str__(self) -> str:
         """What differs from the default."""
@@ -113,30 +123,37 @@ def outcomes(
     seeds: Sequence[int],
     steps: int | None = None,
     backend: str | None = None,
+    policy_output_scale: float | None = None,
 ) -> dict[str, np.ndarray]:
     """{objective: [S] return of PPO trained with it}, mode actions; arguments as `learning_curves`."""
-    check_names(objectives)
-    setting = training_setting(environment, steps)
-    return {
-        objective.name: learning_curves(
-            environment, objective, seeds, setting, backend=backend, points=1
-        ).final
-        for objective in objectives
-    }
+    setting = training_setting(environment, steps, policy_output_scale)
+    comparison = compare(environment, objectives, seeds, setting=setting, backend=backend, points=1)
+    return {curves.objective: curves.final for curves in comparison.curves}
 
 
 def regime_fitness(
-    regime: Regime, objective: Objective, seeds: Sequence[int]
-) -> dict[str, np.ndarray]:
-    """{fitness: [S]} of agents trained in a regime with an objective, one a seed; see `FITNESSES`.
+    regime: Regime, objectives: Sequence[Objective], seeds: Sequence[int]
+) -> dict[str, dict[str, np.ndarray]]:
+    """{objective: {fitness: [S]}} of agents trained in a regime with each, one a seed; see `FITNESSES`.
 
     Returns are without reward noise. "area under the curve" is the mean over the training of the
     return with mode actions; "transfer" is the return in the bandit's evaluation environment.
     """
+    check_names(objectives)
     check_seeds(seeds)
+    found = {}
+    for family in families(objectives):
+        results = over_objectives(_trained_in(regime, family[0]), family, seeds)
+        for objective, of_it in zip(family, np.asarray(results, np.float64), strict=True):
+            found[objective.name] = dict(zip(FITNESSES, of_it.T, strict=True))
+    return found
+
+
+def _trained_in(regime: Regime, objective: Objective) -> Callable[[Any, jax.Array], jax.Array]:
+    """(parameters of the objective's drift, seed) -> [F] fitnesses."""
     task = regime.task(objective)
     home, home_params = make(task.home)
-    hyperparameters = replace(task.base_hyperparameters, drift=objective.parameters)
+    hyperparameters = regime.hyperparameters()
 
     def returns(state: Any, key: jax.Array, mode: bool) -> jax.Array:
         episodes = task.agent.evaluate(
@@ -144,11 +161,11 @@ def regime_fitness(
         )
         return episodes.returns.mean()
 
-    def train(seed: jax.Array) -> jax.Array:
+    def train(parameters: Any, seed: jax.Array) -> jax.Array:
         key_train, key_sampled, key_home = jax.random.split(jax.random.key(seed), 3)
         state, curve = task.agent.train_with_evaluations(
             key_train,
-            hyperparameters,
+            replace(hyperparameters, drift=parameters),
             task.training_params,
             lambda state, key: returns(state, key, mode=True),
             every=task.area_every,
@@ -163,8 +180,7 @@ def regime_fitness(
             ]
         )
 
-    results = map_population(train, len(seeds), (0,))(np.asarray(seeds, np.uint32))
-    return dict(zip(FITNESSES, np.asarray(results, np.float64).T, strict=True))
+    return train
 
 
 @dataclass(frozen=True)
@@ -228,6 +244,7 @@ def measure_alignment(
     seeds: Sequence[int],
     steps: int | None = None,
     backend: str | None = None,
+    policy_output_scale: float | None = None,
     tell: Callable[[str], None] = print,
 ) -> dict[str, Any]:
     """The alignment of every regime's fitnesses with an environment's outcome, ready for JSON.
@@ -235,17 +252,17 @@ def measure_alignment(
     Args:
       regimes: inner loops on bandits.
       objectives: the family that is ranked.
-      environment, steps, backend: where the outcome is measured.
+      environment, steps, backend, policy_output_scale: where and how the outcome is measured.
       seeds: of the agents in the environment and in the regimes.
       tell: takes a line when a regime has been measured.
     """
-    outcome = outcomes(environment, objectives, seeds, steps, backend)
+    outcome = outcomes(environment, objectives, seeds, steps, backend, policy_output_scale)
     ranked = {name: float(iqm(returns)) for name, returns in outcome.items()}
     tell(f"{environment}: " + ", ".join(f"{n} {x:.0f}" for n, x in ranked.items()))
     rows = []
     for regime in regimes:
         watch = Stopwatch()
-        fitness = {o.name: regime_fitness(regime, o, seeds) for o in objectives}
+        fitness = regime_fitness(regime, objectives, seeds)
         correlations = {
             name: asdict(alignment({o: x[name] for o, x in fitness.items()}, outcome))
             for name in FITNESSES
@@ -270,6 +287,7 @@ def measure_alignment(
         "environment": environment,
         "steps": steps,
         "backend": backend,
+        "policy_output_scale": policy_output_scale,
         "agents": len(seeds),
         "first_seed": min(seeds),
         "outcome_iqm": ranked,

@@ -17,7 +17,7 @@ from rich.table import Table
 
 from lpo import figures
 from lpo.alignment import FITNESSES, Regime, correlation_text, known_drifts, measure_alignment
-from lpo.certificate import certify
+from lpo.certificate import Certificate, certify
 from lpo.distill import DistillConfig, distill
 from lpo.drift import LearnedDrift
 from lpo.generalization import (
@@ -103,8 +103,10 @@ def meta_train_command(
     fitness: str | None = None,
     reward_noise: float | None = None,
     base: str | None = None,
+    xi: float | None = None,
     temporal: bool = False,
     horizons: str | None = None,
+    hyperparameters: str | None = None,
     combine: str | None = None,
     strategy: str | None = None,
     population_size: int | None = None,
@@ -136,10 +138,13 @@ def meta_train_command(
       reward_noise: noise on the bandit's reward, in its standard deviations. Without it the drift
         overfits the bandit.
       base: ppo (the network corrects PPO's clip) or none.
+      xi: half-width of the drift's dead zone.
       temporal: let the drift change over an agent's training; inner agents then train for random
         numbers of updates.
       horizons: how long inner agents train, as fractions of the setting's number of updates, such
         as 0.25,0.5,1; one is drawn for each generation. With --temporal 0.25,0.5,1,2 if left out.
+      hyperparameters: values that inner agents draw theirs from, such as
+        "learning_rate=0.0003,0.001 policy_output_scale=1,0.01".
       combine: how a candidate's agents and tasks count: mean, or ranks (the mean over them of its
         rank among the candidates; the default for several tasks).
       strategy: any of evosax's, by name (Open_ES, SNES, CMA_ES, ...).
@@ -166,8 +171,10 @@ def meta_train_command(
             "fitness": fitness,
             "reward_noise": reward_noise,
             "base": base,
+            "xi": xi,
             "temporal": temporal or None,
             "horizons": horizons,
+            "hyperparameters": hyperparameters,
             "combine": combine,
             "strategy": strategy,
             "population_size": population_size,
@@ -186,13 +193,30 @@ def meta_train_command(
         preset,
         resume,
     )
+    path, certificate = learn_objective(settings, resume or out, resume is not None, wandb)
+    console = Console()
+    console.print(f"objective: {path}", soft_wrap=True)
+    console.print(f"it {certificate}")
+
+
+def learn_objective(
+    settings: Mapping[str, Any], folder: Path, resume: bool = False, wandb: str | None = None
+) -> tuple[Path, Certificate]:
+    """What `lpo meta-train` does: evolves a drift in a run folder, and saves it with its certificate.
+
+    Args:
+      settings: the command's flags by name, "command" among them; what is left out keeps its default.
+      folder: of the run; new or empty, or with `resume` that of a run with these settings.
+      resume: continue after the folder's newest checkpoint.
+      wandb: project to log to.
+    """
     config = meta_training_config(settings)
     problem = MetaTraining(config)
-    folder = Run.open(resume or out, settings, resume=resume is not None, wandb_project=wandb)
-    outcome = evolve(problem, config.evolution, folder)
-    folder.close()
+    run = Run.open(folder, dict(settings), resume=resume, wandb_project=wandb)
+    outcome = evolve(problem, config.evolution, run)
+    run.close()
     path, certificate = save_objective(
-        folder.folder / "objective.npz",
+        run.folder / "objective.npz",
         config.drift,
         outcome.best_mean if config.validation else outcome.mean,
         meta_training_artefact(problem, outcome, settings, command_of("lpo", settings)),
@@ -206,11 +230,9 @@ def meta_train_command(
             config.evolution.mean_evaluations,
             ", ".join(config.homes) if config.validation else None,
         ),
-        folder.folder / "figures" / "meta_training.png",
+        run.folder / "figures" / "meta_training.png",
     )
-    console = Console()
-    console.print(f"objective: {path}", soft_wrap=True)
-    console.print(f"it {certificate}")
+    return path, certificate
 
 
 def meta_training_config(settings: Mapping[str, Any]) -> MetaTrainingConfig:
@@ -254,12 +276,13 @@ def meta_training_config(settings: Mapping[str, Any]) -> MetaTrainingConfig:
             ),
         }
     )
-    drift = LearnedDrift(**given(base="base", temporal="temporal"))
+    drift = LearnedDrift(**given(base="base", temporal="temporal", xi="xi"))
     return MetaTrainingConfig(
         tasks=tasks,
         drift=drift,
         horizons=horizons,
         evolution=evolution,
+        hyperparameters=_lists(settings.get("hyperparameters")) or default.hyperparameters,
         **given(
             fitness="fitness",
             reward_noise="reward_noise",
@@ -281,18 +304,34 @@ def _listed(text: str | None, what: str) -> tuple[str, ...]:
 
 
 def _numbers(text: str | None, what: str) -> tuple[float, ...]:
+    listed = _listed(text, what)
     try:
-        return tuple(float(x) for x in _listed(text, what))
+        return tuple(float(x) for x in listed)
     except ValueError as error:
         raise UserError(
             f"{what} {text!r} are no numbers: give them separated by commas, such as 0.25,0.5,1."
         ) from error
 
 
+def _lists(text: str | None) -> dict[str, tuple[float, ...]]:
+    """The values in "learning_rate=0.0003,0.001 policy_output_scale=1,0.01" by name."""
+    lists = {}
+    for part in (text or "").split():
+        name, equals, values = part.partition("=")
+        if not equals:
+            raise UserError(
+                f"hyperparameters {text!r} have the part {part!r}, which is no NAME=VALUE,VALUE: write such as "
+                "learning_rate=0.0003,0.001."
+            )
+        lists[name] = _numbers(values, name)
+    return lists
+
+
 def train(
     environment: str = "Pendulum-v1",
     objective: str = "ppo",
     steps: int | None = None,
+    policy_output_scale: float | None = None,
     seeds: int = 1,
     seed: int = 0,
     backend: str | None = None,
@@ -305,6 +344,8 @@ def train(
       environment: Pendulum-v1, CartPole-v1, hopper, Synthetic-Pendulum-v1, ...
       objective: ppo, ppo-0.3 (clip 0.3), dpo, none, a zoo name, or path.npz.
       steps: environment steps; the environment's own setting where left out.
+      policy_output_scale: factor on the policy's last layer at initialisation; many public PPOs take
+        0.01.
       seeds: agents to train.
       seed: the first of their seeds.
       backend: Brax physics: generalized, positional or spring.
@@ -317,7 +358,7 @@ def train(
         environment,
         load_objective(objective),
         seed_list(seeds, seed),
-        setting=training_setting(environment, steps),
+        setting=training_setting(environment, steps, policy_output_scale),
         backend=backend,
         mode_actions=not sampled_actions,
     )
@@ -333,6 +374,7 @@ def evaluate(
     suite: str | None = None,
     objectives: tuple[str, ...] = ("ppo", "dpo"),
     steps: int | None = None,
+    policy_output_scale: float | None = None,
     seeds: int = 10,
     seed: int = 1000,
     backend: str | None = None,
@@ -348,6 +390,8 @@ def evaluate(
       objectives: any of ppo, ppo-0.3, dpo, none, zoo names, files; the first is the reference of
         the differences.
       steps: environment steps; the environment's own setting where left out.
+      policy_output_scale: factor on the policy's last layer at initialisation; many public PPOs take
+        0.01.
       seeds: agents of each objective.
       seed: the first of their seeds.
       backend: Brax physics: generalized, positional or spring.
@@ -362,7 +406,16 @@ def evaluate(
             raise UserError(
                 f"the environment {environment} and the suite {suite} are both given: leave one out."
             )
-        _evaluate_suite(suite, loaded, seed_list(seeds, seed), steps, backend, sampled_actions, out)
+        settings = {
+            "suite": suite,
+            "objectives": [objective.name for objective in loaded],
+            "seeds": seed_list(seeds, seed),
+            "steps": steps,
+            "policy_output_scale": policy_output_scale,
+            "backend": backend,
+            "sampled_actions": sampled_actions,
+        }
+        _evaluate_suite(loaded, settings, out)
         return
     environment = environment or "Pendulum-v1"
     if out is not None:
@@ -371,7 +424,7 @@ def evaluate(
         environment,
         loaded,
         seed_list(seeds, seed),
-        setting=training_setting(environment, steps),
+        setting=training_setting(environment, steps, policy_output_scale),
         backend=backend,
         mode_actions=not sampled_actions,
     )
@@ -387,22 +440,9 @@ def evaluate(
 
 
 def _evaluate_suite(
-    name: str,
-    objectives: Sequence[Objective],
-    seeds: Sequence[int],
-    steps: int | None,
-    backend: str | None,
-    sampled_actions: bool,
-    out: Path | None,
+    objectives: Sequence[Objective], settings: Mapping[str, Any], out: Path | None
 ) -> None:
-    settings = {
-        "suite": name,
-        "objectives": [objective.name for objective in objectives],
-        "seeds": list(seeds),
-        "steps": steps,
-        "backend": backend,
-        "sampled_actions": sampled_actions,
-    }
+    name = settings["suite"]
     environments = suite_environments(name)
     done: dict[str, Comparison] = {}
     if out is not None:
@@ -416,13 +456,14 @@ def _evaluate_suite(
     scores, comparisons = run_suite(
         name,
         objectives,
-        seeds,
-        backend,
+        settings["seeds"],
+        settings["backend"],
         tell=console.print,
         done=done,
         keep=keep,
-        steps=steps,
-        mode_actions=not sampled_actions,
+        steps=settings["steps"],
+        policy_output_scale=settings["policy_output_scale"],
+        mode_actions=not settings["sampled_actions"],
     )
     reference = objectives[0].name
     table = Table(
@@ -490,6 +531,7 @@ def align(
     epochs: tuple[int, ...] = (),
     minibatches: tuple[int, ...] = (),
     steps: int | None = None,
+    policy_output_scale: float | None = None,
     agents: int = 16,
     seed: int = 500,
     backend: str | None = None,
@@ -512,6 +554,8 @@ def align(
       epochs: passes over a batch.
       minibatches: of a batch.
       steps: environment steps of the outcome's agents; the environment's own where left out.
+      policy_output_scale: factor on the policy's last layer at initialisation, in the environment and
+        in every regime.
       agents: of each objective, in the environment and in each regime.
       seed: the first of their seeds.
       backend: Brax physics: generalized, positional or spring.
@@ -519,7 +563,7 @@ def align(
     """
     family = [*known_drifts(), *_named_apart(objectives)]
     regimes = [
-        Regime(*values)
+        Regime(*values, policy_output_scale=policy_output_scale)
         for values in itertools.product(
             bandits,
             reward_noise,
@@ -537,7 +581,9 @@ def align(
     if out is not None:
         _make_folder(out)
     console = Console()
-    report = measure_alignment(regimes, family, target, seeds, steps, backend, console.print)
+    report = measure_alignment(
+        regimes, family, target, seeds, steps, backend, policy_output_scale, console.print
+    )
     table = Table("regime", *FITNESSES, title=f"Spearman's correlation with {target} [95 %]")
     for row in report["regimes"]:
         cells = (row["alignment"][fitness] for fitness in FITNESSES)

@@ -154,7 +154,7 @@ def meta_training_curve(
     if metrics[-1].get("final_mean/fitness") is not None:
         # Judged after the last generation, and so where the next would be.
         judged.append((metrics[-1]["generation"] + 1, metrics[-1]["final_mean/fitness"]))
-    with _style():
+    with figure_style():
         figure = Figure(figsize=(WIDTH, 4.2))
         axes = figure.add_subplot()
         axes.fill_between(
@@ -224,7 +224,7 @@ def environment_steps(
             raise UserError(
                 f"the steps {name} lack {', '.join(missing)}: give training, evaluation and total."
             )
-    with _style():
+    with figure_style():
         figure = Figure(figsize=(WIDTH, 3.0))
         axes = figure.add_subplot()
         axes.set_xscale("log")
@@ -305,7 +305,7 @@ def learning_curves(curves: "Sequence[LearningCurves]") -> Figure:
             )
     style = looks([curve.objective for curve in curves])
     counts = sorted({len(curve.seeds) for curve in curves})
-    with _style():
+    with figure_style():
         figure = Figure(figsize=(WIDTH, 4.4))
         training, final = figure.subplots(1, 2, width_ratios=(2.4, 1))
         for position, curve in enumerate(curves):
@@ -354,7 +354,7 @@ def drift_heatmaps(objectives: "Sequence[Objective]", progress: float = 0.5) -> 
     surfaces = [drift_surface(o, ratios, advantages, progress) for o in objectives]
     drifts = [drift for drift, _ in surfaces]
     gradients = [gradient for _, gradient in surfaces]
-    with _style():
+    with figure_style():
         figure = Figure(figsize=(WIDTH, 6.4))
         grid = figure.subplots(2, len(objectives), sharex=True, sharey=True, squeeze=False)
         # The dark end of the map is cut off: contours would drown in it.
@@ -478,7 +478,7 @@ def suite_scores(scores: "SuiteScores") -> Figure:
     style = looks(scores.objectives)
     thresholds = np.linspace(-0.1, 1.3, 141)
     share, low, high = scores.profile(thresholds)
-    with _style():
+    with figure_style():
         figure = Figure(figsize=(WIDTH, 4.0))
         profile, aggregate = figure.subplots(1, 2, width_ratios=(2.0, 1))
         for i, name in enumerate(scores.objectives):
@@ -529,7 +529,7 @@ def alignment_heatmap(report: Mapping[str, Any]) -> Figure:
             for row in rows
         ]
     )
-    with _style():
+    with figure_style():
         figure = Figure(figsize=(WIDTH, 1.6 + 0.42 * len(rows)))
         axes = figure.subplots()
         image = axes.imshow(values, cmap="RdBu", vmin=-1.0, vmax=1.0, aspect="auto")
@@ -586,7 +586,7 @@ def drift_and_gradient(
         for fraction in fractions
     ]
     names = list(REGIONS)
-    with _style():
+    with figure_style():
         figure = Figure(figsize=(WIDTH, 1.7 + 1.9 * len(rows)))
         grid = figure.subplots(len(rows), 3, sharex=True, sharey=True, squeeze=False)
         pale_is_none = LinearSegmentedColormap.from_list(
@@ -666,7 +666,7 @@ def save(figure: Figure, path: str | Path) -> Path:
     """Writes a PNG whose bytes depend on the figure alone: no date, no version in its metadata."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    with _style():
+    with figure_style():
         figure.savefig(path, format="png", dpi=DPI, metadata={"Software": None})
     return path
 
@@ -688,7 +688,8 @@ def thousands(x: float) -> str:
 
 
 @contextmanager
-def _style() -> Iterator[None]:
+def figure_style() -> Iterator[None]:
+    """The context in which every figure of the project is drawn."""
     # "default" first: a reader's own matplotlibrc must not change the figures of a run.
     with matplotlib.style.context(["default", _STYLE]):
         yield

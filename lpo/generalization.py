@@ -5,11 +5,13 @@ episodes, so that differences are paired. Final scores are interquartile means w
 intervals.
 """
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from lpo.objectives import Objective
@@ -83,14 +85,27 @@ def evaluation_interval(num_iterations: int, points: int) -> int:
     return min(divisors, key=lambda n: abs(num_iterations / n - points))
 
 
-def training_setting(environment: str, total_steps: int | None = None) -> Setting:
-    """The environment's PPO setting, for another number of steps where one is given."""
+def training_setting(
+    environment: str, total_steps: int | None = None, policy_output_scale: float | None = None
+) -> Setting:
+    """The environment's PPO setting, with another number of steps or initialisation where one is given."""
     setting = environment_setting(environment)
-    if total_steps is None:
-        return setting
-    if total_steps < 1:
-        raise UserError(f"steps is {total_steps}: it must be at least 1.")
-    return replace(setting, config=replace(setting.config, total_steps=total_steps))
+    if total_steps is not None:
+        if total_steps < 1:
+            raise UserError(f"steps is {total_steps}: it must be at least 1.")
+        setting = replace(setting, config=replace(setting.config, total_steps=total_steps))
+    if policy_output_scale is not None:
+        if not 0 <= policy_output_scale < math.inf:
+            raise UserError(
+                f"policy_output_scale is {policy_output_scale}: it must be 0 or larger, and finite."
+            )
+        setting = replace(
+            setting,
+            hyperparameters=replace(
+                setting.hyperparameters, policy_output_scale=policy_output_scale
+            ),
+        )
+    return setting
 
 
 def _rounded_to_points(config: PPOConfig, points: int) -> PPOConfig:
@@ -132,6 +147,62 @@ def learning_curves(
       episodes: of each evaluation.
       mode_actions: evaluate the most likely actions rather than sampled ones.
     """
+    return _family_curves(
+        environment,
+        [objective],
+        seeds,
+        setting,
+        backend,
+        points,
+        episodes,
+        mode_actions,
+    )[0]
+
+
+def families(objectives: Sequence[Objective]) -> list[list[Objective]]:
+    """Objectives that differ in their drifts' parameters alone stand together: one program trains them all."""
+    found: list[list[Objective]] = []
+    for objective in objectives:
+        family = next((f for f in found if f[0].drift == objective.drift), None)
+        if family is None:
+            found.append([objective])
+        else:
+            family.append(objective)
+    return found
+
+
+def over_objectives(
+    function: Callable[[Any, jax.Array], Any], objectives: Sequence[Objective], seeds: Sequence[int]
+) -> Any:
+    """Calls a function for every objective of a family and every seed, as one program.
+
+    Args:
+      function: (drift parameters, seed) -> pytree of arrays.
+
+    Returns:
+      The pytree, every leaf [objectives, seeds, ...].
+    """
+    number, size = len(objectives), len(objectives) * len(seeds)
+    parameters = jax.tree.map(
+        lambda *leaves: jnp.repeat(jnp.stack(leaves), len(seeds), axis=0),
+        *(objective.parameters for objective in objectives),
+    )
+    every_seed = np.tile(np.asarray(seeds, np.uint32), number)
+    results = map_population(function, size, (0, 0))(parameters, every_seed)
+    return jax.tree.map(lambda x: np.reshape(x, (number, len(seeds), *x.shape[1:])), results)
+
+
+def _family_curves(
+    environment: str,
+    objectives: Sequence[Objective],
+    seeds: Sequence[int],
+    setting: Setting | None = None,
+    backend: str | None = None,
+    points: int = 15,
+    episodes: int = 20,
+    mode_actions: bool = True,
+) -> list[LearningCurves]:
+    """`learning_curves` of objectives that share a drift, on the same seeds."""
     check_seeds(seeds)
     for name, value in (("points", points), ("episodes", episodes)):
         if value < 1:
@@ -139,34 +210,37 @@ def learning_curves(
     env, env_params = make(environment, **({} if backend is None else {"backend": backend}))
     setting = setting or environment_setting(environment)
     config = _rounded_to_points(setting.config, min(points, setting.config.num_iterations))
-    agent = PPO(env, config, objective.drift)
-    hyperparameters = replace(setting.hyperparameters, drift=objective.parameters)
+    agent = PPO(env, config, objectives[0].drift)
     every = evaluation_interval(config.num_iterations, points)
 
-    def train(seed: jax.Array) -> jax.Array:
-        key = jax.random.key(seed)
-
+    def train(parameters: Any, seed: jax.Array) -> jax.Array:
         def judge(state: Any, key: jax.Array) -> jax.Array:
             return agent.evaluate(
                 state, key, episodes, env_params=env_params, mode=mode_actions
             ).returns.mean()
 
-        _, returns = agent.train_with_evaluations(key, hyperparameters, env_params, judge, every)
+        hyperparameters = replace(setting.hyperparameters, drift=parameters)
+        _, returns = agent.train_with_evaluations(
+            jax.random.key(seed), hyperparameters, env_params, judge, every
+        )
         return returns
 
-    returns = map_population(train, len(seeds), (0,))(np.asarray(seeds, np.uint32))
-    steps = np.arange(returns.shape[1]) * every * config.batch_size
-    return LearningCurves(
-        environment,
-        getattr(env, "backend", None),
-        objective.name,
-        steps,
-        # In double precision, so that curves read back from JSON give the same estimates.
-        np.asarray(returns, np.float64),
-        list(seeds),
-        episodes,
-        mode_actions,
-    )
+    # In double precision, so that curves read back from JSON give the same estimates.
+    returns = np.asarray(over_objectives(train, objectives, seeds), np.float64)
+    steps = np.arange(returns.shape[2]) * every * config.batch_size
+    return [
+        LearningCurves(
+            environment,
+            getattr(env, "backend", None),
+            objective.name,
+            steps,
+            of_it,
+            list(seeds),
+            episodes,
+            mode_actions,
+        )
+        for objective, of_it in zip(objectives, returns, strict=True)
+    ]
 
 
 @dataclass(frozen=True)
@@ -220,6 +294,10 @@ def compare(
       UserError: two objectives bear one name, by which their results would be told apart.
     """
     check_names(objectives)
-    return Comparison(
-        [learning_curves(environment, objective, seeds, **arguments) for objective in objectives]
-    )
+    curves = [
+        curve
+        for family in families(objectives)
+        for curve in _family_curves(environment, family, seeds, **arguments)
+    ]
+    names = [objective.name for objective in objectives]
+    return Comparison(sorted(curves, key=lambda curve: names.index(curve.objective)))

@@ -10,6 +10,7 @@ makes it rank objectives almost as the environment does.
 """
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
@@ -19,7 +20,8 @@ from jax.typing import ArrayLike
 
 from lpo.drift import Drift, LearnedDrift
 from lpo.suite import REFERENCES, random_return
-from scb.agents.ppo import PPO, PPOConfig, PPOState
+from scb.agents.hyperparameters import check_lists, sample_hyperparameters
+from scb.agents.ppo import PPO, PPOConfig, PPOHyperparameters, PPOState
 from scb.agents.settings import environment_setting
 from scb.environments.brax import BRAX_NAMES
 from scb.environments.registry import make
@@ -50,8 +52,9 @@ class MetaTrainingConfig:
       horizons: how long inner agents train, as fractions of the setting's number of updates; one is
         drawn for each generation. Empty: always in full. A temporally-aware drift learns here that
         the fraction of training done is what matters.
-      learning_rates, entropy_coefficients: values that an inner agent's are drawn from; where
-        empty, those of the (evaluation) environment's own setting.
+      hyperparameters: {PPO's hyperparameter: values that inner agents' are drawn from}; the rest are
+        those of the (evaluation) environment's own setting. By default the policy's initialisation is
+        drawn: with one alone, an objective learns to make up for its weakness.
       reward_noise: standard deviation of the noise on a bandit's reward, in standard deviations of
         that reward over random contexts and actions. Real environments have noise of their own and
         take none.
@@ -76,8 +79,9 @@ class MetaTrainingConfig:
     agent: PPOConfig | None = None
     contexts: int = 200
     horizons: tuple[float, ...] = ()
-    learning_rates: tuple[float, ...] = ()
-    entropy_coefficients: tuple[float, ...] = ()
+    hyperparameters: Mapping[str, tuple[float, ...]] = field(
+        default_factory=lambda: {"policy_output_scale": (1.0, 0.01)}
+    )
     reward_noise: float = 5.0
     agents_per_candidate: int = 4
     evaluation_episodes: int | None = None
@@ -121,6 +125,13 @@ class MetaTrainingConfig:
             if not 0 < horizon < math.inf:
                 raise UserError(
                     f"a horizon is {horizon}: it must be larger than 0, and finite (1 is the setting's own)."
+                )
+        check_lists(self.hyperparameters, PPOHyperparameters())
+        for name in ("drift", "horizon"):
+            if name in self.hyperparameters:
+                raise UserError(
+                    f"{name} is not drawn from a list: the drift is what is learned, and horizons are a setting of "
+                    "their own."
                 )
         for name in ("agents_per_candidate", "evaluation_episodes", "contexts"):
             value = getattr(self, name)
@@ -195,23 +206,32 @@ class TaskTraining:
             self.training_params = self.env_params.replace(reward_noise=config.reward_noise * scale)
         self.base_hyperparameters = environment_setting(self.home).hyperparameters
 
-    def train_one(
-        self, drift_parameters: Any, key: jax.Array, horizon: ArrayLike = 1.0
+    def fitness(
+        self, drift_parameters: Any, key: jax.Array, number: int, horizon: ArrayLike = 1.0
     ) -> jax.Array:
-        """[] fitness of one agent that was trained with these drift parameters.
+        """[number] fitnesses of as many agents, each trained with these drift parameters.
 
         Args:
-          horizon: how long it trains, as a fraction of the inner loop's iterations; traced.
+          horizon: how long they train, as a fraction of the inner loop's iterations; traced.
         """
+        key_draw, key_agents = jax.random.split(key)
+        hyperparameters = sample_hyperparameters(
+            key_draw, self.config.hyperparameters, number, self.base_hyperparameters
+        )
+        return jax.vmap(lambda h, k: self._train_one(drift_parameters, h, k, horizon))(
+            hyperparameters, jax.random.split(key_agents, number)
+        )
+
+    def _train_one(
+        self,
+        drift_parameters: Any,
+        hyperparameters: PPOHyperparameters,
+        key: jax.Array,
+        horizon: ArrayLike,
+    ) -> jax.Array:
         config = self.config
-        key_rate, key_entropy, key_train, key_evaluate = jax.random.split(key, 4)
-        hyperparameters = replace(self.base_hyperparameters, drift=drift_parameters)
-        if config.learning_rates:
-            rate = jax.random.choice(key_rate, jnp.asarray(config.learning_rates))
-            hyperparameters = replace(hyperparameters, learning_rate=rate)
-        if config.entropy_coefficients:
-            entropy = jax.random.choice(key_entropy, jnp.asarray(config.entropy_coefficients))
-            hyperparameters = replace(hyperparameters, entropy_coefficient=entropy)
+        key_train, key_evaluate = jax.random.split(key)
+        hyperparameters = replace(hyperparameters, drift=drift_parameters)
 
         def judge(state: PPOState, key: jax.Array) -> jax.Array:
             return self.agent.evaluate(
@@ -298,10 +318,8 @@ class MetaTraining:
             key_horizon = jax.random.fold_in(key, len(config.tasks))
             horizon = jax.random.choice(key_horizon, jnp.asarray(config.horizons))
         fitness = {
-            name: jax.vmap(lambda k, task=task: task.train_one(candidate, k, horizon))(
-                jax.random.split(
-                    key if i == 0 else jax.random.fold_in(key, i), config.agents_per_candidate
-                )
+            name: task.fitness(
+                candidate, jax.random.fold_in(key, i), config.agents_per_candidate, horizon
             )
             for i, (name, task) in enumerate(self.tasks.items())
         }
@@ -310,7 +328,7 @@ class MetaTraining:
 
     def evaluate_mean(self, candidate: Any, key: jax.Array) -> dict[str, jax.Array]:
         fitness = {
-            name: task.train_one(candidate, key if i == 0 else jax.random.fold_in(key, i))
+            name: task.fitness(candidate, jax.random.fold_in(key, i), 1)[0]
             for i, (name, task) in enumerate(self.judges.items())
         }
         apart = {} if len(fitness) == 1 else {f"fitness/{n}": x for n, x in fitness.items()}

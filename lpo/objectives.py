@@ -12,8 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from lpo.certificate import Certificate, certify
-from lpo.distill import ClosedFormDrift
 from lpo.drift import TEMPORAL_FEATURES, ClipDrift, DPODrift, Drift, LearnedDrift, NoDrift
+from lpo.formula import ClosedFormDrift
 from scb import artefacts
 from scb.errors import UserError, unknown_name
 

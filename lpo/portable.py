@@ -18,6 +18,7 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from lpo.drift import ClipDrift, DPODrift, LearnedDrift, NoDrift
+from lpo.formula import ClosedFormDrift, evaluate, parse
 from lpo.objectives import Objective, load_objective
 from scb.agents.ppo import MAX_LOG_RATIO
 from scb.errors import UserError
@@ -186,9 +187,14 @@ def _formula(objective: Objective) -> _Formula:
             return lambda xp, log_ratio, advantage, progress: _learned(
                 xp, log_ratio, advantage, progress, drift, weights
             )
+        case ClosedFormDrift():
+            constants = [float(x) for x in parameters["constants"]]
+            return lambda xp, log_ratio, advantage, progress: _closed_form(
+                xp, log_ratio, advantage, progress, drift, constants
+            )
     raise UserError(
-        f"{type(drift).__name__} has no form in NumPy and PyTorch: those that have are ClipDrift, DPODrift, NoDrift "
-        "and LearnedDrift; take `drift_function` for JAX, or write the formula out."
+        f"{type(drift).__name__} has no form in NumPy and PyTorch: those that have are ClipDrift, DPODrift, NoDrift, "
+        "LearnedDrift and ClosedFormDrift; take `drift_function` for JAX, or write the formula out."
     )
 
 
@@ -220,6 +226,26 @@ def _learned(
         inputs = xp.concatenate([inputs, progress[..., None] * inputs], -1)
     hidden, output = (_like(xp, log_ratio, weights[name]) for name in ("hidden", "output"))
     penalty = (xp.tanh(inputs @ hidden) @ output)[..., 0]
+    if drift.base == "ppo":
+        penalty = penalty + _clip(xp, log_ratio, advantage, drift.clip)
+    return _relu(xp, penalty - drift.xi)
+
+
+def _closed_form(
+    xp: Any,
+    log_ratio: Any,
+    advantage: Any,
+    progress: Any,
+    drift: ClosedFormDrift,
+    constants: list[float],
+) -> Any:
+    variables = {
+        "d": xp.expm1(log_ratio),
+        "log_r": log_ratio,
+        "A": advantage,
+        "progress": progress,
+    }
+    penalty = evaluate(parse(drift.expression).root, constants, variables, xp)
     if drift.base == "ppo":
         penalty = penalty + _clip(xp, log_ratio, advantage, drift.clip)
     return _relu(xp, penalty - drift.xi)

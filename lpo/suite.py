@@ -170,14 +170,12 @@ def _resampled(scores: np.ndarray) -> np.ndarray:
 def suite_scores(
     comparisons: Mapping[str, Comparison],
     random: Mapping[str, float],
-    references: Mapping[str, tuple[float, str]] | None = None,
 ) -> SuiteScores:
     """Normalises the final returns of comparisons that share objectives and numbers of seeds.
 
     Args:
       comparisons: {environment: Comparison}.
       random: {environment: return of random actions}.
-      references: {environment: (return, source)} that is 1; `reference_of` where None.
 
     Raises:
       UserError: other objectives or numbers of seeds in one than in another; no environment left.
@@ -190,9 +188,7 @@ def suite_scores(
         if [c.objective for c in comparison.curves] != objectives:
             raise UserError(f"{name} was run with other objectives than the rest: run all alike.")
         finals = np.stack([c.final for c in comparison.curves])
-        reference, source = (
-            references[name] if references is not None else reference_of(name, comparison)
-        )
+        reference, source = reference_of(name, comparison)
         if not reference > random[name]:
             left_out.append(name)
             continue
@@ -230,6 +226,7 @@ def run_suite(
     done: Mapping[str, Comparison] | None = None,
     keep: Callable[[str, Comparison], None] = lambda name, comparison: None,
     steps: int | None = None,
+    policy_output_scale: float | None = None,
     **arguments: Any,
 ) -> tuple[SuiteScores, dict[str, Comparison]]:
     """Trains PPO with every objective in every environment of a suite.
@@ -242,7 +239,7 @@ def run_suite(
       tell: takes a line when an environment is done.
       done: comparisons that are there already and are not run again.
       keep: is given every new comparison as it comes.
-      steps: environment steps of every training; each environment's own setting where None.
+      steps, policy_output_scale: of every training; each environment's own setting where None.
       arguments: further ones of `learning_curves`.
     """
     check_names(objectives)
@@ -261,7 +258,7 @@ def run_suite(
             environment_name,
             objectives,
             seeds,
-            setting=training_setting(environment_name, steps),
+            setting=training_setting(environment_name, steps, policy_output_scale),
             backend=physics,
             **arguments,
         )

@@ -386,13 +386,7 @@ def standardize_reward(
 
     Both are over its contexts and uniform actions. What agents should do in it stays the same.
     """
-    params = bandit.params(weights)
-    key_context, key_action = jax.random.split(jax.random.key(0))
-    contexts, _ = jax.vmap(bandit.reset_env, in_axes=(0, None))(
-        jax.random.split(key_context, num_samples), params
-    )
-    actions = jax.vmap(bandit.action_space().sample)(jax.random.split(key_action, num_samples))
-    rewards = jax.vmap(bandit.mean_reward, in_axes=(0, 0, None))(contexts, actions, params)
+    rewards = bandit.sample_rewards(bandit.params(weights), jax.random.key(0), num_samples)
     factor = std / rewards.std()
     # Through the network's last layer, which is linear.
     reward = dict(weights["reward"])

@@ -1,11 +1,13 @@
 """Policy and value networks: separate multilayer perceptrons, as in the paper's tables."""
 
 from collections.abc import Callable
+from typing import Any
 
 import distrax
 import jax
 import jax.numpy as jnp
 from flax import linen as nn
+from jax.typing import ArrayLike
 
 ACTIVATIONS: dict[str, Callable[[jax.Array], jax.Array]] = {
     "tanh": jnp.tanh,
@@ -24,6 +26,19 @@ class MLP(nn.Module):
         for size in self.hidden_sizes:
             inputs = ACTIVATIONS[self.activation](nn.Dense(size)(inputs))
         return nn.Dense(self.output_size)(inputs)
+
+
+def scale_output(variables: Any, scale: ArrayLike) -> Any:
+    """A policy's initial variables with the weights of its MLP's last layer multiplied by `scale`.
+
+    A small last layer makes the untrained policy the same in every state, which matters more to PPO
+    on continuous actions than anything else about its networks' initialisation (Andrychowicz et al.,
+    2021, "What matters in on-policy reinforcement learning?").
+    """
+    mlp = dict(variables["params"]["MLP_0"])
+    name = f"Dense_{len(mlp) - 1}"
+    mlp[name] = {**mlp[name], "kernel": mlp[name]["kernel"] * scale}
+    return {**variables, "params": {**variables["params"], "MLP_0": mlp}}
 
 
 class CategoricalPolicy(nn.Module):

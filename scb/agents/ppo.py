@@ -107,7 +107,8 @@ class PPOHyperparameters:
 
     `drift` holds the drift's parameters, whatever pytree it takes; for PPO itself the clip epsilon.
     `horizon` is the number of iterations that the fraction of training done refers to; the
-    configuration's where None.
+    configuration's where None. `policy_output_scale` multiplies the policy's last layer at
+    initialisation: 1 leaves Flax's, as the paper's agents have it; many public PPOs take 0.01.
     """
 
     learning_rate: ArrayLike = 5e-3
@@ -118,6 +119,7 @@ class PPOHyperparameters:
     max_grad_norm: ArrayLike = 10.0
     drift: Any = 0.2
     horizon: ArrayLike | None = None
+    policy_output_scale: ArrayLike = 1.0
 
 
 @struct.dataclass
@@ -215,7 +217,9 @@ class PPO(Agent):
         policy, value = self._networks(env_params)
         size = self.observation_size(env_params)
         params = {
-            "policy": policy.init(key_policy, jnp.zeros(size)),
+            "policy": networks.scale_output(
+                policy.init(key_policy, jnp.zeros(size)), hyperparameters.policy_output_scale
+            ),
             "value": value.init(key_value, jnp.zeros(size)),
         }
         standing = None

@@ -204,17 +204,21 @@ class SyntheticBandit(environment.Environment[BanditState, BanditParams]):
     def observation_space(self, params: BanditParams | None = None) -> spaces.Box:
         return spaces.Box(-jnp.inf, jnp.inf, (self.observation_size,), jnp.float32)
 
-    def reward_scale(
-        self, params: BanditParams, key: jax.Array, num_samples: int = 4096
-    ) -> jax.Array:
-        """[] standard deviation of the noiseless reward over random contexts and uniformly random actions."""
+    def sample_rewards(self, params: BanditParams, key: jax.Array, num_samples: int) -> jax.Array:
+        """[num_samples] noiseless rewards of random contexts and uniformly random actions."""
 
         def sample(key: jax.Array) -> jax.Array:
             key_context, key_action = jax.random.split(key)
             context, _ = self.reset_env(key_context, params)
             return self.mean_reward(context, self._action_space.sample(key_action), params)
 
-        return jnp.std(jax.vmap(sample)(jax.random.split(key, num_samples)))
+        return jax.vmap(sample)(jax.random.split(key, num_samples))
+
+    def reward_scale(
+        self, params: BanditParams, key: jax.Array, num_samples: int = 4096
+    ) -> jax.Array:
+        """[] standard deviation of `sample_rewards`."""
+        return jnp.std(self.sample_rewards(params, key, num_samples))
 
 
 def flat_size(shape: tuple[int, ...]) -> int:

@@ -86,12 +86,14 @@ def test_a_regime_changes_what_it_names_and_keeps_the_settings_own():
     plain = Regime().task(ppo)
     assert plain.agent_config.num_iterations == own.config.num_iterations == 15
     assert plain.agent_config.batch_size == 200
-    assert plain.base_hyperparameters == own.hyperparameters
-    other = replace(TINY, learning_rate=0.5).task(ppo)
-    config = other.agent_config
+    assert Regime().hyperparameters() == own.hyperparameters
+    regime = replace(TINY, learning_rate=0.5, policy_output_scale=0.25)
+    config = regime.task(ppo).agent_config
     assert (config.num_iterations, config.batch_size) == (4, 10)
     assert (config.num_epochs, config.num_minibatches) == (1, 1)
-    assert other.base_hyperparameters.learning_rate == 0.5
+    hyperparameters = regime.hyperparameters()
+    assert (hyperparameters.learning_rate, hyperparameters.policy_output_scale) == (0.5, 0.25)
+    assert hyperparameters.discount == own.hyperparameters.discount
     assert str(Regime()) == "default"
     assert str(Regime(reward_noise=0.0, contexts=50)) == "reward noise 0.0, contexts 50"
 
@@ -113,13 +115,15 @@ def test_the_family_is_ppo_dpo_and_none_each_with_its_own_parameters():
 
 def test_agents_of_a_regime_are_judged_in_every_way():
     ppo = known_drifts()[2]
-    fitness = regime_fitness(TINY, ppo, [1, 2, 3])
+    dpo = known_drifts()[-1]
+    fitness = regime_fitness(TINY, [ppo, dpo], [1, 2, 3])[ppo.name]
     assert tuple(fitness) == FITNESSES
     assert all(x.shape == (3,) and np.isfinite(x).all() for x in fitness.values())
     # In the bandit a return is one reward; on Pendulum 200 of down to -16.3.
     assert np.abs(fitness["return, mode actions"]).max() < 100
     assert -16.3 * 200 < fitness["transfer"].min() <= fitness["transfer"].max() < -100
-    again = regime_fitness(TINY, ppo, [3, 2])
+    # Another clip shares the program; neither it nor other seeds change what an agent learns.
+    again = regime_fitness(TINY, [known_drifts()[0], ppo], [3, 2])[ppo.name]
     np.testing.assert_allclose(again["transfer"], fitness["transfer"][[2, 1]], rtol=1e-4)
 
 
@@ -130,8 +134,9 @@ def test_the_report_holds_every_regime_and_is_drawn(monkeypatch, tmp_path):
     monkeypatch.setattr(
         module,
         "regime_fitness",
-        lambda regime, objective, seeds: {
-            name: regime.reward_noise * fixed[objective.name] for name in FITNESSES
+        lambda regime, objectives, seeds: {
+            o.name: {name: regime.reward_noise * fixed[o.name] for name in FITNESSES}
+            for o in objectives
         },
     )
     regimes = [Regime(reward_noise=1.0), Regime(reward_noise=0.0)]

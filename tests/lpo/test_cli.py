@@ -469,7 +469,10 @@ def measured(environment, objective, seeds, mode_actions=True, **_) -> LearningC
 
 @pytest.fixture
 def trained(monkeypatch) -> None:
-    monkeypatch.setattr("lpo.generalization.learning_curves", measured)
+    def family(environment, objectives, seeds, **arguments) -> list[LearningCurves]:
+        return [measured(environment, objective, seeds, **arguments) for objective in objectives]
+
+    monkeypatch.setattr("lpo.generalization._family_curves", family)
     monkeypatch.setattr(commands, "learning_curves", measured)
 
 
@@ -621,7 +624,8 @@ def test_lists_of_meta_train_reach_the_configuration():
 def test_align_measures_every_combination_and_stores_it(monkeypatch, working_folder, capsys):
     asked = []
 
-    def measure(regimes, objectives, environment, seeds, steps, backend, tell):
+    def measure(regimes, objectives, environment, seeds, steps, backend, scale, tell):
+        assert scale == 0.01 and all(r.policy_output_scale == scale for r in regimes)
         asked.extend(regimes)
         assert {"ppo-0.2", "none", "lpo-pendulum"} <= {o.name for o in objectives}
         assert (environment, seeds) == ("Pendulum-v1", [500, 501])
@@ -636,6 +640,7 @@ def test_align_measures_every_combination_and_stores_it(monkeypatch, working_fol
 
     monkeypatch.setattr(commands, "measure_alignment", measure)
     flags = ["--objectives", "lpo-pendulum", "--agents=2", "--out=aligned"]
+    flags += ["--policy-output-scale=0.01"]
     assert cli.main(["align", "--reward-noise", "0", "5", "--contexts", "50", "200", *flags]) == 0
     assert [(r.reward_noise, r.contexts) for r in asked] == [(0, 50), (0, 200), (5, 50), (5, 200)]
     output = capsys.readouterr().out
@@ -643,3 +648,22 @@ def test_align_measures_every_combination_and_stores_it(monkeypatch, working_fol
     stored = json.loads((working_folder / "aligned" / "alignment.json").read_text())
     assert len(stored["regimes"]) == 4
     assert (working_folder / "aligned" / "alignment.png").stat().st_size > 5000
+
+
+def test_inner_agents_hyperparameters_are_read_from_one_line(one_sentence):
+    def config(text):
+        return commands.meta_training_config({"hyperparameters": text})
+
+    lists = config("learning_rate=0.0003,0.001 policy_output_scale=1").hyperparameters
+    assert lists == {"learning_rate": (0.0003, 0.001), "policy_output_scale": (1.0,)}
+    assert config(None).hyperparameters == {"policy_output_scale": (1.0, 0.01)}
+    for text, message in (
+        ("learning_rate", "the part 'learning_rate', which is no NAME=VALUE,VALUE"),
+        ("learning_rate=fast", "learning_rate 'fast' are no numbers"),
+        ("learning_rate=", "the list of learning_rate is empty"),
+        ("learning_rat=0.1", "unknown hyperparameter 'learning_rat'"),
+        ("drift=0.1", "drift is not drawn from a list"),
+    ):
+        with pytest.raises(UserError) as error:
+            config(text)
+        assert message in one_sentence(str(error.value))

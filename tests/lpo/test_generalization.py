@@ -154,7 +154,8 @@ def test_every_member_of_the_contract_trains_inside_ppo(trained):
 def test_objectives_start_from_the_same_agents_and_lead_elsewhere(trained):
     # Paired seeds: the same networks and evaluation contexts, so the same return before training.
     for name in ("dpo", "none", "tiny"):
-        np.testing.assert_array_equal(trained[name].returns[:, 0], trained["ppo"].returns[:, 0])
+        start = trained[name].returns[:, 0]
+        np.testing.assert_allclose(start, trained["ppo"].returns[:, 0], rtol=1e-5)
         assert np.all(np.any(trained[name].returns != trained["ppo"].returns, axis=1))
 
 
@@ -162,6 +163,38 @@ def test_training_with_zero_output_weights_is_training_with_ppos_clip(trained):
     # The two drifts differ by xi = 1e-6 at most.
     zero, ppo = trained["zero"].returns, trained["ppo"].returns
     np.testing.assert_allclose(zero, ppo, atol=1e-3)
+
+
+def test_objectives_of_one_drift_share_a_program_and_keep_their_order(arguments, trained):
+    clips = [load_objective(name) for name in ("ppo-0.01", "dpo", "ppo")]
+    curves = {c.objective: c for c in compare(objectives=clips, **arguments).curves}
+    assert list(curves) == ["ppo-0.01", "dpo", "ppo"]
+    np.testing.assert_allclose(curves["ppo"].returns, trained["ppo"].returns, rtol=1e-4)
+    assert np.abs(curves["ppo-0.01"].returns - curves["ppo"].returns).max() > 1e-3
+
+
+def test_a_policy_that_starts_at_zero_takes_the_same_action_everywhere(arguments):
+    # The mean action of a fresh policy is its last layer's bias, which is zero: a pendulum left alone.
+    setting = training_setting("Pendulum-v1", 8, policy_output_scale=0.0)
+    start = learning_curves(
+        "Pendulum-v1", load_objective("ppo"), [1, 2], setting, points=1, episodes=3
+    ).returns[:, 0]
+    plain = learning_curves(
+        "Pendulum-v1",
+        load_objective("ppo"),
+        [1, 2],
+        training_setting("Pendulum-v1", 8),
+        points=1,
+        episodes=3,
+    ).returns[:, 0]
+    assert np.abs(start - plain).min() > 1.0
+
+
+@pytest.mark.parametrize("scale", [-1.0, float("inf"), float("nan")])
+def test_a_scale_that_cannot_be_is_refused(scale, one_sentence):
+    with pytest.raises(UserError) as error:
+        training_setting("Pendulum-v1", policy_output_scale=scale)
+    assert "policy_output_scale is" in one_sentence(str(error.value))
 
 
 def test_seeds_differ_from_each_other(trained):

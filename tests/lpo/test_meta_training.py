@@ -110,7 +110,7 @@ def test_area_is_the_mean_over_the_training_without_the_untrained_agent(config):
     problem = TaskTraining(replace(config, fitness="area", reward_noise=0.0), PENDULUM)
     problem.agent = Recorded()
     # (1 + 2 + 6) / 3 = 3, and 27.25 with the untrained agent's 100.
-    assert float(problem.train_one({}, jax.random.key(0))) == 3.0
+    assert problem.fitness({}, jax.random.key(0), 1).tolist() == [3.0]
 
 
 # -- where it starts ----------------------------------------------------------------------------
@@ -154,14 +154,14 @@ def test_inner_agents_draw_from_the_lists_or_take_the_settings_own(config):
             return Episodes(jnp.array([total]), jnp.array([1]))
 
     def worth(**lists):
-        problem = TaskTraining(replace(config, reward_noise=0.0, **lists), PENDULUM)
+        problem = TaskTraining(replace(config, reward_noise=0.0, hyperparameters=lists), PENDULUM)
         problem.agent = Echo()
-        return jax.vmap(lambda key: problem.train_one({}, key))(
-            jax.random.split(jax.random.key(0), 50)
-        )
+        return problem.fitness({}, jax.random.key(0), 50)
 
-    both = worth(learning_rates=(1.0, 2.0), entropy_coefficients=(10.0, 20.0))
+    both = worth(learning_rate=(1.0, 2.0), entropy_coefficient=(10.0, 20.0))
     assert set(both.tolist()) == {11.0, 12.0, 21.0, 22.0}
+    # Dealt evenly: 25 agents have each value.
+    assert float(both.sum()) == 25 * (1.0 + 2.0) + 25 * (10.0 + 20.0)
     # Pendulum's setting has a learning rate of 0.001 and an entropy coefficient of 0.01.
     np.testing.assert_allclose(worth(), 0.011, rtol=1e-6)
 
@@ -212,8 +212,8 @@ class Worth:
     def __init__(self, number: float) -> None:
         self.number = number
 
-    def train_one(self, candidate, key, horizon=1.0):
-        return candidate["output"].sum() * self.number + 0.0 * jax.random.uniform(key)
+    def fitness(self, candidate, key, number, horizon=1.0):
+        return jnp.full(number, candidate["output"].sum() * self.number)
 
 
 def test_every_task_gives_its_own_entries_of_fitness(config):
@@ -312,7 +312,9 @@ def test_inner_agents_train_for_the_horizon_and_know_how_far_they_are(config):
         (2.0, {0.0, 1 / 6, 2 / 6, 3 / 6, 4 / 6, 5 / 6}),
     ):
         seen.clear()
-        jax.block_until_ready(jax.jit(task.train_one)(0.0, jax.random.key(0), horizon))
+        jax.block_until_ready(
+            jax.jit(task.fitness, static_argnums=2)(0.0, jax.random.key(0), 1, horizon)
+        )
         jax.effects_barrier()
         assert set(np.round(seen, 5)) == set(np.round(list(fractions), 5))
     assert hyperparameters.horizon is None
@@ -322,8 +324,8 @@ def test_a_generation_has_one_horizon_and_generations_differ(config):
     problem = MetaTraining(replace(config, horizons=(0.5, 1.0, 2.0), agents_per_candidate=3))
 
     class Echo:
-        def train_one(self, candidate, key, horizon=1.0):
-            return horizon
+        def fitness(self, candidate, key, number, horizon=1.0):
+            return jnp.full(number, horizon)
 
     problem.tasks = {"a": Echo()}
     drawn = [
@@ -369,16 +371,13 @@ def test_reward_noise_enters_training_and_not_evaluation(config):
     # Half of the agents draw the learning rate 0 and stay as they were initialised: were noise in
     # the evaluation, none of them would be worth the same as without. The other half learns, and
     # learns something else under noise.
-    keys = jax.random.split(jax.random.key(0), 16)
     start = config.drift.init(jax.random.key(1))
+    drawn = replace(config, hyperparameters={"learning_rate": (0.0, 0.1)})
     with_noise, without = (
-        jax.jit(jax.vmap(TaskTraining(c, PENDULUM).train_one, (None, 0)))(start, keys)
-        for c in (
-            replace(config, learning_rates=(0.0, 0.1), reward_noise=noise) for noise in (5.0, 0.0)
-        )
+        jax.jit(TaskTraining(c, PENDULUM).fitness, static_argnums=2)(start, jax.random.key(0), 16)
+        for c in (replace(drawn, reward_noise=noise) for noise in (5.0, 0.0))
     )
-    equal = np.asarray(with_noise == without)
-    assert 2 < equal.sum() < 14
+    assert int(jnp.sum(with_noise == without)) == 8
 
 
 def test_environments_take_no_reward_noise(config):

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from lpo.drift import BASES, LearnedDrift
+from lpo.formula import ClosedFormDrift
 from lpo.objectives import Objective, load_objective, objective_names
 from lpo.portable import drift_function, numpy_drift, torch_drift, torch_loss
 from scb.agents.ppo import MAX_LOG_RATIO
@@ -27,8 +28,17 @@ def random_objective(base: str, temporal: bool) -> Objective:
     return Objective(f"learned-{base}{'-temporal' if temporal else ''}", drift, parameters)
 
 
+def formula(base: str, expression: str) -> Objective:
+    drift = ClosedFormDrift(expression, base=base)
+    return Objective(f"formula-{base}", drift, drift.init(jax.random.key(0)))
+
+
 OBJECTIVES = [load_objective(name) for name in [*objective_names(), "ppo-0.3"]] + [
     random_objective(base, temporal) for base in BASES for temporal in (False, True)
+]
+OBJECTIVES += [
+    formula("ppo", "0.3*A*tanh(d) - 0.2*relu(1.5*A*log_r)"),
+    formula("none", "abs(d)*(0.7 - progress) + A*log_r*tanh(-2*A*d)"),
 ]
 every_objective = pytest.mark.parametrize("objective", OBJECTIVES, ids=lambda o: o.name)
 
@@ -90,7 +100,8 @@ def test_only_a_temporal_drift_changes_with_progress():
         early, late = drift(log_ratio, advantage, 0.0), drift(log_ratio, advantage, 1.0)
         changes[objective.name] = bool(np.any(early != late))
     assert {name for name, changed in changes.items() if changed} == {
-        f"learned-{base}-temporal" for base in BASES
+        *(f"learned-{base}-temporal" for base in BASES),
+        "formula-none",
     }
 
 

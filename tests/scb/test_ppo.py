@@ -361,6 +361,7 @@ CHANGED = {
     "value_coefficient": 0.0,
     "max_grad_norm": 1e-4,
     "drift": 0.0001,
+    "policy_output_scale": 0.1,
 }
 
 
@@ -392,9 +393,25 @@ def watched(small):
 def test_every_hyperparameter_has_an_effect(population):
     # The horizon has one only where a drift or an annealed learning rate asks how far training is.
     assert set(CHANGED) == set(PPOHyperparameters.__dataclass_fields__) - {"horizon"}
-    base, *others = (jax.tree.map(itemgetter(i), population[1].params) for i in range(8))
+    base, *others = (
+        jax.tree.map(itemgetter(i), population[1].params) for i in range(1 + len(CHANGED))
+    )
     for name, other in zip(CHANGED, others, strict=True):
         assert np.abs(displacement(base, other)).max() > 1e-5, name
+
+
+def test_the_output_scale_multiplies_the_policys_last_layer_and_nothing_else(small):
+    agent, params = small
+    full, half = (
+        agent.init(jax.random.key(0), PPOHyperparameters(policy_output_scale=scale), params).params
+        for scale in (1.0, 0.5)
+    )
+    name = f"Dense_{len(agent.config.hidden_sizes)}"
+    last = full["policy"]["params"]["MLP_0"].pop(name)
+    halved = half["policy"]["params"]["MLP_0"].pop(name)
+    np.testing.assert_array_equal(halved["kernel"], 0.5 * last["kernel"])
+    assert np.abs(last["kernel"]).min() > 0
+    chex.assert_trees_all_equal(full, half)
 
 
 def test_a_member_of_a_population_is_the_agent_that_is_trained_alone(population, watched):

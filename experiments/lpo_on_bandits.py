@@ -1,0 +1,454 @@
+"""The paper's figure of learned policy optimisation: learned on a bandit and on the environment, judged on two.
+
+    python -m experiments.lpo_on_bandits --preset quick
+
+(i) Meta-training on the bandit and on Pendulum: what agents trained on Pendulum with the mean of the
+search distribution earn, over generations. (ii) The same over environment steps and over wall-clock.
+(iii) PPO on Pendulum with its clip, a tuned clip, DPO and the learned objectives, with either
+initialisation of the policy. (iv) The same on Hopper. Every search is a run folder under --runs and is
+resumed; what --out holds already is not measured again, so the same command continues an interrupted
+one. `--only-render` makes page and figure from --out.
+"""
+
+import argparse
+import json
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from lpo.cli import configure_jax
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from scb.statistics import Estimate
+
+SOURCES = ("bandit", "environment")
+CLIPS = ("ppo-0.1", "ppo", "ppo-0.3", "ppo-0.5", "ppo-1")
+TUNING_SEED = 22_000  # the clip is chosen on these agents, and reported on others
+REPORTING_SEED = 10_000
+SCALES = {"Flax's initialisation": 1.0, "small last layer": 0.01}
+
+_JUDGED = {"validate": True, "mean_evaluations": 16}
+PRESETS: dict[str, dict[str, Any]] = {
+    "quick": {
+        "searches": {
+            "bandit": {
+                "seeds": 5,
+                "settings": {
+                    **_JUDGED,
+                    "environment": "Synthetic-Pendulum-v1",
+                    "population_size": 32,
+                    "generations": 30,
+                    "agents_per_candidate": 4,
+                    "evaluate_mean_every": 5,
+                },
+            },
+            # A generation takes forty times as long here: a candidate has one agent, and the search
+            # is short.
+            "environment": {
+                "seeds": 2,
+                "settings": {
+                    **_JUDGED,
+                    "environment": "Pendulum-v1",
+                    "population_size": 16,
+                    "generations": 10,
+                    "agents_per_candidate": 1,
+                    "evaluate_mean_every": 2,
+                },
+            },
+        },
+        "agents": 20,
+        "tuning_agents": 10,
+        "hopper": {"backend": "generalized", "steps": 250_000, "agents": 10},
+    },
+    "paper": {
+        "searches": {
+            source: {
+                "seeds": 5,
+                "settings": {
+                    **_JUDGED,
+                    "environment": environment,
+                    "population_size": 64,
+                    "generations": 512,
+                    "agents_per_candidate": 4,
+                    "evaluate_mean_every": 16,
+                },
+            }
+            for source, environment in zip(
+                SOURCES, ("Synthetic-Pendulum-v1", "Pendulum-v1"), strict=True
+            )
+        },
+        "agents": 20,
+        "tuning_agents": 20,
+        "hopper": {"backend": "generalized", "steps": 5 * 2**20, "agents": 10},
+    },
+}
+
+
+def pooled(
+    returns: Sequence[Sequence[float]], reference: Sequence[float] | None = None
+) -> "Estimate":
+    """The interquartile mean over searches and agents, or its difference to a reference on the same agents.
+
+    The interval draws searches, and agents within them: what one search would find, and what one
+    agent would earn, are both uncertain.
+
+    Args:
+      returns: [searches][agents].
+      reference: [agents] of the same seeds.
+    """
+    from scb.statistics import Estimate, iqm
+
+    values = np.asarray(returns)
+    searches, agents = values.shape
+    rng = np.random.default_rng(0)
+
+    def statistic(search: Any, agent: Any) -> float:
+        value = float(iqm(values[search][:, agent].ravel()))
+        return value if reference is None else value - float(iqm(np.asarray(reference)[agent]))
+
+    drawn = [
+        statistic(rng.integers(0, searches, searches), rng.integers(0, agents, agents))
+        for _ in range(5000)
+    ]
+    low, high = np.percentile(drawn, [2.5, 97.5])
+    value = statistic(np.arange(searches), np.arange(agents))
+    return Estimate(value, float(low), float(high), values.size)
+
+
+def search_curve(metrics: Sequence[Mapping[str, Any]], seconds: Sequence[float]) -> dict[str, Any]:
+    """What a search's log says: the judged mean over generations, steps and minutes.
+
+    The time of a generation is the median of those that judged nothing: judging is no part of the
+    search. The first, which compiles, is left out of it too.
+    """
+    judged = [("mean/fitness_iqm" in line) for line in metrics]
+    plain = [s for s, j in list(zip(seconds, judged, strict=True))[1:] if not j] or list(seconds)
+    per_generation = float(np.median(plain))
+    per = {kind: metrics[0][f"steps/{kind}"] for kind in ("training", "evaluation", "total")}
+    points = [
+        (line["generation"], line["mean/fitness_iqm"])
+        for line in metrics
+        if line.get("mean/fitness_iqm") is not None
+    ]
+    if metrics[-1].get("final_mean/fitness_iqm") is not None:
+        points.append((metrics[-1]["generation"] + 1, metrics[-1]["final_mean/fitness_iqm"]))
+    return {
+        "generations": [g for g, _ in points],
+        "returns": [r for _, r in points],
+        "steps_per_generation": per,
+        "seconds_per_generation": round(per_generation, 3),
+    }
+
+
+def markdown(report: Mapping[str, Any]) -> str:
+    """The page."""
+    lines = [
+        "# Learned policy optimisation on synthetic contextual bandits",
+        "",
+        f"`python -m experiments.lpo_on_bandits --preset {report['preset']}`",
+        "",
+        "![Meta-training and what its objectives are worth](figures/lpo_on_bandits.png)",
+        "",
+        "## What a search costs",
+        "",
+        "| learned on | searches | generations | candidates x agents | steps a generation (training + evaluation) | "
+        "seconds a generation | steps of the search | steps to judge means |",
+        "| --- | --- | --- | --- | --- | --- | --- | --- |",
+    ]
+    for search in report["searches"].values():
+        settings, curves = search["settings"], search["curves"]
+        per = curves[0]["steps_per_generation"]
+        seconds = np.median([c["seconds_per_generation"] for c in curves])
+        lines.append(
+            f"| {settings['environment']} | {len(curves)} | {settings['generations']} | "
+            f"{settings['population_size']} x {settings['agents_per_candidate']} | "
+            f"{per['training']:,} + {per['evaluation']:,} | {seconds:.1f} | "
+            f"{per['total'] * settings['generations']:,} | {search['steps_to_judge']:,} |"
+        )
+    lines += [
+        "",
+        "Means are judged by agents that train on Pendulum; the mean that was judged best is the objective. Those "
+        "steps choose when to stop, and no step of Pendulum enters the fitness of a bandit's search.",
+    ]
+    for name, table in report["evaluations"].items():
+        lines += ["", f"## {name}", "", table["protocol"], ""]
+        lines += [
+            "| objective | final return, IQM [95 %] | area under the curve | difference to PPO |",
+            "| --- | --- | --- | --- |",
+        ]
+        reference = table["finals"]["ppo"][0]
+        for objective, finals in table["finals"].items():
+            difference = "" if objective == "ppo" else _text(pooled(finals, reference), sign=True)
+            lines.append(
+                f"| {objective} | {_text(pooled(finals))} | {_text(pooled(table['areas'][objective]))} | {difference} |"
+            )
+        if "tuned" in table:
+            lines += ["", f"The tuned clip, chosen on other agents, is {table['tuned']}."]
+    machine = report["machine"]
+    lines += [
+        "",
+        "Interquartile means over agents, and for learned objectives over searches and agents, with 95 % bootstrap "
+        "intervals that resample both; differences are paired by seed. Most likely actions, seeds from "
+        f"{REPORTING_SEED}. Measured on {machine['cores']} cores, {machine['processor']}.",
+        "",
+    ]
+    return "\n".join(lines)
+
+
+def _text(x: "Estimate", sign: bool = False) -> str:
+    text = f"{x.value:+.0f}" if sign else f"{x.value:.0f}"
+    return f"{text} [{x.low:.0f}, {x.high:.0f}]".replace("-", "\u2212")
+
+
+def draw(report: Mapping[str, Any]) -> "Figure":
+    """(i) over generations, (ii) over steps and minutes; (iii) Pendulum; (iv) Hopper."""
+    from matplotlib.figure import Figure
+
+    from lpo import figures
+
+    looks = {
+        "bandit": figures.Look(figures.VERMILLION, "-", "o"),
+        "environment": figures.Look(figures.PURPLE, "--", "D"),
+    }
+    with figures.figure_style():
+        figure = Figure(figsize=(12.0, 8.0))
+        parts: Any = figure.subfigures(2, 1)
+        top, bottom = parts
+        panels: Any = top.subplots(1, 3, sharey=True)
+        for source, search in report["searches"].items():
+            curves, look = search["curves"], looks[source]
+            name = f"on the {source} ({len(curves)} searches)"
+            per = curves[0]["steps_per_generation"]
+            seconds = float(np.median([c["seconds_per_generation"] for c in curves]))
+            generations = np.asarray(curves[0]["generations"], float)
+            axes: Sequence[tuple[Any, np.ndarray, str]] = (
+                (panels[0], generations, name),
+                (panels[1], generations * per["total"], "training + evaluation"),
+                (panels[2], generations * seconds / 60, name),
+            )
+            for panel, x, label in axes:
+                _band(panel, x, [c["returns"] for c in curves], look, label)
+            middle = np.mean([c["returns"] for c in curves], axis=0)
+            panels[1].plot(
+                generations[1:] * per["training"],
+                middle[1:],
+                ":",
+                color=look.color,
+                label="training alone",
+            )
+        titles = ("(i) over generations", "(ii) over environment steps", "(ii) over wall-clock")
+        labels = ("generation", "environment steps of the search", "minutes of the search")
+        for panel, title, label in zip(panels, titles, labels, strict=True):
+            panel.set_title(title)
+            panel.set_xlabel(label)
+            panel.legend(fontsize=8)
+        for panel in panels[1:]:
+            panel.set_xscale("log")
+        panels[0].set_ylabel("return on Pendulum of agents\ntrained with the search's mean")
+        below = bottom.subplots(1, len(report["evaluations"]), squeeze=False)[0]
+        for panel, (name, table) in zip(below, report["evaluations"].items(), strict=True):
+            _dots(panel, table)
+            number = "(iv)" if name.startswith("Hopper") else "(iii)"
+            panel.set_title(f"{number} {name}", fontsize=9)
+    return figure
+
+
+def _band(
+    axes: "Axes", x: np.ndarray, returns: Sequence[Sequence[float]], look: Any, label: str
+) -> None:
+    from scb.statistics import estimate
+
+    found = [estimate(column) for column in np.asarray(returns).T]
+    axes.plot(
+        x,
+        [f.value for f in found],
+        look.linestyle,
+        color=look.color,
+        marker=look.marker,
+        label=label,
+    )
+    if len(returns) > 1:
+        low, high = [f.low for f in found], [f.high for f in found]
+        axes.fill_between(x, low, high, color=look.color, alpha=0.15, linewidth=0)  # type: ignore[arg-type]
+
+
+def _dots(axes: "Axes", table: Mapping[str, Any]) -> None:
+    from lpo import figures
+
+    for position, (objective, finals) in enumerate(table["finals"].items()):
+        learned = objective.startswith("LPO")
+        color = figures.VERMILLION if learned else figures.BLUE
+        values = np.asarray(finals).ravel()
+        axes.plot(values, np.full(values.size, position), ".", color=color, alpha=0.2)
+        x = pooled(finals)
+        axes.errorbar(
+            x.value,
+            position,
+            xerr=np.abs([[(x.low or 0.0) - x.value], [(x.high or 0.0) - x.value]]),
+            fmt="o",
+            color=color,
+            capsize=3,
+        )
+    axes.set_yticks(range(len(table["finals"])), list(table["finals"]))
+    axes.invert_yaxis()
+    axes.set_xlabel("final return")
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--preset", choices=PRESETS, default="quick")
+    parser.add_argument("--runs", type=Path, default=Path("runs/lpo_on_bandits"))
+    parser.add_argument("--out", type=Path, default=Path("docs/data/lpo_on_bandits.json"))
+    parser.add_argument("--page", type=Path, default=Path("docs/lpo_on_bandits.md"))
+    parser.add_argument("--only-render", action="store_true")
+    arguments = parser.parse_args(argv)
+    configure_jax()
+    from lpo import figures
+
+    report: dict[str, Any] = {}
+    if arguments.out.exists():
+        report = json.loads(arguments.out.read_text())
+    if not arguments.only_render:
+        measure(arguments.preset, arguments.runs / arguments.preset, arguments.out, report)
+    arguments.page.write_text(markdown(report))
+    (arguments.page.parent / "figures").mkdir(exist_ok=True)
+    figures.save(draw(report), arguments.page.parent / "figures" / "lpo_on_bandits.png")
+    return 0
+
+
+def measure(preset: str, runs: Path, out: Path, report: dict[str, Any]) -> None:
+    """Does what the report lacks, and writes it after every part."""
+    from lpo.objectives import Objective, load_objective
+    from scb.artefacts import machine_description, package_versions
+    from scb.errors import UserError
+    from scb.runs import write_json
+
+    plan = PRESETS[preset]
+    if report and report["preset"] != preset:
+        raise UserError(f"{out} is of preset {report['preset']}: choose another --out.")
+    report |= {
+        "preset": preset,
+        "versions": package_versions(),
+        "machine": machine_description(),
+    }
+    report.setdefault("searches", {})
+    report.setdefault("evaluations", {})
+    out.parent.mkdir(parents=True, exist_ok=True)
+    learned: dict[str, list[Objective]] = {}
+    for source, search in plan["searches"].items():
+        name = f"LPO ({source})"
+        folders = [runs / f"{source}-{seed}" for seed in range(search["seeds"])]
+        learned[name] = [
+            _learn(folder, {"command": "meta-train", "seed": seed, **search["settings"]}, name)
+            for seed, folder in enumerate(folders)
+        ]
+        report["searches"][source] = {
+            "settings": search["settings"],
+            "curves": [_curve_of(folder) for folder in folders],
+            "steps_to_judge": learned[name][0].metadata["cost"]["environment_steps_validation"],
+        }
+        write_json(out, report)
+    for label, scale in SCALES.items():
+        name = f"Pendulum, {label}"
+        if name not in report["evaluations"]:
+            report["evaluations"][name] = _on_pendulum(plan, learned, scale)
+            write_json(out, report)
+    hopper = plan["hopper"]
+    name = f"Hopper, {hopper['backend']} physics, {hopper['steps']:,} steps"
+    if name not in report["evaluations"]:
+        objectives = {n: [load_objective(n)] for n in ("ppo", "dpo")} | learned
+        report["evaluations"][name] = _judge(
+            "hopper", objectives, hopper["agents"], hopper["steps"], 1.0, hopper["backend"]
+        )
+        write_json(out, report)
+
+
+def _learn(folder: Path, settings: Mapping[str, Any], name: str) -> Any:
+    from dataclasses import replace
+
+    from lpo.commands import learn_objective
+    from lpo.objectives import load_objective
+
+    path = folder / "objective.npz"
+    if not path.with_suffix(".json").exists():
+        learn_objective(settings, folder, resume=(folder / "config.json").exists())
+    return replace(load_objective(path), name=f"{name} {settings['seed']}")
+
+
+def _curve_of(folder: Path) -> dict[str, Any]:
+    lines = [
+        [json.loads(line) for line in (folder / name).read_text().splitlines()]
+        for name in ("metrics.jsonl", "timing.jsonl")
+    ]
+    return search_curve(lines[0], [line["seconds"] for line in lines[1]])
+
+
+def _on_pendulum(
+    plan: Mapping[str, Any], learned: Mapping[str, Any], scale: float
+) -> dict[str, Any]:
+    from lpo.generalization import compare, training_setting
+    from lpo.objectives import load_objective
+    from scb.statistics import iqm
+
+    tuning = compare(
+        "Pendulum-v1",
+        [load_objective(clip) for clip in CLIPS],
+        list(range(TUNING_SEED, TUNING_SEED + plan["tuning_agents"])),
+        setting=training_setting("Pendulum-v1", policy_output_scale=scale),
+        points=1,
+    )
+    sweep = {c.objective: float(iqm(c.final)) for c in tuning.curves}
+    tuned = max(sweep, key=lambda clip: sweep[clip])
+    objectives = {n: [load_objective(n)] for n in ("ppo", "dpo")}
+    if tuned != "ppo":
+        objectives = {"ppo": objectives["ppo"], tuned: [load_objective(tuned)], **objectives}
+    found = _judge("Pendulum-v1", objectives | dict(learned), plan["agents"], None, scale, None)
+    return {**found, "tuned": tuned, "sweep": sweep}
+
+
+def _judge(
+    environment: str,
+    objectives: Mapping[str, Sequence[Any]],
+    agents: int,
+    steps: int | None,
+    scale: float,
+    backend: str | None,
+) -> dict[str, Any]:
+    from lpo.generalization import compare, training_setting
+
+    setting = training_setting(environment, steps, scale)
+    seeds = list(range(REPORTING_SEED, REPORTING_SEED + agents))
+    curves = compare(
+        environment,
+        [objective for group in objectives.values() for objective in group],
+        seeds,
+        setting=setting,
+        backend=backend,
+        points=10,
+    ).curves
+    of = {curve.objective: curve for curve in curves}
+    finals, areas = (
+        {
+            name: [np.round(getattr(of[o.name], kind), 2).tolist() for o in group]
+            for name, group in objectives.items()
+        }
+        for kind in ("final", "area")
+    )
+    physics = "" if backend is None else f" on `{backend}` physics"
+    protocol = (
+        f"{environment}{physics}: {agents} agents an objective (and search), {curves[0].steps[-1]:,} steps, policy's "
+        f"last layer times {scale:g} at initialisation."
+    )
+    return {"protocol": protocol, "seeds": seeds, "finals": finals, "areas": areas}
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,318 @@
+"""What makes an objective carry over from a bandit: every lever of the meta-training, one at a time.
+
+    python -m experiments.transfer_study --out docs/data/transfer_study.json
+
+Each variation changes one setting of `lpo meta-train`, learns an objective with it, and trains PPO
+with what it learned: on Pendulum, with Flax's initialisation of the policy and with a small last layer,
+and on Hopper, which no choice ever looked at. Searches are run folders under --runs and are resumed;
+what --out holds already is not measured again, so the same command continues an interrupted study.
+`--variations` names some of them; `--only-render` makes page and figure from --out.
+"""
+
+import argparse
+import json
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from lpo.cli import configure_jax
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+# Flags of `lpo meta-train`. The first is what the others differ from in one thing each.
+VARIATIONS: dict[str, dict[str, Any]] = {
+    "default": {},
+    "no reward noise": {"reward_noise": 0.0},
+    "reward noise 10": {"reward_noise": 10.0},
+    "one initialisation": {"hyperparameters": "policy_output_scale=1"},
+    "learning rates drawn": {
+        "hyperparameters": "policy_output_scale=1,0.01 learning_rate=0.0003,0.001,0.003"
+    },
+    "area under the curve": {"fitness": "area"},
+    "return on Pendulum": {"fitness": "transfer"},
+    "four bandits": {
+        "tasks": "Synthetic-Pendulum-v1,Synthetic-CartPole-v1,Synthetic-Acrobot-v1,"
+        "Synthetic-MountainCarContinuous-v0"
+    },
+    "no PPO base": {"base": "none"},
+    "temporal": {"temporal": True},
+    "xi 1e-4": {"xi": 1e-4},
+    "small steps": {"sigma": 0.01, "learning_rate": 0.003},
+    "large steps": {"sigma": 0.1, "learning_rate": 0.03},
+    "stopped by validation": {"validate": True},
+}
+REFERENCES = ("ppo", "ppo-1", "dpo")
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Where objectives are judged. The seeds are neither those of searches nor those that report."""
+
+    name: str
+    environment: str
+    backend: str | None = None
+    steps: int | None = None
+    policy_output_scale: float = 1.0
+    seeds: int = 20
+    first_seed: int = 21_000
+
+    def seed_list(self) -> list[int]:
+        return list(range(self.first_seed, self.first_seed + self.seeds))
+
+
+EVALUATIONS = (
+    Evaluation("Pendulum", "Pendulum-v1"),
+    Evaluation("Pendulum, small last layer", "Pendulum-v1", policy_output_scale=0.01),
+    Evaluation("Hopper (spring), never used", "hopper", "spring", 300_000, seeds=10),
+)
+
+
+def settings_of(
+    variation: str, seed: int, generations: int, population_size: int
+) -> dict[str, Any]:
+    """The settings of `lpo meta-train` for a variation."""
+    return {
+        "command": "meta-train",
+        "seed": seed,
+        "population_size": population_size,
+        "generations": generations,
+        **VARIATIONS[variation],
+    }
+
+
+def summary(report: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """One row an objective: per evaluation the estimate, and the paired difference to the default's."""
+    from scb.statistics import estimate, paired_difference
+
+    rows = []
+    default = report["objectives"].get("default", {}).get("returns", {})
+    for name, entry in report["objectives"].items():
+        row: dict[str, Any] = {"name": name, "seconds": entry.get("seconds")}
+        for evaluation, returns in entry["returns"].items():
+            row[evaluation] = estimate(np.concatenate(returns))
+            # The reference has one set of agents, a variation one for each of its searches.
+            if (
+                evaluation in default
+                and name != "default"
+                and len(returns) == len(default[evaluation])
+            ):
+                row[f"{evaluation}, difference"] = paired_difference(
+                    np.concatenate(returns), np.concatenate(default[evaluation])
+                )
+        rows.append(row)
+    return rows
+
+
+def _text(estimate: Any) -> str:
+    text = f"{estimate.value:.0f} [{estimate.low:.0f}, {estimate.high:.0f}]"
+    return text.replace("-", "\u2212")
+
+
+def markdown(report: Mapping[str, Any]) -> str:
+    """The page with the table."""
+    evaluations = [e["name"] for e in report["evaluations"]]
+    searches = report["searches"]
+    lines = [
+        "# What makes an objective carry over from a bandit",
+        "",
+        "`python -m experiments.transfer_study --out docs/data/transfer_study.json`",
+        "",
+        f"Each row is learned on a bandit by {searches['generations']} generations of "
+        f"{searches['population_size']} candidates, {len(searches['seeds'])} "
+        f"{'search' if len(searches['seeds']) == 1 else 'searches'}; it differs from the default in what its name "
+        "says. Then PPO is trained with it. Final return with the most likely actions, interquartile mean over "
+        "agents and 95 % bootstrap interval; in brackets below, the paired difference to the default where its "
+        "interval excludes zero.",
+        "",
+        "![Final returns by variation](figures/transfer_study.png)",
+        "",
+        "| objective | " + " | ".join(evaluations) + " | minutes |",
+        "| --- |" + " --- |" * (len(evaluations) + 1),
+    ]
+    for row in summary(report):
+        cells = []
+        for evaluation in evaluations:
+            cell = _text(row[evaluation]) if evaluation in row else ""
+            difference = row.get(f"{evaluation}, difference")
+            if difference is not None and (difference.low > 0 or difference.high < 0):
+                sign = "+" if difference.value > 0 else "\u2212"
+                cell += f" ({sign}{abs(difference.value):.0f})"
+            cells.append(cell)
+        minutes = "" if row["seconds"] is None else f"{row['seconds'] / 60:.1f}"
+        lines.append(f"| {row['name']} | {' | '.join(cells)} | {minutes} |")
+    described = [
+        f"{e['name']}: {e['seeds']} agents a search, seeds from {e['first_seed']}"
+        + (f", {e['steps']} steps" if e["steps"] else "")
+        + (
+            f", last layer times {e['policy_output_scale']:g}"
+            if e["policy_output_scale"] != 1
+            else ""
+        )
+        for e in report["evaluations"]
+    ]
+    machine = report["machine"]
+    lines += [
+        "",
+        "; ".join(described) + ". PPO and DPO have one set of agents each.",
+        "",
+        "The commands:",
+        "",
+        *(
+            f"- {name}: `{entry['command']}`"
+            for name, entry in report["objectives"].items()
+            if "command" in entry
+        ),
+        "",
+        f"Measured on {machine['cores']} cores, {machine['processor']}.",
+        "",
+    ]
+    return "\n".join(lines)
+
+
+def draw(report: Mapping[str, Any]) -> "Figure":
+    """One panel an evaluation, one line an objective: interquartile mean with its interval, each agent a dot."""
+    from matplotlib.figure import Figure
+
+    from lpo.figures import BLUE, GREY, VERMILLION, figure_style
+
+    evaluations = [e["name"] for e in report["evaluations"]]
+    rows = summary(report)
+    with figure_style():
+        figure = Figure(figsize=(11.0, 1.6 + 0.32 * len(rows)))
+        panels = figure.subplots(1, len(evaluations), sharey=True, squeeze=False)[0]
+        for axes, evaluation in zip(panels, evaluations, strict=True):
+            for position, row in enumerate(rows):
+                if evaluation not in row:
+                    continue
+                color = {"default": VERMILLION}.get(
+                    row["name"], BLUE if row["name"] in REFERENCES else GREY
+                )
+                agents = np.concatenate(report["objectives"][row["name"]]["returns"][evaluation])
+                axes.plot(agents, np.full(agents.size, position), ".", color=color, alpha=0.25)
+                x = row[evaluation]
+                axes.errorbar(
+                    x.value,
+                    position,
+                    xerr=np.abs([[x.low - x.value], [x.high - x.value]]),
+                    fmt="o",
+                    color=color,
+                    capsize=3,
+                )
+            axes.set_title(evaluation)
+            axes.set_xlabel("final return")
+        panels[0].set_yticks(range(len(rows)), [row["name"] for row in rows])
+        panels[0].invert_yaxis()
+    return figure
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--variations", nargs="*", default=list(VARIATIONS), choices=VARIATIONS)
+    parser.add_argument("--meta-seeds", type=int, nargs="+", default=[0])
+    parser.add_argument("--generations", type=int, default=30)
+    parser.add_argument("--population-size", type=int, default=32)
+    parser.add_argument("--runs", type=Path, default=Path("runs/transfer_study"))
+    parser.add_argument("--out", type=Path, default=Path("docs/data/transfer_study.json"))
+    parser.add_argument("--page", type=Path, default=Path("docs/transfer_study.md"))
+    parser.add_argument("--only-render", action="store_true")
+    arguments = parser.parse_args(argv)
+    configure_jax()
+    searches = {
+        "generations": arguments.generations,
+        "population_size": arguments.population_size,
+        "seeds": arguments.meta_seeds,
+    }
+    report: dict[str, Any] = {}
+    if arguments.out.exists():
+        report = json.loads(arguments.out.read_text())
+    if not arguments.only_render:
+        _measure(arguments, report, searches)
+    from lpo import figures
+
+    arguments.page.write_text(markdown(report))
+    (arguments.page.parent / "figures").mkdir(exist_ok=True)
+    figures.save(draw(report), arguments.page.parent / "figures" / "transfer_study.png")
+    return 0
+
+
+def _measure(
+    arguments: argparse.Namespace, report: dict[str, Any], searches: Mapping[str, Any]
+) -> None:
+    from lpo.generalization import compare, training_setting
+    from lpo.objectives import load_objective
+    from scb.artefacts import machine_description, package_versions
+    from scb.errors import UserError
+    from scb.runs import write_json
+    from scb.statistics import estimate
+
+    if report and report["searches"] != searches:
+        raise UserError(
+            f"{arguments.out} holds a study of other searches ({report['searches']}): choose another --out."
+        )
+    report |= {
+        "searches": dict(searches),
+        "evaluations": [asdict(e) for e in EVALUATIONS],
+        "versions": package_versions(),
+        "machine": machine_description(),
+    }
+    entries = report.setdefault("objectives", {})
+    arguments.out.parent.mkdir(parents=True, exist_ok=True)
+
+    def judge(name: str, evaluation: Evaluation, objectives: Sequence[Any]) -> None:
+        comparison = compare(
+            evaluation.environment,
+            objectives,
+            evaluation.seed_list(),
+            setting=training_setting(
+                evaluation.environment, evaluation.steps, evaluation.policy_output_scale
+            ),
+            backend=evaluation.backend,
+            points=1,
+        )
+        returns = [np.round(c.final, 2).tolist() for c in comparison.curves]
+        entries[name].setdefault("returns", {})[evaluation.name] = returns
+        write_json(arguments.out, report)
+        print(f"{name} | {evaluation.name} | {estimate(np.concatenate(returns))}", flush=True)
+
+    for name in (*REFERENCES, *arguments.variations):
+        entry = entries.setdefault(name, {})
+        if name in REFERENCES:
+            objectives = [load_objective(name)]
+        else:
+            objectives = [_learn(arguments, name, seed, entry) for seed in arguments.meta_seeds]
+        for evaluation in EVALUATIONS:
+            if evaluation.name not in entry.get("returns", {}):
+                judge(name, evaluation, objectives)
+
+
+def _learn(arguments: argparse.Namespace, name: str, seed: int, entry: dict[str, Any]) -> Any:
+    """A variation's objective of one search, learned here or found in its run folder."""
+    from dataclasses import replace
+
+    from lpo.commands import learn_objective
+    from lpo.objectives import load_objective
+    from scb.runs import command_of
+
+    settings = settings_of(name, seed, arguments.generations, arguments.population_size)
+    folder = arguments.runs / f"{name.replace(' ', '-')}-{seed}"
+    path = folder / "objective.npz"
+    if not path.with_suffix(".json").exists():
+        learn_objective(settings, folder, resume=(folder / "config.json").exists())
+    objective = load_objective(path)
+    entry["command"] = command_of("lpo", {**settings, "seed": None})
+    cost = objective.metadata["cost"]
+    entry["seconds"] = cost["seconds"]
+    if "generation" in cost:
+        entry.setdefault("stopped_at", {})[str(seed)] = cost["generation"]
+    return replace(objective, name=f"{name}-{seed}")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

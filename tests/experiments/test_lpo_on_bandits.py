@@ -1,0 +1,128 @@
+"""What the page and the figure of learned policy optimisation are made from."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from experiments import lpo_on_bandits as module
+from lpo import figures
+
+DOCS = Path(__file__).parents[2] / "docs"
+
+
+def line(generation, **more):
+    return {
+        "generation": generation,
+        "steps/training": 100 * (generation + 1),
+        "steps/evaluation": 20 * (generation + 1),
+        "steps/total": 120 * (generation + 1),
+        **more,
+    }
+
+
+METRICS = [
+    line(0, **{"mean/fitness_iqm": -900.0}),
+    line(1),
+    line(2, **{"mean/fitness_iqm": -500.0}),
+    line(3, **{"final_mean/fitness_iqm": -300.0}),
+]
+
+
+def test_a_searchs_curve_is_its_judged_means_and_the_time_of_what_judged_nothing():
+    curve = module.search_curve(METRICS, [50.0, 2.0, 9.0, 4.0])
+    assert curve["generations"] == [0, 2, 4]
+    assert curve["returns"] == [-900.0, -500.0, -300.0]
+    assert curve["steps_per_generation"] == {"training": 100, "evaluation": 20, "total": 120}
+    # Generations 1 and 3; the first compiles, and the third judges.
+    assert curve["seconds_per_generation"] == 3.0
+
+
+def test_pooled_is_the_interquartile_mean_over_searches_and_agents():
+    x = module.pooled([[1.0, 2.0, 3.0, 4.0], [5.0, 6.0, 7.0, 8.0]])
+    # Of eight values the two lowest and the two highest are left out.
+    assert (x.value, x.n) == (4.5, 8)
+    assert 1.0 <= x.low < 4.5 < x.high <= 8.0
+
+
+def test_searches_that_differ_widen_the_interval_beyond_that_of_their_agents():
+    rng = np.random.default_rng(0)
+    agents = rng.normal(size=(4, 20))
+    alike = module.pooled(agents.tolist())
+    apart = module.pooled((agents + np.array([[-30.0], [-10.0], [10.0], [30.0]])).tolist())
+    assert apart.high - apart.low > 5 * (alike.high - alike.low)
+
+
+def test_a_difference_is_paired_by_agent():
+    # Every agent is 10 better than the reference's: a difference of exactly 10, whoever is drawn.
+    reference = [0.0, 100.0, -300.0, 50.0]
+    x = module.pooled([[r + 10.0 for r in reference]], reference)
+    assert (x.value, x.low, x.high) == pytest.approx((10.0, 10.0, 10.0))
+
+
+@pytest.fixture
+def report():
+    curve = module.search_curve(METRICS, [50.0, 2.0, 9.0, 4.0])
+    searches = {
+        source: {
+            "settings": {
+                "environment": environment,
+                "generations": 4,
+                "population_size": 2,
+                "agents_per_candidate": 1,
+            },
+            "curves": [curve] * number,
+            "steps_to_judge": 1000,
+        }
+        for source, environment, number in (
+            ("bandit", "Synthetic-Pendulum-v1", 3),
+            ("environment", "Pendulum-v1", 1),
+        )
+    }
+    finals = {
+        "ppo": [[-900.0, -800.0]],
+        "dpo": [[-300.0, -200.0]],
+        "LPO (bandit)": [[-250.0, -150.0], [-260.0, -160.0], [-240.0, -140.0]],
+        "LPO (environment)": [[-350.0, -250.0]],
+    }
+    table = {"protocol": "Two agents.", "seeds": [1, 2], "finals": finals, "areas": finals}
+    return {
+        "preset": "quick",
+        "machine": {"cores": 2, "processor": "a processor"},
+        "searches": searches,
+        "evaluations": {
+            "Pendulum, Flax's initialisation": {**table, "tuned": "ppo-0.5"},
+            "Hopper, spring physics": table,
+        },
+    }
+
+
+def test_the_page_says_costs_returns_and_differences(report, tmp_path):
+    page = module.markdown(report)
+    assert "| Synthetic-Pendulum-v1 | 3 | 4 | 2 x 1 | 100 + 20 | 3.0 | 480 | 1,000 |" in page
+    # (-850 of PPO, -200 of the pooled bandit's objectives.)
+    assert "| ppo | −850 [" in page
+    assert "| LPO (bandit) | −200 [" in page
+    assert "| +650 [" in page
+    assert "The tuned clip, chosen on other agents, is ppo-0.5." in page
+    path = figures.save(module.draw(report), tmp_path / "figure.png")
+    assert path.stat().st_size > 20_000
+
+
+def test_the_settings_of_every_preset_are_those_of_the_command():
+    from lpo.commands import meta_training_config
+
+    for preset in module.PRESETS.values():
+        for search in preset["searches"].values():
+            config = meta_training_config(search["settings"])
+            assert config.validation
+            assert config.evolution.num_generations == search["settings"]["generations"]
+    assert module.PRESETS["paper"]["hopper"]["steps"] == 5_242_880
+
+
+def test_the_committed_page_is_that_of_the_committed_report():
+    data = DOCS / "data" / "lpo_on_bandits.json"
+    if not data.exists():
+        pytest.skip("not measured yet")
+    assert (DOCS / "lpo_on_bandits.md").read_text() == module.markdown(json.loads(data.read_text()))

@@ -1,0 +1,64 @@
+"""The transfer study's variations are commands that exist, and its page says what was measured."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from experiments import transfer_study as module
+from lpo import figures
+from lpo.commands import meta_training_config
+
+DOCS = Path(__file__).parents[2] / "docs"
+
+
+def test_every_variation_is_a_meta_training_that_differs_from_the_default():
+    configs = {
+        name: meta_training_config(module.settings_of(name, 0, 30, 32))
+        for name in module.VARIATIONS
+    }
+    default = configs.pop("default")
+    assert all(config != default for config in configs.values())
+    assert len({repr(config) for config in configs.values()}) == len(configs)
+
+
+@pytest.fixture
+def report():
+    names = [e.name for e in module.EVALUATIONS]
+
+    def returns(*values):
+        return {name: [[v, v + 1.0, v + 2.0, v + 3.0] for v in values] for name in names}
+
+    return {
+        "searches": {"generations": 30, "population_size": 32, "seeds": [0]},
+        "evaluations": [module.asdict(e) for e in module.EVALUATIONS],
+        "machine": {"cores": 2, "processor": "a processor"},
+        "objectives": {
+            "ppo": {"returns": returns(-500.0)},
+            "default": {"returns": returns(-200.0), "seconds": 120.0, "command": "lpo meta-train"},
+            "no reward noise": {
+                "returns": returns(-700.0),
+                "seconds": 90.0,
+                "command": "lpo meta-train --reward-noise=0.0",
+            },
+        },
+    }
+
+
+def test_the_page_says_returns_and_differences_that_exclude_zero(report, tmp_path):
+    page = module.markdown(report)
+    row = next(line for line in page.splitlines() if line.startswith("| no reward noise |"))
+    # -698.5 and -198.5 are the interquartile means; the pairing leaves the difference no width.
+    assert row.count("−698 [") == 3 or row.count("−699 [") == 3
+    assert row.count("(−500)") == 3
+    assert row.endswith("| 1.5 |")
+    assert "- no reward noise: `lpo meta-train --reward-noise=0.0`" in page
+    path = figures.save(module.draw(report), tmp_path / "figure.png")
+    assert path.stat().st_size > 20_000
+
+
+def test_the_committed_page_is_that_of_the_committed_report():
+    data = DOCS / "data" / "transfer_study.json"
+    if not data.exists():
+        pytest.skip("not measured yet")
+    assert (DOCS / "transfer_study.md").read_text() == module.markdown(json.loads(data.read_text()))
