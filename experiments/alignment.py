@@ -4,15 +4,16 @@
 
 First the choice: the family of known drifts and the zoo's learned ones train agents on Pendulum-v1,
 and in regimes of the Pendulum bandit that differ from the default in one thing each (reward noise,
-contexts, iterations, epochs, minibatches, learning rate, bandit). Then the confirmation, on seeds,
-environments and objectives that chose nothing: the same regimes' correlation with the outcome on other
-environments, each with its own bandit. `--adversaries FILES` adds objectives that evolution found.
-Stages that --out holds already are kept.
+contexts, iterations, epochs, minibatches, learning rate). The same with a small last layer of the
+policy, on both sides. Then the confirmation, on seeds and environments that chose nothing: the same
+regimes' correlation with the outcome on other environments, each with its own bandit. `--adversaries
+FILES` adds objectives that evolution found. Stages that --out holds already are kept.
 """
 
 import argparse
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -53,10 +54,10 @@ def markdown(report: dict[str, Any]) -> str:
         "95 % bootstrap intervals over agents. A regime differs from the default (reward noise 5, 200 contexts, the "
         "environment's own number of iterations, epochs, minibatches and learning rate) in what its name says.",
     ]
-    for stage in report["stages"].values():
+    for name, stage in report["stages"].items():
         family = ", ".join(
-            f"{name} {value:.0f}".replace("-", "\u2212", 1) if value < 0 else f"{name} {value:.0f}"
-            for name, value in stage["outcome_iqm"].items()
+            f"{objective} {value:.0f}".replace(" -", " \u2212", 1)
+            for objective, value in stage["outcome_iqm"].items()
         )
         lines += [
             "",
@@ -65,7 +66,7 @@ def markdown(report: dict[str, Any]) -> str:
             f"Seeds {stage['first_seed']} to {stage['first_seed'] + stage['agents'] - 1}. Final return of the "
             f"family (IQM): {family}.",
             "",
-            f"![Correlations with {stage['environment']}](figures/alignment_{stage['environment']}.png)",
+            f"![Correlations with {stage['environment']}](figures/alignment_{name}.png)",
             "",
             "| regime | " + " | ".join(FITNESSES) + " |",
             "| --- |" + " --- |" * len(FITNESSES),
@@ -106,38 +107,40 @@ def main() -> int:
         report["stages"] = json.loads(arguments.out.read_text())["stages"]
 
     def stage(
-        name: str, environment: str, role: str, regimes: list[Regime], family: Any, seed: int
+        name: str,
+        environment: str,
+        role: str,
+        regimes: list[Regime],
+        seed: int,
+        scale: float | None = None,
     ) -> None:
         if name not in report["stages"]:
             seeds = range(seed, seed + arguments.agents)
             measured = measure_alignment(
                 regimes,
-                family,
+                known_drifts() + learned,
                 environment,
                 list(seeds),
+                policy_output_scale=scale,
                 tell=lambda line: print(line, flush=True),
             )
             report["stages"][name] = {"role": role, **measured}
             arguments.out.parent.mkdir(parents=True, exist_ok=True)
             arguments.out.write_text(json.dumps(report, indent=1) + "\n")
-        path = arguments.page.parent / "figures" / f"alignment_{environment}.png"
+        path = arguments.page.parent / "figures" / f"alignment_{name}.png"
         path.parent.mkdir(parents=True, exist_ok=True)
         figures.save(figures.alignment_heatmap(report["stages"][name]), path)
 
     variations = [Regime(PENDULUM, **variation) for variation in VARIATIONS]
-    stage("choice", "Pendulum-v1", "the choice", variations, known_drifts() + learned, FIRST_SEED)
+    stage("pendulum", "Pendulum-v1", "the choice", variations, FIRST_SEED)
+    small = [replace(regime, policy_output_scale=0.01) for regime in variations]
+    role = "the choice, last layer of the policy times 0.01"
+    stage("pendulum_small_last_layer", "Pendulum-v1", role, small, FIRST_SEED, 0.01)
     for environment, bandit in CONFIRMATIONS.items():
         if not arguments.skip_confirmation:
             regimes = [Regime(bandit, **variation) for variation in CONFIRMED]
             regimes += [Regime(PENDULUM, **variation) for variation in CONFIRMED]
-            stage(
-                environment,
-                environment,
-                "the confirmation",
-                regimes,
-                known_drifts() + learned,
-                CONFIRMATION_SEED,
-            )
+            stage(environment, environment, "the confirmation", regimes, CONFIRMATION_SEED)
     arguments.page.write_text(markdown(report))
     return 0
 

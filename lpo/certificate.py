@@ -26,6 +26,10 @@ class Certificate:
       value_at_one, gradient_at_one: largest |f| and |df/dr| at ratio 1 over all advantages.
       slope_at_0_001, slope_at_0_01: largest |df/dr| at |r - 1| = 0.001 and 0.01. Not a condition,
         but a drift whose slope jumps just outside its dead zone is one in name only.
+      kink: how much the penalty rises per unit of |log-ratio| around ratio 1 (at |r - 1| = 0.01), the
+        mean over standard normal advantages. No condition either: but where the advantages of a
+        minibatch correlate less than that with every direction that the policy could take, an update
+        stays where it is.
       finite: no NaN or infinity, out to the largest ratio that training meets.
       grid: what the grid was.
     """
@@ -36,6 +40,7 @@ class Certificate:
     gradient_at_one: float
     slope_at_0_001: float
     slope_at_0_01: float
+    kink: float
     finite: bool
     grid: str
 
@@ -47,7 +52,7 @@ class Certificate:
         return (
             f"{verdict}: min f {self.minimum:.3g}, at ratio 1 |f| {self.value_at_one:.3g} and |df/dr| "
             f"{self.gradient_at_one:.3g}, |df/dr| {self.slope_at_0_001:.3g} at |r - 1| = 0.001 and "
-            f"{self.slope_at_0_01:.3g} at 0.01 ({self.grid})"
+            f"{self.slope_at_0_01:.3g} at 0.01, kink {self.kink:.3g} ({self.grid})"
         )
 
 
@@ -91,6 +96,11 @@ def certify(
             np.max([jnp.abs(slopes(points, advantages, p)).max() for p in progress_values])
         )
 
+    def kink(progress: float) -> float:
+        right, left = slopes(jnp.log(jnp.asarray([1.01, 0.99])), advantages, progress)
+        weights = jnp.exp(-(advantages**2) / 2)
+        return float(jnp.sum(weights * (right - left)) / (2 * jnp.sum(weights)))
+
     grid = [np.asarray(values(log_ratios, advantages, progress)) for progress in progress_values]
     at_one = [np.asarray(values(jnp.zeros(1), advantages, p)) for p in progress_values]
     finite = all(np.isfinite(x).all() for x in grid)
@@ -104,6 +114,7 @@ def certify(
         gradient_at_one=gradient_at_one,
         slope_at_0_001=largest_slope([0.999, 1.001]),
         slope_at_0_01=largest_slope([0.99, 1.01]),
+        kink=float(np.max([kink(progress) for progress in progress_values])),
         finite=finite,
         grid=f"{len(log_ratios)} log-ratios in [-{MAX_LOG_RATIO:g}, {MAX_LOG_RATIO:g}] x "
         f"{len(advantages)} advantages in [-10, 10] x 3 training fractions",

@@ -28,7 +28,7 @@ from lpo.generalization import (
     learning_curves,
     training_setting,
 )
-from lpo.meta_training import MetaTraining, MetaTrainingConfig
+from lpo.meta_training import MetaTraining, MetaTrainingConfig, chosen_mean
 from lpo.objectives import Objective, load_objective, save_objective
 from lpo.pipeline import PRESETS as RUN_PRESETS
 from lpo.pipeline import check_settings, meta_training_artefact, run_pipeline
@@ -104,6 +104,7 @@ def meta_train_command(
     reward_noise: float | None = None,
     base: str | None = None,
     xi: float | None = None,
+    gate: float | None = None,
     temporal: bool = False,
     horizons: str | None = None,
     hyperparameters: str | None = None,
@@ -139,6 +140,7 @@ def meta_train_command(
         overfits the bandit.
       base: ppo (the network corrects PPO's clip) or none.
       xi: half-width of the drift's dead zone.
+      gate: width of the region around ratio 1 where the network is faded out, in nats; 0 for none.
       temporal: let the drift change over an agent's training; inner agents then train for random
         numbers of updates.
       horizons: how long inner agents train, as fractions of the setting's number of updates, such
@@ -172,6 +174,7 @@ def meta_train_command(
             "reward_noise": reward_noise,
             "base": base,
             "xi": xi,
+            "gate": gate,
             "temporal": temporal or None,
             "horizons": horizons,
             "hyperparameters": hyperparameters,
@@ -218,7 +221,7 @@ def learn_objective(
     path, certificate = save_objective(
         run.folder / "objective.npz",
         config.drift,
-        outcome.best_mean if config.validation else outcome.mean,
+        chosen_mean(config, outcome),
         meta_training_artefact(problem, outcome, settings, command_of("lpo", settings)),
     )
     figures.save(
@@ -276,7 +279,7 @@ def meta_training_config(settings: Mapping[str, Any]) -> MetaTrainingConfig:
             ),
         }
     )
-    drift = LearnedDrift(**given(base="base", temporal="temporal", xi="xi"))
+    drift = LearnedDrift(**given(base="base", temporal="temporal", xi="xi", gate="gate"))
     return MetaTrainingConfig(
         tasks=tasks,
         drift=drift,

@@ -364,3 +364,8 @@ class MetaTraining:
 def meta_train(config: MetaTrainingConfig, run: Run | None = None, quiet: bool = False) -> Outcome:
     """Evolves a drift; the outcome's means are its weights."""
     return evolve(MetaTraining(config), config.evolution, run, quiet)
+
+
+def chosen_mean(config: MetaTrainingConfig, outcome: Outcome) -> Any:
+    """The weights that a search ends with: the mean judged best where it was validated, else the last."""
+    return outcome.best_mean if config.validation else outcome.mean

@@ -91,6 +91,7 @@ def _from_file(path: Path) -> Objective:
             clip=family["clip"],
             xi=family["xi"],
             temporal=features == TEMPORAL_FEATURES,
+            gate=family.get("gate", 0.0),  # what was learned before there was one has none
         )
     except KeyError as error:
         raise UserError(
@@ -152,7 +153,11 @@ def save_objective(
     if isinstance(drift, ClosedFormDrift):
         own = {"expression": drift.expression}
     else:
-        own = {"hidden_size": drift.hidden_size, "features": list(drift.features)}
+        own = {
+            "hidden_size": drift.hidden_size,
+            "features": list(drift.features),
+            "gate": drift.gate,
+        }
     config["drift"] = {"base": drift.base, "clip": drift.clip, "xi": drift.xi, **own}
     full = {
         **metadata,

@@ -21,7 +21,7 @@ from lpo.generalization import (
     learning_curves,
     training_setting,
 )
-from lpo.meta_training import MetaTraining, MetaTrainingConfig
+from lpo.meta_training import MetaTraining, MetaTrainingConfig, chosen_mean
 from lpo.objectives import Objective, load_objective, save_objective
 from scb.artefacts import machine_description, package_versions
 from scb.environments.registry import make
@@ -63,6 +63,8 @@ PRESETS: dict[str, dict[str, Any]] = {
         "population_size": 64,
         "generations": 512,
         "agents_per_candidate": 4,
+        # So long a search overfits the bandit: the mean that was judged best on Pendulum is kept.
+        "validate": True,
         "evaluations": [
             {"environment": "Pendulum-v1", "backend": None, "seeds": 20, "steps": 150_000},
             {
@@ -168,8 +170,15 @@ def pipeline_config(settings: Mapping[str, Any]) -> MetaTrainingConfig:
         num_generations=settings["generations"],
         seed=settings["seed"],
     )
+    validate = bool(settings.get("validate"))
+    if validate:
+        # A judgement costs a training on the environment.
+        evolution = replace(evolution, mean_evaluations=16)
     return replace(
-        default, evolution=evolution, agents_per_candidate=settings["agents_per_candidate"]
+        default,
+        evolution=evolution,
+        agents_per_candidate=settings["agents_per_candidate"],
+        validation=validate,
     )
 
 
@@ -184,7 +193,7 @@ def _learn(
         save_objective(
             path,
             config.drift,
-            outcome.mean,
+            chosen_mean(config, outcome),
             meta_training_artefact(problem, outcome, dict(settings), command),
         )
     evaluations = config.evolution.num_generations * config.evolution.population_size
@@ -298,6 +307,7 @@ def _figures(
             config.fitness,
             config.evolution.population_size,
             config.evolution.mean_evaluations,
+            ", ".join(config.homes) if config.validation else None,
         )
         drawn["environment_steps"] = figures.environment_steps(
             meta["steps"], meta["environment_steps"]

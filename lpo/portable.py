@@ -226,6 +226,8 @@ def _learned(
         inputs = xp.concatenate([inputs, progress[..., None] * inputs], -1)
     hidden, output = (_like(xp, log_ratio, weights[name]) for name in ("hidden", "output"))
     penalty = (xp.tanh(inputs @ hidden) @ output)[..., 0]
+    if drift.gate:
+        penalty = penalty * -xp.expm1(-((log_ratio / drift.gate) ** 2))
     if drift.base == "ppo":
         penalty = penalty + _clip(xp, log_ratio, advantage, drift.clip)
     return _relu(xp, penalty - drift.xi)

@@ -271,6 +271,12 @@ def _certificate_rows(certificate: Mapping[str, Any]) -> list[dict[str, Any]]:
         row("finite everywhere", "yes" if finite else "no", "yes", bool(finite)),
         row("largest |df/dr| at |r − 1| = 0.001", f"{near:.3g}", "no condition", None),
         row("largest |df/dr| at |r − 1| = 0.01", f"{further:.3g}", "no condition", None),
+        row(
+            "kink: mean rise of f around ratio 1",
+            f"{certificate['kink']:.3g}",
+            "no condition",
+            None,
+        ),
     ]
 
 

@@ -1,7 +1,7 @@
 """A certificate must tell a drift from what only looks like one."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import jax
@@ -10,6 +10,7 @@ import pytest
 
 from lpo.certificate import Certificate, certify
 from lpo.drift import ClipDrift, DPODrift, Drift, LearnedDrift, NoDrift
+from lpo.objectives import load_objective
 
 GRID = {"num_ratios": 61, "num_advantages": 11}
 
@@ -38,8 +39,9 @@ def quadratic(x, a, p):
 
 @pytest.mark.parametrize("scale", [1.0, 100.0])
 @pytest.mark.parametrize("base", ["ppo", "none"])
-def test_a_learned_drift_is_a_drift_whatever_its_weights(base, scale):
-    drift = LearnedDrift(base=base, hidden_size=4)
+@pytest.mark.parametrize("gate", [0.0, 0.1])
+def test_a_learned_drift_is_a_drift_whatever_its_weights(base, scale, gate):
+    drift = LearnedDrift(base=base, hidden_size=4, gate=gate)
     parameters = jax.tree.map(lambda x: scale * x, drift.init(jax.random.key(1)))
     found = certify(drift, parameters, **GRID)
     assert found.holds
@@ -141,3 +143,29 @@ def test_a_certificate_says_on_which_grid():
     assert found.grid == expected
     assert found.as_dict()["grid"] == expected
     assert Certificate(**found.as_dict()) == found
+
+
+def test_the_kink_is_the_rise_of_the_penalty_around_ratio_one():
+    class Absolute:
+        """Half of |log r|, for every advantage."""
+
+        def init(self, key):
+            return jnp.zeros(())
+
+        def __call__(self, parameters, log_ratio, advantage, progress):
+            return 0.5 * jnp.abs(log_ratio)
+
+    # d/dr of 0.5 |log r| is 0.5 / r: 0.495 to the right of 1, -0.505 to the left, half of 1.00 in the mean.
+    assert certify(Absolute(), jnp.zeros(())).kink == pytest.approx(0.5, rel=1e-3)
+    for name in ("ppo", "dpo", "none"):
+        objective = load_objective(name)
+        assert certify(objective.drift, objective.parameters).kink == pytest.approx(0.0, abs=1e-3)
+
+
+def test_a_gate_takes_the_kink_from_any_weights():
+    drift = LearnedDrift(hidden_size=16, gate=0.0)
+    weights = jax.tree.map(lambda w: 3.0 * w, drift.init(jax.random.key(1)))
+    assert certify(drift, weights).kink > 0.1
+    gated = certify(replace(drift, gate=0.1), weights)
+    assert gated.holds
+    assert gated.kink < 0.03 * certify(drift, weights).kink + 1e-3

@@ -1,5 +1,7 @@
 """What PPO's clip, DPO and any learned network charge, and what a drift must never charge."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -138,7 +140,7 @@ def test_features_are_those_of_the_list_in_its_order():
 
 def test_a_network_by_hand_charges_beyond_xi_and_nothing_within():
     # One unit that sees log r alone: f = relu(tanh(log r) - xi), xi = 0.01.
-    drift = LearnedDrift(base="none", hidden_size=1, xi=0.01)
+    drift = LearnedDrift(base="none", hidden_size=1, xi=0.01, gate=0.0)
     seen = jnp.zeros((len(FEATURES), 1)).at[FEATURES.index("log r"), 0].set(1.0)
     parameters = {"hidden": seen, "output": jnp.ones((1, 1))}
     charged = drift(parameters, batch(0.1, 0.005, -0.1), batch(1, 1, 1), batch(0, 0, 0))
@@ -297,6 +299,7 @@ def test_a_column_beside_rows_is_an_error(name, position):
         (lambda: LearnedDrift(base="ppo2"), "unknown drift base 'ppo2': did you mean ppo"),
         (lambda: LearnedDrift(hidden_size=0), "hidden_size is 0: it must be at least 1."),
         (lambda: LearnedDrift(xi=0.0), "clip and xi are 0.2 and 0.0: both must be positive."),
+        (lambda: LearnedDrift(gate=-0.1), "gate is -0.1: it must be 0 or larger, and finite."),
     ],
 )
 def test_a_drift_refuses_numbers_that_make_none(make_drift, message):
@@ -341,3 +344,16 @@ def test_a_temporal_drift_is_certified():
 def batch_of_ratios():
     key_ratio, key_advantage = jax.random.split(jax.random.key(5))
     return jax.random.normal(key_ratio, (64,)), 2.0 * jax.random.normal(key_advantage, (64,))
+
+
+def test_a_gate_fades_the_network_out_around_ratio_one_and_leaves_it_elsewhere():
+    gated = LearnedDrift(base="none", hidden_size=HIDDEN, gate=0.1)
+    open_ = replace(gated, gate=0.0)
+    weights = jax.tree.map(lambda w: 3.0 * w, gated.init(jax.random.key(2)))
+    advantage, progress = jnp.full(5, -1.5), jnp.zeros(5)
+    x = jnp.asarray([-0.5, -0.1, 0.0, 0.1, 0.5])
+    with_gate, without = (d(weights, x, advantage, progress) for d in (gated, open_))
+    # 1 - e^-1 at one width, 1 - e^-25 at five; xi = 1e-6 is subtracted after it.
+    factor = jnp.asarray([1.0, 0.6321206, 0.0, 0.6321206, 1.0])
+    assert float(without.max()) > 0.01
+    np.testing.assert_allclose(with_gate, factor * without, atol=2e-6)

@@ -23,7 +23,8 @@ ROOT = Path(__file__).parents[2]
 
 def random_objective(base: str, temporal: bool) -> Objective:
     """A learned drift of random weights, three times the usual size so that it charges on many points."""
-    drift = LearnedDrift(base=base, hidden_size=8, temporal=temporal)
+    # One of the two families with a gate, and one without.
+    drift = LearnedDrift(base=base, hidden_size=8, temporal=temporal, gate=0.2 * temporal)
     parameters = jax.tree.map(lambda w: 3 * w, drift.init(jax.random.key(5)))
     return Objective(f"learned-{base}{'-temporal' if temporal else ''}", drift, parameters)
 

@@ -83,6 +83,7 @@ def results(**changes: Any) -> dict[str, Any]:
         "gradient_at_one": 0.0,
         "slope_at_0_001": 0.123,
         "slope_at_0_01": 0.456,
+        "kink": 0.0789,
         "finite": True,
         "grid": "11 log-ratios",
     }

@@ -1,0 +1,47 @@
+"""The README's Python is run, with less training than it says."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+README = Path(__file__).parents[1] / "README.md"
+BLOCKS = re.findall(r"```python\n(.*?)```", README.read_text(), re.S)
+# (what the README says, what is run)
+SHORTER = (
+    ("scb.PPOConfig(activation", "scb.PPOConfig(total_steps=1000, activation"),
+    ("scb.SACConfig()", "scb.SACConfig(total_steps=1500)"),
+    ("total_steps=500_000", "total_steps=2048"),
+    (
+        "population_size=32, num_generations=30,",
+        "population_size=2, num_generations=1, mean_evaluations=2,",
+    ),
+    (
+        "population_size=32, num_generations=100",
+        "population_size=2, num_generations=1, mean_evaluations=2",
+    ),
+)
+
+
+def test_every_replacement_finds_its_text():
+    for long, short in SHORTER:
+        assert sum(long in block for block in BLOCKS) == 1, long
+        assert long != short
+
+
+# Compiling Brax and finding an expert take a minute each.
+@pytest.mark.parametrize(
+    "block",
+    [
+        pytest.param(
+            block,
+            marks=[pytest.mark.slow] if "hopper" in block or "discover" in block else [],
+            id=f"block-{number}",
+        )
+        for number, block in enumerate(BLOCKS)
+    ],
+)
+def test_a_block_of_the_readme_runs(block):
+    for long, short in SHORTER:
+        block = block.replace(long, short)
+    exec(compile(block, "README.md", "exec"), {})
