@@ -70,7 +70,7 @@ class Evaluation:
 EVALUATIONS = (
     Evaluation("Pendulum", "Pendulum-v1"),
     Evaluation("Pendulum, small last layer", "Pendulum-v1", policy_output_scale=0.01),
-    Evaluation("Hopper (spring), never used", "hopper", "spring", 300_000, seeds=10),
+    Evaluation("Hopper (spring), never used", "hopper", "spring", 500_000, seeds=6),
 )
 
 
