@@ -36,6 +36,9 @@ def main() -> int:
         comparison = json.loads(path.read_text())
         curves = comparison["curves"]
         environment = curves[0]["environment"]
+        scale = curves[0].get("policy_output_scale", 1.0)
+        if scale != 1.0:
+            environment += f", policy_output_scale {scale:g}"
         reporting_seeds[environment] = curves[0]["seeds"]
         results[environment] = {
             "backend": curves[0]["backend"],

@@ -766,7 +766,9 @@ def _final(axes: Axes, position: int, curve: "LearningCurves", look: Look) -> No
 def _protocol(curve: "LearningCurves") -> str:
     physics = "" if curve.backend is None else f" ({curve.backend} physics)"
     actions = "mode" if curve.mode_actions else "sampled"
-    return f"{curve.environment}{physics}: {actions} actions, {curve.episodes} episodes"
+    scale = curve.policy_output_scale
+    start = "" if scale == 1.0 else f", policy's last layer x {scale:g}"
+    return f"{curve.environment}{physics}{start}: {actions} actions, {curve.episodes} episodes"
 
 
 def _fitness_label(environment: str, fitness: str) -> str:

@@ -33,6 +33,7 @@ class LearningCurves:
       steps: [P] environment steps at each evaluation, the first 0.
       returns: [S, P] mean return of `episodes` episodes, per seed.
       mode_actions: whether evaluation took the most likely actions or sampled ones.
+      policy_output_scale: factor on the policy's last layer at initialisation.
     """
 
     environment: str
@@ -43,6 +44,7 @@ class LearningCurves:
     seeds: list[int]
     episodes: int
     mode_actions: bool
+    policy_output_scale: float = 1.0
 
     @property
     def final(self) -> np.ndarray:
@@ -62,6 +64,7 @@ class LearningCurves:
             steps=np.asarray(stored["steps"]),
             returns=np.asarray(stored["returns"]),
             **{name: stored[name] for name in names},
+            policy_output_scale=stored.get("policy_output_scale", 1.0),
         )
 
     def as_dict(self) -> dict[str, Any]:
@@ -74,6 +77,7 @@ class LearningCurves:
             "seeds": self.seeds,
             "episodes": self.episodes,
             "mode_actions": self.mode_actions,
+            "policy_output_scale": self.policy_output_scale,
             "final_iqm": estimate(self.final).as_dict(),
             "area_iqm": estimate(self.area).as_dict(),
         }
@@ -238,6 +242,7 @@ def _family_curves(
             list(seeds),
             episodes,
             mode_actions,
+            float(setting.hyperparameters.policy_output_scale),
         )
         for objective, of_it in zip(objectives, returns, strict=True)
     ]
