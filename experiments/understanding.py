@@ -55,6 +55,7 @@ def read_formula(path: Path) -> dict[str, Any]:
         "of": metadata["config"].get("of"),
         "expression": objective.drift.expression,
         "base": objective.drift.base,
+        "gate": objective.drift.gate,
         "r2": metadata["results"].get("r2"),
         "base_r2": metadata["results"].get("base_r2"),
         "certificate": metadata["certificate"],
@@ -192,16 +193,19 @@ def _formula_section(report: Mapping[str, Any]) -> list[str]:
     for formula in report["formulas"]:
         r2, base, certificate = formula["r2"], formula["base_r2"], formula["certificate"]
         added = "PPO's clip drift + " if formula["base"] == "ppo" else ""
+        gate = "g·" if formula["gate"] else ""
+        width = f", and `g = 1 − exp(−(log r / {formula['gate']:g})²)`" if gate else ""
         lines += [
-            f"`{formula['command']}` wrote `{formula['of']}` down as `f = relu({added}e − ξ)` with",
+            f"`{formula['command']}` wrote `{formula['of']}` down as `f = relu({added}{gate}e − ξ)` with",
             "",
             "```text",
             f"e = {formula['expression']}",
             "```",
             "",
-            "where `d = r − 1` and `log_r = log r`. On points that the fit has not seen, log-ratios of standard",
-            f"deviation 0.3 and normal advantages, R² is {_r2(r2['drift'])} for the drift and {_r2(r2['slope'])} for",
-            f"its slope `df/d(log r)`; the base alone has {_r2(base['drift'])} and {_r2(base['slope'])}.",
+            f"where `d = r − 1` and `log_r = log r`{width}.",
+            "On points that the fit has not seen, log-ratios of standard deviation 0.3 and normal advantages,",
+            f"R² is {_r2(r2['drift'])} for the drift and {_r2(r2['slope'])} for its slope `df/d(log r)`;",
+            f"the base alone has {_r2(base['drift'])} and {_r2(base['slope'])}.",
             f"The mirror-learning conditions {'hold' if certificate['holds'] else 'do NOT hold'} on the "
             "certificate's grid.",
             "",

@@ -645,7 +645,8 @@ def distill_command(
         },
     )
     print(f"expression: {found.drift.expression}")
-    print(f"drift: relu({'base + ' if found.drift.base == 'ppo' else ''}expression - xi)")
+    gate = f"gate({found.drift.gate:g}) * " if found.drift.gate else ""
+    print(f"drift: relu({'base + ' if found.drift.base == 'ppo' else ''}{gate}expression - xi)")
     print("R² on unseen points: " + ", ".join(f"{k} {v:.3f}" for k, v in found.r2.items()))
     base = ", ".join(f"{k} {v:.3f}" for k, v in found.base_r2.items())
     print(f"R² of the base ({found.drift.base}) alone: {base}")

@@ -134,7 +134,7 @@ def distill(objective: "Objective", config: DistillConfig | None = None) -> Dist
     drift = objective.drift
     shape: dict[str, Any] = {"base": "none"}
     if isinstance(drift, LearnedDrift | ClosedFormDrift):
-        shape = {"base": drift.base, "clip": drift.clip, "xi": drift.xi}
+        shape = {"base": drift.base, "clip": drift.clip, "xi": drift.xi, "gate": drift.gate}
     rng = np.random.default_rng(config.seed)
     temporal = bool(getattr(drift, "temporal", False))
     fit = _Data(objective, sample_updates(rng, config.samples), shape)
@@ -233,6 +233,8 @@ class _Data:
             clip, ratio = shape["clip"], np.exp(x)
             self.base = np.maximum((ratio - np.clip(ratio, 1.0 - clip, 1.0 + clip)) * a, 0.0)
         self.variables = {"d": np.expm1(x), "log_r": x, "A": a, "abs(A)": np.abs(a), "progress": p}
+        width = float(shape.get("gate", ClosedFormDrift.gate))
+        self.gate = -np.expm1(-((x / width) ** 2)) if width else np.ones_like(x)
         f = objective.drift(objective.parameters, *(jnp.asarray(v, jnp.float32) for v in (x, a, p)))
         self.drift, self.slope = self._split(np.asarray(f, float))
         # Residuals in units of the standard deviation: 1 - R² is the mean of their squares.
@@ -245,7 +247,7 @@ class _Data:
 
     def residuals(self, added: NDArray[np.floating]) -> NDArray[np.floating]:
         """[3 S] values of an expression -> [2 S] scaled errors of drift and slope."""
-        drift, slope = self._split(np.maximum(self.base + added - self.xi, 0.0))
+        drift, slope = self._split(np.maximum(self.base + self.gate * added - self.xi, 0.0))
         return np.concatenate(
             [(drift - self.drift) / self._scales[0], (slope - self.slope) / self._scales[1]]
         )

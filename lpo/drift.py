@@ -152,8 +152,7 @@ class LearnedDrift:
     gate: float = 0.1
 
     def __post_init__(self) -> None:
-        if not 0 <= self.gate < math.inf:
-            raise UserError(f"gate is {self.gate}: it must be 0 or larger, and finite.")
+        check_gate(self.gate)
         if self.base not in BASES:
             raise unknown_name("drift base", self.base, BASES)
         if self.hidden_size < 1:
@@ -191,11 +190,21 @@ class LearnedDrift:
         if self.temporal:
             inputs = jnp.concatenate([inputs, progress[..., None] * inputs], axis=-1)
         penalty = (jnp.tanh(inputs @ parameters["hidden"]) @ parameters["output"])[..., 0]
-        if self.gate:
-            penalty = penalty * -jnp.expm1(-((log_ratio / self.gate) ** 2))
+        penalty = gated(penalty, log_ratio, self.gate)
         if self.base == "ppo":
             penalty = penalty + clipped_surrogate_drift(self.clip, log_ratio, advantage, progress)
         return jax.nn.relu(penalty - self.xi)
+
+
+def check_gate(width: float) -> None:
+    """Raises a UserError for what is no width."""
+    if not 0 <= width < math.inf:
+        raise UserError(f"gate is {width}: it must be 0 or larger, and finite.")
+
+
+def gated(penalty: jax.Array, log_ratio: jax.Array, width: float) -> jax.Array:
+    """[B] the penalty faded out around ratio 1, by 1 - exp(-(log r / width)^2); as it is where the width is 0."""
+    return penalty * -jnp.expm1(-((log_ratio / width) ** 2)) if width else penalty
 
 
 def drift_features(log_ratio: jax.Array, advantage: jax.Array) -> jax.Array:

@@ -2,7 +2,7 @@
 
 An expression such as "0.5*A*d - tanh(2*A*log_r)" becomes a member of the drift contract,
 
-    relu(base + expression - xi),
+    relu(base + gate * expression - xi),
 
 where every term of the expression vanishes at ratio 1. A text is checked for that when it is read,
 by its structure, so the conditions of mirror learning hold whatever its numbers are. `lpo.distill`
@@ -21,7 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lpo.drift import BASES, Base
+from lpo.drift import BASES, Base, check_gate, gated
 from scb.agents.ppo import MAX_LOG_RATIO, clipped_surrogate_drift
 from scb.errors import UserError, unknown_name
 
@@ -264,7 +264,7 @@ def evaluate(
 
 @dataclass(frozen=True)
 class ClosedFormDrift:
-    """A formula as a drift: relu(base + expression - xi).
+    """A formula as a drift: relu(base + gate * expression - xi).
 
     Its parameters are the formula's numbers, so they can be traced and evolved like a network's
     weights. The conditions of mirror learning hold whatever they are: expression and base vanish at
@@ -273,7 +273,7 @@ class ClosedFormDrift:
     Attributes:
       expression: in the language of `parse`: numbers, d (r - 1), log_r, A, progress; +, -, *, tanh,
         relu, abs.
-      base, clip, xi: as `LearnedDrift`'s.
+      base, clip, xi, gate: as `LearnedDrift`'s.
 
     Raises:
       UserError: as `parse`.
@@ -283,8 +283,10 @@ class ClosedFormDrift:
     base: Base = "none"
     clip: float = 0.2
     xi: float = 1e-6
+    gate: float = 0.0
 
     def __post_init__(self) -> None:
+        check_gate(self.gate)
         parse(self.expression)
         if self.base not in BASES:
             raise unknown_name("drift base", self.base, BASES)
@@ -326,7 +328,9 @@ class ClosedFormDrift:
             "progress": progress,
         }
         root = parse(self.expression).root
-        penalty = evaluate(root, parameters["constants"], variables, jnp)
+        penalty = gated(
+            evaluate(root, parameters["constants"], variables, jnp), log_ratio, self.gate
+        )
         if self.base == "ppo":
             penalty = penalty + clipped_surrogate_drift(self.clip, log_ratio, advantage, progress)
         return jax.nn.relu(penalty - self.xi)

@@ -117,6 +117,7 @@ def _formula(path: Path, artefact: artefacts.Artefact, family: Mapping[str, Any]
         base=family["base"],
         clip=family["clip"],
         xi=family["xi"],
+        gate=family.get("gate", 0.0),
     )
     parameters = drift.init(jax.random.key(0))
     artefacts.expect_shapes(artefact, {"constants": parameters["constants"].shape})
@@ -156,9 +157,9 @@ def save_objective(
         own = {
             "hidden_size": drift.hidden_size,
             "features": list(drift.features),
-            "gate": drift.gate,
         }
-    config["drift"] = {"base": drift.base, "clip": drift.clip, "xi": drift.xi, **own}
+    shared = {"base": drift.base, "clip": drift.clip, "xi": drift.xi, "gate": drift.gate}
+    config["drift"] = {**shared, **own}
     full = {
         **metadata,
         "kind": KIND,

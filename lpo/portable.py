@@ -198,6 +198,10 @@ def _formula(objective: Objective) -> _Formula:
     )
 
 
+def _gated(xp: Any, penalty: Any, log_ratio: Any, width: float) -> Any:
+    return penalty * -xp.expm1(-((log_ratio / width) ** 2)) if width else penalty
+
+
 def _clip(xp: Any, log_ratio: Any, advantage: Any, clip: float) -> Any:
     ratio = xp.exp(log_ratio)
     return _relu(xp, (ratio - xp.clip(ratio, 1.0 - clip, 1.0 + clip)) * advantage)
@@ -226,8 +230,7 @@ def _learned(
         inputs = xp.concatenate([inputs, progress[..., None] * inputs], -1)
     hidden, output = (_like(xp, log_ratio, weights[name]) for name in ("hidden", "output"))
     penalty = (xp.tanh(inputs @ hidden) @ output)[..., 0]
-    if drift.gate:
-        penalty = penalty * -xp.expm1(-((log_ratio / drift.gate) ** 2))
+    penalty = _gated(xp, penalty, log_ratio, drift.gate)
     if drift.base == "ppo":
         penalty = penalty + _clip(xp, log_ratio, advantage, drift.clip)
     return _relu(xp, penalty - drift.xi)
@@ -247,7 +250,8 @@ def _closed_form(
         "A": advantage,
         "progress": progress,
     }
-    penalty = evaluate(parse(drift.expression).root, constants, variables, xp)
+    expression = evaluate(parse(drift.expression).root, constants, variables, xp)
+    penalty = _gated(xp, expression, log_ratio, drift.gate)
     if drift.base == "ppo":
         penalty = penalty + _clip(xp, log_ratio, advantage, drift.clip)
     return _relu(xp, penalty - drift.xi)

@@ -246,12 +246,23 @@ def test_a_known_formula_is_found_again():
     assert again.drift == found.drift
 
 
+def test_a_known_formula_is_found_again_behind_its_gate():
+    pytest.importorskip("gplearn")
+    known = ClosedFormDrift("0.7*abs(A)*d*d", gate=0.2)
+    # At r = e^0.2 the gate lets 1 - 1/e through: 0.7 (0.2214)² 0.6321.
+    assert charged(known, [0.2], [1.0])[0] == pytest.approx(0.02169, rel=1e-3)
+    found = distill(Objective("known", known, known.init(jax.random.key(0))), QUICK)
+    assert found.drift.gate == 0.2
+    assert found.r2["drift"] > 0.999 and found.r2["slope"] > 0.999
+
+
 def test_a_learned_drift_keeps_its_base():
     pytest.importorskip("gplearn")
-    drift = LearnedDrift(hidden_size=2, clip=0.3, xi=1e-5)
+    drift = LearnedDrift(hidden_size=2, clip=0.3, xi=1e-5, gate=0.05)
     parameters = jax.tree.map(lambda x: 0.1 * x, drift.init(jax.random.key(0)))
     found = distill(Objective("mine", drift, parameters), QUICK)
     assert (found.drift.base, found.drift.clip, found.drift.xi) == ("ppo", 0.3, 1e-5)
+    assert found.drift.gate == 0.05
     assert found.r2["drift"] >= found.base_r2["drift"] - 0.05
     assert certify(found.drift, found.parameters, **GRID).holds
 

@@ -30,7 +30,7 @@ def random_objective(base: str, temporal: bool) -> Objective:
 
 
 def formula(base: str, expression: str) -> Objective:
-    drift = ClosedFormDrift(expression, base=base)
+    drift = ClosedFormDrift(expression, base=base, gate=0.3 if base == "ppo" else 0.0)
     return Objective(f"formula-{base}", drift, drift.init(jax.random.key(0)))
 
 
