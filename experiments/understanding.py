@@ -87,6 +87,7 @@ def read_comparison(path: Path, formulas: Sequence[Mapping[str, Any]] = ()) -> d
             "seeds": first["seeds"],
             "episodes": first["episodes"],
             "mode_actions": first["mode_actions"],
+            "policy_output_scale": first.get("policy_output_scale", 1.0),
             "reference": whole["reference"],
             "final_iqm": {c["objective"]: c["final_iqm"] for c in curves},
             "paired_differences": whole["paired_differences"],
@@ -213,8 +214,10 @@ def _formula_section(report: Mapping[str, Any]) -> list[str]:
     for comparison in report.get("comparisons", []):
         seeds = comparison["seeds"]
         actions = "mode" if comparison["mode_actions"] else "sampled"
+        scale = comparison["policy_output_scale"]
+        start = "" if scale == 1 else f", the policy's last layer times {scale:g} at initialisation"
         lines += [
-            f"Trained with on {comparison['environment']}, {comparison['steps']} steps, seeds {min(seeds)} to "
+            f"Trained with on {comparison['environment']}{start}, {comparison['steps']} steps, seeds {min(seeds)} to "
             f"{max(seeds)}, {comparison['episodes']} episodes of {actions} actions; interquartile means with 95 % "
             "bootstrap intervals:",
             "",
