@@ -14,6 +14,7 @@ import argparse
 import json
 import sys
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -31,6 +32,7 @@ SOURCES = ("bandit", "environment")
 CLIPS = ("ppo-0.1", "ppo", "ppo-0.3", "ppo-0.5", "ppo-1")
 TUNING_SEED = 22_000  # the clip is chosen on these agents, and reported on others
 REPORTING_SEED = 10_000
+RESAMPLES = 5000
 SCALES = {"Flax's initialisation": 1.0, "small last layer": 0.01}
 
 _JUDGED = {"validate": True, "mean_evaluations": 16}
@@ -108,17 +110,21 @@ def pooled(
     searches, agents = values.shape
     rng = np.random.default_rng(0)
 
-    def statistic(search: Any, agent: Any) -> float:
-        value = float(iqm(values[search][:, agent].ravel()))
-        return value if reference is None else value - float(iqm(np.asarray(reference)[agent]))
+    def statistic(search: Any, agent: Any) -> np.ndarray:
+        """[N, searches], [N, agents] indices -> [N]."""
+        drawn = values[search[:, :, None], agent[:, None, :]].reshape(len(search), -1)
+        middle = iqm(drawn, axis=1)
+        return middle if reference is None else middle - iqm(np.asarray(reference)[agent], axis=1)
 
-    drawn = [
-        statistic(rng.integers(0, searches, searches), rng.integers(0, agents, agents))
-        for _ in range(5000)
-    ]
-    low, high = np.percentile(drawn, [2.5, 97.5])
-    value = statistic(np.arange(searches), np.arange(agents))
-    return Estimate(value, float(low), float(high), values.size)
+    low, high = np.percentile(
+        statistic(
+            rng.integers(0, searches, (RESAMPLES, searches)),
+            rng.integers(0, agents, (RESAMPLES, agents)),
+        ),
+        [2.5, 97.5],
+    )
+    value = statistic(np.arange(searches)[None], np.arange(agents)[None])[0]
+    return Estimate(float(value), float(low), float(high), values.size)
 
 
 def search_curve(metrics: Sequence[Mapping[str, Any]], seconds: Sequence[float]) -> dict[str, Any]:
@@ -326,6 +332,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def measure(preset: str, runs: Path, out: Path, report: dict[str, Any]) -> None:
     """Does what the report lacks, and writes it after every part."""
+    from lpo.commands import objective_of_run
     from lpo.objectives import Objective, load_objective
     from scb.artefacts import machine_description, package_versions
     from scb.errors import UserError
@@ -347,7 +354,12 @@ def measure(preset: str, runs: Path, out: Path, report: dict[str, Any]) -> None:
         name = f"LPO ({source})"
         folders = [runs / f"{source}-{seed}" for seed in range(search["seeds"])]
         learned[name] = [
-            _learn(folder, {"command": "meta-train", "seed": seed, **search["settings"]}, name)
+            replace(
+                objective_of_run(
+                    {"command": "meta-train", "seed": seed, **search["settings"]}, folder
+                ),
+                name=f"{name} {seed}",
+            )
             for seed, folder in enumerate(folders)
         ]
         report["searches"][source] = {
@@ -369,18 +381,6 @@ def measure(preset: str, runs: Path, out: Path, report: dict[str, Any]) -> None:
             "hopper", objectives, hopper["agents"], hopper["steps"], 1.0, hopper["backend"]
         )
         write_json(out, report)
-
-
-def _learn(folder: Path, settings: Mapping[str, Any], name: str) -> Any:
-    from dataclasses import replace
-
-    from lpo.commands import learn_objective
-    from lpo.objectives import load_objective
-
-    path = folder / "objective.npz"
-    if not path.with_suffix(".json").exists():
-        learn_objective(settings, folder, resume=(folder / "config.json").exists())
-    return replace(load_objective(path), name=f"{name} {settings['seed']}")
 
 
 def _curve_of(folder: Path) -> dict[str, Any]:

@@ -13,7 +13,7 @@ import argparse
 import json
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -295,19 +295,12 @@ def _measure(
 
 
 def _learn(arguments: argparse.Namespace, name: str, seed: int, entry: dict[str, Any]) -> Any:
-    """A variation's objective of one search, learned here or found in its run folder."""
-    from dataclasses import replace
-
-    from lpo.commands import learn_objective
-    from lpo.objectives import load_objective
+    """A variation's objective of one search, and into the entry what it took."""
+    from lpo.commands import objective_of_run
     from scb.runs import command_of
 
     settings = settings_of(name, seed, arguments.generations, arguments.population_size)
-    folder = arguments.runs / f"{name.replace(' ', '-')}-{seed}"
-    path = folder / "objective.npz"
-    if not path.with_suffix(".json").exists():
-        learn_objective(settings, folder, resume=(folder / "config.json").exists())
-    objective = load_objective(path)
+    objective = objective_of_run(settings, arguments.runs / f"{name.replace(' ', '-')}-{seed}")
     entry["command"] = command_of("lpo", {**settings, "seed": None})
     cost = objective.metadata["cost"]
     entry["seconds"] = cost["seconds"]

@@ -238,6 +238,14 @@ def learn_objective(
     return path, certificate
 
 
+def objective_of_run(settings: Mapping[str, Any], folder: Path) -> Objective:
+    """The objective of a run folder with these settings: read, or learned first, or its run resumed."""
+    path = folder / "objective.npz"
+    if not path.with_suffix(".json").exists():  # it is written last
+        learn_objective(settings, folder, resume=(folder / "config.json").exists())
+    return load_objective(path)
+
+
 def meta_training_config(settings: Mapping[str, Any]) -> MetaTrainingConfig:
     """A MetaTrainingConfig from flat settings; what is None keeps its default."""
 
