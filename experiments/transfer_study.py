@@ -128,7 +128,7 @@ def markdown(report: Mapping[str, Any]) -> str:
         f"{searches['population_size']} candidates, {len(searches['seeds'])} "
         f"{'search' if len(searches['seeds']) == 1 else 'searches'}; it differs from the default in what its name "
         "says. Then PPO is trained with it. Final return with the most likely actions, interquartile mean over "
-        "agents and 95 % bootstrap interval; in brackets below, the paired difference to the default where its "
+        "agents and 95 % bootstrap interval; in round brackets the paired difference to the default where its "
         "interval excludes zero.",
         "",
         "![Final returns by variation](figures/transfer_study.png)",
@@ -209,6 +209,7 @@ def draw(report: Mapping[str, Any]) -> "Figure":
             axes.set_xlabel("final return")
         panels[0].set_yticks(range(len(rows)), [row["name"] for row in rows])
         panels[0].invert_yaxis()
+        figure.suptitle("Interquartile mean with its 95 % interval, each agent a dot")
     return figure
 
 
