@@ -29,13 +29,16 @@ def test_every_replacement_finds_its_text():
         assert long != short
 
 
-# Compiling Brax and finding an expert take a minute each.
+# Compiling Brax, SAC and a search takes from half a minute to a minute each.
+SLOW = ("hopper", "discover", "SAC", "meta_train")
+
+
 @pytest.mark.parametrize(
     "block",
     [
         pytest.param(
             block,
-            marks=[pytest.mark.slow] if "hopper" in block or "discover" in block else [],
+            marks=[pytest.mark.slow] if any(word in block for word in SLOW) else [],
             id=f"block-{number}",
         )
         for number, block in enumerate(BLOCKS)
@@ -45,3 +48,13 @@ def test_a_block_of_the_readme_runs(block):
     for long, short in SHORTER:
         block = block.replace(long, short)
     exec(compile(block, "README.md", "exec"), {})
+
+
+@pytest.mark.parametrize("call", ["meta_train(config)", "discover(config)"])
+def test_what_the_slow_blocks_configure_exists(call):
+    block = next(block for block in BLOCKS if call in block)
+    lines = block.splitlines()
+    number = next(i for i, line in enumerate(lines) if call in line)
+    names: dict = {}
+    exec("\n".join(lines[:number]), names)
+    assert names["config"].evolution.population_size == 32
