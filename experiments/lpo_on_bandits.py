@@ -291,17 +291,7 @@ def _dots(axes: "Axes", table: Mapping[str, Any]) -> None:
     for position, (objective, finals) in enumerate(table["finals"].items()):
         learned = objective.startswith("LPO")
         color = figures.VERMILLION if learned else figures.BLUE
-        values = np.asarray(finals).ravel()
-        axes.plot(values, np.full(values.size, position), ".", color=color, alpha=0.2)
-        x = pooled(finals)
-        axes.errorbar(
-            x.value,
-            position,
-            xerr=np.abs([[(x.low or 0.0) - x.value], [(x.high or 0.0) - x.value]]),
-            fmt="o",
-            color=color,
-            capsize=3,
-        )
+        figures.estimate_row(axes, position, np.ravel(finals), pooled(finals), color)
     axes.set_yticks(range(len(table["finals"])), list(table["finals"]))
     axes.invert_yaxis()
     axes.set_xlabel("final return")

@@ -180,7 +180,7 @@ def draw(report: Mapping[str, Any]) -> "Figure":
     """One panel an evaluation, one line an objective: interquartile mean with its interval, each agent a dot."""
     from matplotlib.figure import Figure
 
-    from lpo.figures import BLUE, GREY, VERMILLION, figure_style
+    from lpo.figures import BLUE, GREY, VERMILLION, estimate_row, figure_style
 
     evaluations = [e["name"] for e in report["evaluations"]]
     rows = summary(report)
@@ -195,16 +195,7 @@ def draw(report: Mapping[str, Any]) -> "Figure":
                     row["name"], BLUE if row["name"] in REFERENCES else GREY
                 )
                 agents = np.concatenate(report["objectives"][row["name"]]["returns"][evaluation])
-                axes.plot(agents, np.full(agents.size, position), ".", color=color, alpha=0.25)
-                x = row[evaluation]
-                axes.errorbar(
-                    x.value,
-                    position,
-                    xerr=np.abs([[x.low - x.value], [x.high - x.value]]),
-                    fmt="o",
-                    color=color,
-                    capsize=3,
-                )
+                estimate_row(axes, position, agents, row[evaluation], color)
             axes.set_title(evaluation)
             axes.set_xlabel("final return")
         panels[0].set_yticks(range(len(rows)), [row["name"] for row in rows])

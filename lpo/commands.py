@@ -28,7 +28,7 @@ from lpo.generalization import (
     learning_curves,
     training_setting,
 )
-from lpo.meta_training import MetaTraining, MetaTrainingConfig, chosen_mean
+from lpo.meta_training import VALIDATION_AGENTS, MetaTraining, MetaTrainingConfig, chosen_mean
 from lpo.objectives import Objective, load_objective, save_objective
 from lpo.pipeline import PRESETS as RUN_PRESETS
 from lpo.pipeline import check_settings, meta_training_artefact, run_pipeline
@@ -269,8 +269,7 @@ def meta_training_config(settings: Mapping[str, Any]) -> MetaTrainingConfig:
             "strategy": default.evolution.strategy,
             "sigma": default.evolution.sigma,
             "learning_rate": default.evolution.learning_rate,
-            # A judgement on the environment costs a training there.
-            "mean_evaluations": 16
+            "mean_evaluations": VALIDATION_AGENTS
             if settings.get("validate")
             else default.evolution.mean_evaluations,
             "combine": "mean" if len(tasks) == 1 else "ranks",

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lpo.certificate import certify
-from lpo.drift import LearnedDrift
+from lpo.drift import LearnedDrift, gated
 from lpo.formula import FUNCTIONS, ClosedFormDrift, parse
 from scb.errors import UserError
 
@@ -233,8 +233,7 @@ class _Data:
             clip, ratio = shape["clip"], np.exp(x)
             self.base = np.maximum((ratio - np.clip(ratio, 1.0 - clip, 1.0 + clip)) * a, 0.0)
         self.variables = {"d": np.expm1(x), "log_r": x, "A": a, "abs(A)": np.abs(a), "progress": p}
-        width = float(shape.get("gate", ClosedFormDrift.gate))
-        self.gate = -np.expm1(-((x / width) ** 2)) if width else np.ones_like(x)
+        self.gate = gated(np.ones_like(x), x, shape.get("gate", ClosedFormDrift.gate), np)
         f = objective.drift(objective.parameters, *(jnp.asarray(v, jnp.float32) for v in (x, a, p)))
         self.drift, self.slope = self._split(np.asarray(f, float))
         # Residuals in units of the standard deviation: 1 - R² is the mean of their squares.

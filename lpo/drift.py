@@ -202,9 +202,12 @@ def check_gate(width: float) -> None:
         raise UserError(f"gate is {width}: it must be 0 or larger, and finite.")
 
 
-def gated(penalty: jax.Array, log_ratio: jax.Array, width: float) -> jax.Array:
-    """[B] the penalty faded out around ratio 1, by 1 - exp(-(log r / width)^2); as it is where the width is 0."""
-    return penalty * -jnp.expm1(-((log_ratio / width) ** 2)) if width else penalty
+def gated(penalty: Any, log_ratio: Any, width: float, library: Any = jnp) -> Any:
+    """[B] the penalty faded out around ratio 1, by 1 - exp(-(log r / width)^2); as it is where the width is 0.
+
+    The arrays are those of `library`: `jax.numpy`, `numpy` or `torch`.
+    """
+    return penalty * -library.expm1(-((log_ratio / width) ** 2)) if width else penalty
 
 
 def drift_features(log_ratio: jax.Array, advantage: jax.Array) -> jax.Array:

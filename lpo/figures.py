@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from lpo.generalization import LearningCurves
     from lpo.objectives import Objective
     from lpo.suite import SuiteScores
+    from scb.statistics import Estimate
 
 BLACK, ORANGE, SKY_BLUE, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"
 BLUE, VERMILLION, PURPLE = "#0072B2", "#D55E00", "#CC79A7"
@@ -685,6 +686,22 @@ def ratio_text(bandit: float, environment: float) -> str:
 def thousands(x: float) -> str:
     """A count with its digits in groups of three, which no line break parts."""
     return f"{x:,.0f}".replace(",", "\N{NARROW NO-BREAK SPACE}")
+
+
+def estimate_row(
+    axes: Axes, position: float, values: NDArray[np.floating], found: "Estimate", color: str
+) -> None:
+    """On one line of a horizontal plot: the estimate with its interval, and behind it each value a dot."""
+    axes.plot(values, np.full(values.size, position), ".", color=color, alpha=0.25)
+    ends = [found.value if end is None else end for end in (found.low, found.high)]
+    axes.errorbar(
+        found.value,
+        position,
+        xerr=np.abs(np.subtract(ends, found.value))[:, None],
+        fmt="o",
+        color=color,
+        capsize=3,
+    )
 
 
 @contextmanager

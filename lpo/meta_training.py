@@ -32,6 +32,8 @@ from scb.evolution import EnvironmentSteps, EvolutionConfig, Outcome, evolve
 from scb.runs import Run
 
 Fitness = Literal["return", "area", "transfer"]
+# Agents that judge a mean on the environment, where each costs a training there.
+VALIDATION_AGENTS = 16
 FITNESSES: tuple[Fitness, ...] = ("return", "area", "transfer")
 
 

@@ -21,7 +21,7 @@ from lpo.generalization import (
     learning_curves,
     training_setting,
 )
-from lpo.meta_training import MetaTraining, MetaTrainingConfig, chosen_mean
+from lpo.meta_training import VALIDATION_AGENTS, MetaTraining, MetaTrainingConfig, chosen_mean
 from lpo.objectives import Objective, load_objective, save_objective
 from scb.artefacts import machine_description, package_versions
 from scb.environments.registry import make
@@ -172,8 +172,7 @@ def pipeline_config(settings: Mapping[str, Any]) -> MetaTrainingConfig:
     )
     validate = bool(settings.get("validate"))
     if validate:
-        # A judgement costs a training on the environment.
-        evolution = replace(evolution, mean_evaluations=16)
+        evolution = replace(evolution, mean_evaluations=VALIDATION_AGENTS)
     return replace(
         default,
         evolution=evolution,

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
-from lpo.drift import ClipDrift, DPODrift, LearnedDrift, NoDrift
+from lpo.drift import ClipDrift, DPODrift, LearnedDrift, NoDrift, gated
 from lpo.formula import ClosedFormDrift, evaluate, parse
 from lpo.objectives import Objective, load_objective
 from scb.agents.ppo import MAX_LOG_RATIO
@@ -198,10 +198,6 @@ def _formula(objective: Objective) -> _Formula:
     )
 
 
-def _gated(xp: Any, penalty: Any, log_ratio: Any, width: float) -> Any:
-    return penalty * -xp.expm1(-((log_ratio / width) ** 2)) if width else penalty
-
-
 def _clip(xp: Any, log_ratio: Any, advantage: Any, clip: float) -> Any:
     ratio = xp.exp(log_ratio)
     return _relu(xp, (ratio - xp.clip(ratio, 1.0 - clip, 1.0 + clip)) * advantage)
@@ -230,7 +226,7 @@ def _learned(
         inputs = xp.concatenate([inputs, progress[..., None] * inputs], -1)
     hidden, output = (_like(xp, log_ratio, weights[name]) for name in ("hidden", "output"))
     penalty = (xp.tanh(inputs @ hidden) @ output)[..., 0]
-    penalty = _gated(xp, penalty, log_ratio, drift.gate)
+    penalty = gated(penalty, log_ratio, drift.gate, xp)
     if drift.base == "ppo":
         penalty = penalty + _clip(xp, log_ratio, advantage, drift.clip)
     return _relu(xp, penalty - drift.xi)
@@ -251,7 +247,7 @@ def _closed_form(
         "progress": progress,
     }
     expression = evaluate(parse(drift.expression).root, constants, variables, xp)
-    penalty = _gated(xp, expression, log_ratio, drift.gate)
+    penalty = gated(expression, log_ratio, drift.gate, xp)
     if drift.base == "ppo":
         penalty = penalty + _clip(xp, log_ratio, advantage, drift.clip)
     return _relu(xp, penalty - drift.xi)
