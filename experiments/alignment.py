@@ -97,6 +97,7 @@ def main() -> int:
     from lpo import figures
     from lpo.alignment import Regime, known_drifts, measure_alignment
     from lpo.objectives import load_objective, zoo_names
+    from scb import plotting
 
     learned = [load_objective(name) for name in [*zoo_names(), *arguments.adversaries]]
     report: dict[str, Any] = {
@@ -129,7 +130,7 @@ def main() -> int:
             arguments.out.write_text(json.dumps(report, indent=1) + "\n")
         path = arguments.page.parent / "figures" / f"alignment_{name}.png"
         path.parent.mkdir(parents=True, exist_ok=True)
-        figures.save(figures.alignment_heatmap(report["stages"][name]), path)
+        plotting.save(figures.alignment_heatmap(report["stages"][name]), path)
 
     variations = [Regime(PENDULUM, **variation) for variation in VARIATIONS]
     stage("pendulum", "Pendulum-v1", "the choice", variations, FIRST_SEED)

@@ -297,16 +297,16 @@ def figure(report: Mapping[str, Any]) -> "Figure":
     from matplotlib.lines import Line2D
     from matplotlib.ticker import EngFormatter, MaxNLocator
 
-    from lpo import figures
+    from scb import plotting
 
     runs = report["runs"]
     environments = list(dict.fromkeys(run["environment"] for run in runs))
     looks = {
-        "warm": figures.Look(figures.VERMILLION, "-", "o"),
-        "random": figures.Look(figures.BLUE, "--", "s"),
+        "warm": plotting.Look(plotting.VERMILLION, "-", "o"),
+        "random": plotting.Look(plotting.BLUE, "--", "s"),
     }
-    with figures.figure_style():
-        drawn = Figure(figsize=(figures.WIDTH, 2.4 * len(environments) + 1.2))
+    with plotting.figure_style():
+        drawn = Figure(figsize=(plotting.WIDTH, 2.4 * len(environments) + 1.2))
         grid = drawn.subplots(len(environments), 2, sharey="row", squeeze=False)
         for row, environment in zip(grid, environments, strict=True):
             of_it = [run for run in runs if run["environment"] == environment]
@@ -324,7 +324,7 @@ def figure(report: Mapping[str, Any]) -> "Figure":
                     )
                 if of_it[0]["target"] is not None:
                     axes.axhline(
-                        of_it[0]["target"], color=figures.BLACK, linewidth=1.4, linestyle=":"
+                        of_it[0]["target"], color=plotting.BLACK, linewidth=1.4, linestyle=":"
                     )
                 axes.margins(x=0.03, y=0.08)
                 # From zero, so that what a warm start costs before the first point can be seen.
@@ -354,22 +354,22 @@ def figure(report: Mapping[str, Any]) -> "Figure":
                 )
                 names.append(f"{start} start ({number} run{'s' if number > 1 else ''})")
         if any(run["target"] is not None for run in runs):
-            handles.append(Line2D([], [], color=figures.BLACK, linewidth=1.4, linestyle=":"))
+            handles.append(Line2D([], [], color=plotting.BLACK, linewidth=1.4, linestyle=":"))
             names.append("target")
-        figures._title(
+        plotting.figure_title(
             drawn, "Discovery of a bandit: return of agents trained in the search's mean"
         )
-        figures._legend_below(drawn, (handles, names), columns=3)
+        plotting.legend_below(drawn, (handles, names), columns=3)
     return drawn
 
 
 def render(report: Mapping[str, Any], docs: Path) -> None:
     """Writes docs/discovery_cost.md and docs/figures/discovery_cost.png."""
-    from lpo import figures
+    from scb import plotting
 
     docs.mkdir(parents=True, exist_ok=True)
     (docs / "discovery_cost.md").write_text(markdown(report))
-    figures.save(figure(report), docs / "figures" / "discovery_cost.png")
+    plotting.save(figure(report), docs / "figures" / "discovery_cost.png")
 
 
 def write_report(path: Path, report: Mapping[str, Any]) -> None:

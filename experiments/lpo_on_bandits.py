@@ -217,13 +217,13 @@ def draw(report: Mapping[str, Any]) -> "Figure":
     """(i) over generations, (ii) over steps and minutes; (iii) Pendulum; (iv) Hopper."""
     from matplotlib.figure import Figure
 
-    from lpo import figures
+    from scb import plotting
 
     looks = {
-        "bandit": figures.Look(figures.VERMILLION, "-", "o"),
-        "environment": figures.Look(figures.PURPLE, "--", "D"),
+        "bandit": plotting.Look(plotting.VERMILLION, "-", "o"),
+        "environment": plotting.Look(plotting.PURPLE, "--", "D"),
     }
-    with figures.figure_style():
+    with plotting.figure_style():
         figure = Figure(figsize=(12.0, 8.0))
         parts: Any = figure.subfigures(2, 1)
         top, bottom = parts
@@ -286,12 +286,12 @@ def _band(
 
 
 def _dots(axes: "Axes", table: Mapping[str, Any]) -> None:
-    from lpo import figures
+    from scb import plotting
 
     for position, (objective, finals) in enumerate(table["finals"].items()):
         learned = objective.startswith("LPO")
-        color = figures.VERMILLION if learned else figures.BLUE
-        figures.estimate_row(axes, position, np.ravel(finals), pooled(finals), color)
+        color = plotting.VERMILLION if learned else plotting.BLUE
+        plotting.estimate_row(axes, position, np.ravel(finals), pooled(finals), color)
     axes.set_yticks(range(len(table["finals"])), list(table["finals"]))
     axes.invert_yaxis()
     axes.set_xlabel("final return")
@@ -308,7 +308,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--only-render", action="store_true")
     arguments = parser.parse_args(argv)
     configure_jax()
-    from lpo import figures
+    from scb import plotting
 
     report: dict[str, Any] = {}
     if arguments.out.exists():
@@ -317,7 +317,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         measure(arguments.preset, arguments.runs / arguments.preset, arguments.out, report)
     arguments.page.write_text(markdown(report))
     (arguments.page.parent / "figures").mkdir(exist_ok=True)
-    figures.save(draw(report), arguments.page.parent / "figures" / "lpo_on_bandits.png")
+    plotting.save(draw(report), arguments.page.parent / "figures" / "lpo_on_bandits.png")
     return 0
 
 

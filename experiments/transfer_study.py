@@ -180,7 +180,7 @@ def draw(report: Mapping[str, Any]) -> "Figure":
     """One panel an evaluation, one line an objective: interquartile mean with its interval, each agent a dot."""
     from matplotlib.figure import Figure
 
-    from lpo.figures import BLUE, GREY, VERMILLION, estimate_row, figure_style
+    from scb.plotting import BLUE, GREY, VERMILLION, estimate_row, figure_style
 
     evaluations = [e["name"] for e in report["evaluations"]]
     rows = summary(report)
@@ -228,11 +228,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         report = json.loads(arguments.out.read_text())
     if not arguments.only_render:
         _measure(arguments, report, searches)
-    from lpo import figures
+    from scb import plotting
 
     arguments.page.write_text(markdown(report))
     (arguments.page.parent / "figures").mkdir(exist_ok=True)
-    figures.save(draw(report), arguments.page.parent / "figures" / "transfer_study.png")
+    plotting.save(draw(report), arguments.page.parent / "figures" / "transfer_study.png")
     return 0
 
 

@@ -279,6 +279,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     from lpo import figures
     from lpo.objectives import load_objective, zoo_names
+    from scb import plotting
     from scb.artefacts import package_versions
     from scb.errors import UserError
     from scb.runs import write_json
@@ -308,7 +309,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     out.parent.mkdir(parents=True, exist_ok=True)
     write_json(out, report)
     (arguments.docs / "understanding.md").write_text(markdown(report))
-    figures.save(figure, arguments.docs / "figures" / "understanding.png")
+    plotting.save(figure, arguments.docs / "figures" / "understanding.png")
     return 0
 
 

@@ -481,7 +481,7 @@ def figure(report: Mapping[str, Any]) -> "Figure":
     from matplotlib.lines import Line2D
     from matplotlib.ticker import MaxNLocator
 
-    from lpo import figures
+    from scb import plotting
     from scb.errors import UserError
 
     entries = report["entries"]
@@ -489,7 +489,7 @@ def figure(report: Mapping[str, Any]) -> "Figure":
         raise UserError("nothing has been measured yet: there is no figure to draw.")
     pairs = _pairs(entries)
     environments = list(dict.fromkeys(environment for environment, _ in pairs))
-    looks = {"ours": (figures.VERMILLION, "o"), "published": (figures.BLUE, "s")}
+    looks = {"ours": (plotting.VERMILLION, "o"), "published": (plotting.BLUE, "s")}
     offsets = {
         (kind, actions): offset
         for (kind, actions), offset in zip(
@@ -500,8 +500,8 @@ def figure(report: Mapping[str, Any]) -> "Figure":
     }
     columns = min(2, len(environments))
     rows = math.ceil(len(environments) / columns)
-    with figures.figure_style():
-        drawn = Figure(figsize=(figures.WIDTH, 2.1 * rows + 1.1))
+    with plotting.figure_style():
+        drawn = Figure(figsize=(plotting.WIDTH, 2.1 * rows + 1.1))
         grid = drawn.subplots(rows, columns, squeeze=False).flat
         for panel, (axes, environment) in enumerate(zip(grid, environments, strict=False)):
             algorithms = [a for e, a in pairs if e == environment]
@@ -528,7 +528,7 @@ def figure(report: Mapping[str, Any]) -> "Figure":
                     )
             expert = _paper_expert(environment)
             if expert is not None:
-                axes.axvline(expert, color=figures.BLACK, linewidth=1.4, linestyle=":")
+                axes.axvline(expert, color=plotting.BLACK, linewidth=1.4, linestyle=":")
             axes.set_yticks(range(len(algorithms)), [a.upper() for a in algorithms])
             axes.set_ylim(len(algorithms) - 0.5, -0.5)
             axes.tick_params(axis="y", length=0)
@@ -556,14 +556,14 @@ def figure(report: Mapping[str, Any]) -> "Figure":
         ]
         names = [f"{kind}, {text}" for kind in kinds for text in ACTIONS.values()]
         if any(_paper_expert(environment) is not None for environment in environments):
-            handles.append(Line2D([], [], color=figures.BLACK, linewidth=1.4, linestyle=":"))
+            handles.append(Line2D([], [], color=plotting.BLACK, linewidth=1.4, linestyle=":"))
             names.append("SAC trained on the environment (paper)")
         agents = " or ".join(str(n) for n in sorted({entry["agents"] for entry in entries}))
-        figures._title(
+        plotting.figure_title(
             drawn,
             f"Agents trained in a bandit, in its environment: IQM of {agents} agents, 95 % intervals",
         )
-        figures._legend_below(drawn, (handles, names), columns=3)
+        plotting.legend_below(drawn, (handles, names), columns=3)
     return drawn
 
 
@@ -582,11 +582,11 @@ def _panel_title(environment: str, entries: Sequence[Mapping[str, Any]]) -> str:
 
 def render(report: Mapping[str, Any], docs: Path) -> None:
     """Writes docs/zoo_table.md and docs/figures/zoo_table.png."""
-    from lpo import figures
+    from scb import plotting
 
     docs.mkdir(parents=True, exist_ok=True)
     (docs / "zoo_table.md").write_text(markdown(report))
-    figures.save(figure(report), docs / "figures" / "zoo_table.png")
+    plotting.save(figure(report), docs / "figures" / "zoo_table.png")
 
 
 def command_text(arguments: argparse.Namespace, published: bool) -> str:

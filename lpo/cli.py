@@ -74,11 +74,13 @@ def _lpo_commands() -> dict[str, Any]:
 
 def _scb_commands() -> dict[str, Any]:
     from scb import commands
+    from scb.analysis.explain import explain_command
     from scb.importer import import_published_command
 
     return {
         "discover": commands.discover_command,
         "train": commands.train,
+        "explain": explain_command,
         "list": commands.list_command,
         "import-published": import_published_command,
     }

@@ -34,6 +34,7 @@ from lpo.pipeline import PRESETS as RUN_PRESETS
 from lpo.pipeline import check_settings, meta_training_artefact, run_pipeline
 from lpo.suite import run_suite
 from lpo.suite import suite as suite_environments
+from scb import plotting
 from scb.artefacts import machine_description, package_versions
 from scb.environments.zoo import home_of
 from scb.errors import UserError
@@ -224,7 +225,7 @@ def learn_objective(
         chosen_mean(config, outcome),
         meta_training_artefact(problem, outcome, settings, command_of("lpo", settings)),
     )
-    figures.save(
+    plotting.save(
         figures.meta_training_curve(
             outcome.metrics,
             ", ".join(config.tasks),
@@ -497,7 +498,7 @@ def _evaluate_suite(
             out / "suite.json",
             {**settings, **scores.as_dict(), "versions": package_versions()},
         )
-        figures.save(figures.suite_scores(scores), out / "suite.png")
+        plotting.save(figures.suite_scores(scores), out / "suite.png")
 
 
 def _stored_comparisons(
@@ -601,7 +602,7 @@ def align(
     console.print(table)
     if out is not None:
         write_json(out / "alignment.json", report)
-        figures.save(figures.alignment_heatmap(report), out / "alignment.png")
+        plotting.save(figures.alignment_heatmap(report), out / "alignment.png")
 
 
 def distill_command(
@@ -703,4 +704,4 @@ def _make_folder(out: Path) -> None:
 
 def _write_comparison(out: Path, comparison: Comparison) -> None:
     write_json(out / "comparison.json", {**comparison.as_dict(), "versions": package_versions()})
-    figures.save(figures.learning_curves(comparison.curves), out / "curves.png")
+    plotting.save(figures.learning_curves(comparison.curves), out / "curves.png")

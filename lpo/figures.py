@@ -6,15 +6,11 @@ Ito (2008), which stay apart for colour-blind readers; line style and marker say
 a grey print.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
-from pathlib import Path
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
-import matplotlib.style
 import numpy as np
 from matplotlib import colormaps
 from matplotlib.artist import Artist
@@ -29,20 +25,28 @@ from numpy.typing import NDArray
 
 from lpo.understanding import CLIP, REGIONS, analyze, is_temporal
 from scb.errors import UserError
+from scb.plotting import (
+    BLACK,
+    BLUE,
+    GREEN,
+    GREY,
+    ORANGE,
+    PURPLE,
+    SKY_BLUE,
+    VERMILLION,
+    WIDTH,
+    Look,
+    figure_style,
+    figure_title,
+    legend_below,
+)
 from scb.statistics import estimate, iqm
 
 if TYPE_CHECKING:
     from lpo.generalization import LearningCurves
     from lpo.objectives import Objective
     from lpo.suite import SuiteScores
-    from scb.statistics import Estimate
 
-BLACK, ORANGE, SKY_BLUE, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"
-BLUE, VERMILLION, PURPLE = "#0072B2", "#D55E00", "#CC79A7"
-GREY = "#555555"
-
-WIDTH = 9.0  # inches; a page shows them at about 100 px an inch, so 10 pt are 14 px
-DPI = 200
 RATIOS = (0.4, 1.8)
 ADVANTAGES = (-3.0, 3.0)
 # Of `lpo.understanding.REGIONS`. What stops or turns an update is dark, what leaves it alone is pale.
@@ -57,36 +61,6 @@ _REGION_COLORS = {
 }
 # Below this a penalty or a gradient is drawn as none: rounding of 32-bit floats, or a dead zone.
 NEGLIGIBLE = 1e-3
-
-_STYLE: dict[str, Any] = {
-    "axes.axisbelow": True,
-    "axes.grid": True,
-    "axes.spines.right": False,
-    "axes.spines.top": False,
-    "axes.titlelocation": "left",
-    "axes.titlesize": 11,
-    "axes.titleweight": "bold",
-    "figure.constrained_layout.use": True,
-    "figure.facecolor": "white",
-    "font.size": 10,
-    "grid.color": "#DDDDDD",
-    "grid.linewidth": 0.6,
-    "hatch.linewidth": 0.7,
-    "legend.frameon": False,
-    "legend.handlelength": 3.0,
-    "lines.linewidth": 1.8,
-    "lines.markersize": 5.0,
-    "savefig.dpi": DPI,
-}
-
-
-@dataclass(frozen=True)
-class Look:
-    """How an objective is drawn, in every figure."""
-
-    color: str
-    linestyle: Any
-    marker: str
 
 
 _LOOKS: dict[str, Look] = {
@@ -198,12 +172,12 @@ def meta_training_curve(
             top.xaxis.set_major_formatter(EngFormatter(sep=""))
             top.set_xlabel("environment steps of the population (training + evaluation)")
         size = "" if population_size is None else f", population of {population_size}"
-        _title(figure, f"Meta-training on {environment}{size}")
+        figure_title(figure, f"Meta-training on {environment}{size}")
         handles, labels = axes.get_legend_handles_labels()
         if judged and judging is not axes:
             of_mean = judging.get_legend_handles_labels()
             handles, labels = handles + of_mean[0], labels + of_mean[1]
-        _legend_below(figure, (handles, labels), columns=2)
+        legend_below(figure, (handles, labels), columns=2)
     return figure
 
 
@@ -277,8 +251,8 @@ def environment_steps(
         axes.grid(axis="y", visible=False)
         axes.xaxis.set_minor_formatter(NullFormatter())
         axes.set_xlabel("environment steps of the whole meta-training (logarithmic)")
-        _title(figure, "Cost of meta-training in environment steps")
-        _legend_below(figure, axes.get_legend_handles_labels(), columns=2)
+        figure_title(figure, "Cost of meta-training in environment steps")
+        legend_below(figure, axes.get_legend_handles_labels(), columns=2)
     return figure
 
 
@@ -330,7 +304,7 @@ def learning_curves(curves: "Sequence[LearningCurves]") -> Figure:
         final.set_ylabel("final return")
         final.set_title("At the end: each seed a dot", fontsize=10, weight="normal")
         seeds = "1 seed" if counts == [1] else f"n = {' and '.join(map(str, counts))} seeds"
-        _title(figure, f"{_protocol(first)}, {seeds}")
+        figure_title(figure, f"{_protocol(first)}, {seeds}")
         # Under its own panel, beside the names on the right; constrained layout keeps its room.
         training.legend(loc="upper center", bbox_to_anchor=(0.5, -0.17), ncols=min(len(curves), 3))
     return figure
@@ -433,8 +407,10 @@ def drift_heatmaps(objectives: "Sequence[Objective]", progress: float = 0.5) -> 
         if turns_back:
             handles.append(Patch(facecolor="white", edgecolor="black", hatch="////", linewidth=0.8))
             names.append("update moves the policy back")
-        _title(figure, "Drift (top) and the direction in which it lets the policy move (bottom)")
-        _legend_below(figure, (handles, names), columns=3)
+        figure_title(
+            figure, "Drift (top) and the direction in which it lets the policy move (bottom)"
+        )
+        legend_below(figure, (handles, names), columns=3)
     return figure
 
 
@@ -506,7 +482,7 @@ def suite_scores(scores: "SuiteScores") -> Figure:
         aggregate.set_xlabel("normalised score")
         aggregate.set_title("Interquartile mean, 95 %", fontsize=10, weight="normal")
         environments, seeds = scores.scores.shape[1:]
-        _title(figure, f"{environments} environments, {seeds} seeds each")
+        figure_title(figure, f"{environments} environments, {seeds} seeds each")
         profile.legend(
             loc="upper center", bbox_to_anchor=(0.5, -0.17), ncols=min(len(scores.objectives), 4)
         )
@@ -554,7 +530,7 @@ def alignment_heatmap(report: Mapping[str, Any]) -> Figure:
         bar = figure.colorbar(image, ax=axes)
         bar.set_label("Spearman's correlation over objectives")
         number = len(report["outcome_iqm"])
-        _title(
+        figure_title(
             figure,
             f"How the bandit's fitness ranks {number} objectives, against {report['environment']} "
             f"(n = {report['agents']} agents each, 95 % intervals)",
@@ -647,8 +623,8 @@ def drift_and_gradient(
             )
         # The third column has its legend where the others have their scales.
         shown = [i for i in range(len(names)) if any((a.regions == i).any() for _, a in rows)]
-        _title(figure, "What a drift charges, and what it does to the update")
-        _legend_below(
+        figure_title(figure, "What a drift charges, and what it does to the update")
+        legend_below(
             figure,
             (
                 [
@@ -661,15 +637,6 @@ def drift_and_gradient(
             columns=4,
         )
     return figure
-
-
-def save(figure: Figure, path: str | Path) -> Path:
-    """Writes a PNG whose bytes depend on the figure alone: no date, no version in its metadata."""
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with figure_style():
-        figure.savefig(path, format="png", dpi=DPI, metadata={"Software": None})
-    return path
 
 
 def ratio_text(bandit: float, environment: float) -> str:
@@ -686,30 +653,6 @@ def ratio_text(bandit: float, environment: float) -> str:
 def thousands(x: float) -> str:
     """A count with its digits in groups of three, which no line break parts."""
     return f"{x:,.0f}".replace(",", "\N{NARROW NO-BREAK SPACE}")
-
-
-def estimate_row(
-    axes: Axes, position: float, values: NDArray[np.floating], found: "Estimate", color: str
-) -> None:
-    """On one line of a horizontal plot: the estimate with its interval, and behind it each value a dot."""
-    axes.plot(values, np.full(values.size, position), ".", color=color, alpha=0.25)
-    ends = [found.value if end is None else end for end in (found.low, found.high)]
-    axes.errorbar(
-        found.value,
-        position,
-        xerr=np.abs(np.subtract(ends, found.value))[:, None],
-        fmt="o",
-        color=color,
-        capsize=3,
-    )
-
-
-@contextmanager
-def figure_style() -> Iterator[None]:
-    """The context in which every figure of the project is drawn."""
-    # "default" first: a reader's own matplotlibrc must not change the figures of a run.
-    with matplotlib.style.context(["default", _STYLE]):
-        yield
 
 
 class _Scale:
@@ -805,12 +748,3 @@ def _column(metrics: list[dict[str, Any]], name: str) -> NDArray[np.floating]:
 
 def _count(steps: float) -> str:
     return EngFormatter(places=None if steps < 1000 else 1, sep="\N{THIN SPACE}")(steps)
-
-
-def _title(figure: Figure, text: str) -> None:
-    figure.suptitle(text, x=0.01, ha="left", fontsize=11, fontweight="bold")
-
-
-def _legend_below(figure: Figure, entries: tuple[list[Any], list[Any]], columns: int) -> None:
-    # Outside the axes, where it can cover no data.
-    figure.legend(*entries, loc="outside lower center", ncols=columns, columnspacing=1.5)

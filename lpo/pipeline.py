@@ -23,6 +23,7 @@ from lpo.generalization import (
 )
 from lpo.meta_training import VALIDATION_AGENTS, MetaTraining, MetaTrainingConfig, chosen_mean
 from lpo.objectives import Objective, load_objective, save_objective
+from scb import plotting
 from scb.artefacts import machine_description, package_versions
 from scb.environments.registry import make
 from scb.environments.synthetic import SyntheticBandit
@@ -318,5 +319,5 @@ def _figures(
     for name, figure in drawn.items():
         paths[name] = folder / "figures" / f"{name.replace('/', '-')}.png"
         paths[name].parent.mkdir(exist_ok=True)
-        figures.save(figure, paths[name])
+        plotting.save(figure, paths[name])
     return paths

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from experiments import lpo_on_bandits as module
-from lpo import figures
+from scb import plotting
 
 DOCS = Path(__file__).parents[2] / "docs"
 
@@ -106,7 +106,7 @@ def test_the_page_says_costs_returns_and_differences(report, tmp_path):
     assert "| LPO (bandit) | −200 [" in page
     assert "| +650 [" in page
     assert "The tuned clip, chosen on other agents, is ppo-0.5." in page
-    path = figures.save(module.draw(report), tmp_path / "figure.png")
+    path = plotting.save(module.draw(report), tmp_path / "figure.png")
     assert path.stat().st_size > 20_000
 
 

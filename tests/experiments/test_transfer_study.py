@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from experiments import transfer_study as module
-from lpo import figures
 from lpo.commands import meta_training_config
+from scb import plotting
 
 DOCS = Path(__file__).parents[2] / "docs"
 
@@ -53,7 +53,7 @@ def test_the_page_says_returns_and_differences_that_exclude_zero(report, tmp_pat
     assert row.count("(−500)") == 3
     assert row.endswith("| 1.5 |")
     assert "- no reward noise: `lpo meta-train --reward-noise=0.0`" in page
-    path = figures.save(module.draw(report), tmp_path / "figure.png")
+    path = plotting.save(module.draw(report), tmp_path / "figure.png")
     assert path.stat().st_size > 20_000
 
 

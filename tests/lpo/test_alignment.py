@@ -18,6 +18,7 @@ from lpo.alignment import (
     regime_fitness,
 )
 from lpo.generalization import training_setting
+from scb import plotting
 from scb.errors import UserError
 
 TINY = Regime(reward_noise=0.0, contexts=10, iterations=4, epochs=1, minibatches=1)
@@ -146,5 +147,5 @@ def test_the_report_holds_every_regime_and_is_drawn(monkeypatch, tmp_path):
     aligned, flat = (row["alignment"]["transfer"]["spearman"] for row in report["regimes"])
     assert (aligned, flat) == (1.0, None)
     assert len(told) == 3
-    path = figures.save(figures.alignment_heatmap(report), tmp_path / "alignment.png")
+    path = plotting.save(figures.alignment_heatmap(report), tmp_path / "alignment.png")
     assert path.stat().st_size > 5000

@@ -15,6 +15,7 @@ from matplotlib.collections import FillBetweenPolyCollection, QuadMesh
 from lpo import figures
 from lpo.generalization import LearningCurves
 from lpo.objectives import Objective, load_objective
+from scb import plotting
 from scb.errors import UserError
 from scb.statistics import estimate, iqm
 
@@ -315,13 +316,13 @@ def test_figures_leave_the_global_state_alone():
 
 
 def test_a_saved_figure_depends_on_its_data_alone(tmp_path: Path):
-    first = figures.save(figures.learning_curves([curve()]), tmp_path / "made" / "first.png")
+    first = plotting.save(figures.learning_curves([curve()]), tmp_path / "made" / "first.png")
     with matplotlib.rc_context({"font.size": 20, "lines.linewidth": 9, "axes.facecolor": "red"}):
-        second = figures.save(figures.learning_curves([curve()]), tmp_path / "second.png")
+        second = plotting.save(figures.learning_curves([curve()]), tmp_path / "second.png")
     assert first.read_bytes() == second.read_bytes()
     for chunk in (b"tEXt", b"iTXt", b"tIME"):
         assert chunk not in first.read_bytes()
-    other = figures.save(figures.learning_curves([curve("dpo")]), tmp_path / "other.png")
+    other = plotting.save(figures.learning_curves([curve("dpo")]), tmp_path / "other.png")
     assert other.read_bytes() != first.read_bytes()
 
 

@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from lpo import figures, report
+from lpo import report
 from lpo.generalization import Comparison, LearningCurves
+from scb import plotting
 from scb.errors import UserError
 
 VOID = {"meta", "link", "img", "br", "hr"}
@@ -124,7 +125,7 @@ def results(**changes: Any) -> dict[str, Any]:
 
 @pytest.fixture
 def picture(tmp_path: Path) -> Path:
-    return figures.save(Figure(figsize=(1, 1)), tmp_path / "picture.png")
+    return plotting.save(Figure(figsize=(1, 1)), tmp_path / "picture.png")
 
 
 def write(folder: Path, made: dict[str, Any] | None = None, **shown: Path) -> Page:

@@ -9,6 +9,7 @@ from lpo import commands, figures, suite
 from lpo.generalization import Comparison, LearningCurves
 from lpo.objectives import load_objective
 from lpo.suite import RESAMPLES, SUITES, SuiteScores, random_return, run_suite, suite_scores
+from scb import plotting
 from scb.environments.registry import environment_names, make
 from scb.errors import UserError
 
@@ -173,4 +174,4 @@ def test_a_suite_and_an_environment_do_not_go_together():
 
 def test_scores_are_drawn(tmp_path):
     scores = scores_of(np.random.default_rng(0).uniform(0.0, 1.2, (2, 5, 10)))
-    assert figures.save(figures.suite_scores(scores), tmp_path / "x.png").stat().st_size > 10_000
+    assert plotting.save(figures.suite_scores(scores), tmp_path / "x.png").stat().st_size > 10_000

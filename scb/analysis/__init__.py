@@ -1,0 +1,1 @@
+"""What a bandit knows about its environment: optimal actions, importance of observations, states."""

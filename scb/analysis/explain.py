@@ -1,0 +1,139 @@
+"""`scb explain`: what a bandit says about its environment, as one figure and one JSON file."""
+
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from gymnax.environments import environment, spaces
+from rich.console import Console
+
+from scb.analysis.importance import reward_variance
+from scb.analysis.optimal_actions import optimal_actions, optimal_policy
+from scb.analysis.planes import observation_names, plane_for
+from scb.analysis.states import bandit_states, follow
+from scb.discovery import check_fits
+from scb.environments.registry import make
+from scb.environments.synthetic import SyntheticBandit
+from scb.environments.zoo import PREFIX, open_bandit
+from scb.errors import UserError
+from scb.runs import write_json
+from scb.statistics import estimate
+
+STATES = 2000  # of either distribution, as in the paper
+
+
+def explain(
+    bandit: SyntheticBandit,
+    env: environment.Environment[Any, Any],
+    env_params: Any,
+    environment_name: str,
+    episodes: int = 20,
+    seed: int = 0,
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """What a bandit knows, in numbers and as `scb.analysis.figures.explained` draws it.
+
+    Args:
+      bandit: with weights of its own.
+      env, env_params: the evaluation environment, where the bandit's optimal policy acts.
+      environment_name: its name.
+      episodes: of the optimal policy.
+      seed: decides episodes, contexts and what is varied.
+
+    Returns:
+      (numbers for JSON, parts for the figure).
+    """
+    key_context, key_vary, key_episode = jax.random.split(jax.random.key(seed), 3)
+    space = bandit.action_space()
+    contexts = bandit_states(bandit, key_context, STATES)
+    importance = np.asarray(reward_variance(bandit, jnp.asarray(contexts), key_vary))
+    names = observation_names(environment_name, bandit.observation_size)
+    trajectories = follow(env, env_params, optimal_policy(bandit), key_episode, episodes)
+    earned = estimate(trajectories.returns())
+    best = jax.jit(jax.vmap(optimal_actions(bandit)))
+    discrete = isinstance(space, spaces.Discrete)
+    first = 0 if discrete else np.ravel(np.broadcast_to(space.low, space.shape))[0]
+    last = 0 if discrete else np.ravel(np.broadcast_to(space.high, space.shape))[0]
+
+    def drawn(observations: np.ndarray) -> np.ndarray:
+        actions = np.asarray(best(jnp.asarray(observations)))
+        return actions.reshape(len(observations), -1)[:, 0]
+
+    visited = trajectories.states()
+    returns = trajectories.returns()
+    usual = int(np.argsort(returns)[len(returns) // 2])  # the episode to draw: of median return
+    numbers = {
+        "bandit": bandit.name,
+        "environment": environment_name,
+        "episodes": episodes,
+        "seed": seed,
+        "return_of_optimal_policy": earned.as_dict(),
+        "importance": {n: round(float(x), 4) for n, x in zip(names, importance, strict=True)},
+        "context_std": dict(zip(names, np.round(contexts.std(0), 4).tolist(), strict=True)),
+        "visited_std": dict(zip(names, np.round(visited.std(0), 4).tolist(), strict=True)),
+    }
+    if bandit.observation_size < 2:
+        return numbers, {}
+    several = not discrete and bandit.num_actions > 1
+    everything = np.concatenate([contexts, visited[:: max(1, len(visited) // STATES)]])
+    parts = {
+        "name": bandit.name,
+        "summary": f"its optimal policy earns {earned} in {environment_name}",
+        "plane": plane_for(environment_name, everything, importance.tolist()),
+        "best": drawn,
+        "num_actions": int(space.n) if discrete else None,
+        "bounds": None if discrete else (float(first), float(last)),
+        "episode": trajectories.observations[usual][trajectories.active[usual]],
+        "contexts": contexts,
+        "visited": visited[:: max(1, len(visited) // STATES)],
+        "names": names,
+        "importance": importance.tolist(),
+        "action": "action" + (" (first dimension)" if several else ""),
+    }
+    return numbers, parts
+
+
+def explain_command(
+    bandit: str = "Synthetic-Pendulum-v1",
+    out: Path | None = None,
+    evaluation_environment: str | None = None,
+    backend: str | None = None,
+    episodes: int = 20,
+    seed: int = 0,
+) -> None:
+    """Show what a bandit knows: its best actions, its states, and what its reward depends on.
+
+    Args:
+      bandit: a zoo name such as Synthetic-Pendulum-v1, or path.npz.
+      out: folder for explain.png and explain.json; runs/explain/NAME where left out.
+      evaluation_environment: where the bandit's optimal policy acts; the bandit's own where left out.
+      backend: Brax's physics: generalized, positional or spring.
+      episodes: of the optimal policy.
+      seed: decides everything.
+    """
+    from scb import plotting
+    from scb.analysis import figures
+
+    if episodes < 1:
+        raise UserError(f"episodes is {episodes}: give at least 1.")
+    if seed < 0:
+        raise UserError(f"seed is {seed}: it must be 0 or larger.")
+    loaded = open_bandit(bandit)
+    target = evaluation_environment or loaded.name.removeprefix(PREFIX)
+    env, env_params = make(target, **({} if backend is None else {"backend": backend}))
+    check_fits(loaded, env, env_params, target)
+    folder = Path("runs") / "explain" / loaded.name if out is None else out
+    numbers, parts = explain(loaded, env, env_params, target, episodes, seed)
+    folder.mkdir(parents=True, exist_ok=True)
+    write_json(folder / "explain.json", numbers)
+    console = Console()
+    earned = numbers["return_of_optimal_policy"]
+    console.print(
+        f"The bandit's optimal policy earns {earned['value']:.1f} in {target} ({episodes} episodes)."
+    )
+    for name, share in sorted(numbers["importance"].items(), key=lambda item: -item[1]):
+        console.print(f"  {share:6.1%} of the reward's variance: {name}")
+    if parts:
+        plotting.save(figures.explained(parts), folder / "explain.png")
+    console.print(f"written to {folder}", soft_wrap=True)

@@ -1,0 +1,114 @@
+"""Figures of what a bandit knows about its environment."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import ListedColormap
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from scb import plotting
+from scb.analysis.planes import Plane
+
+POINTS = 80  # of a plane's grid in either direction
+# Discrete actions, in order; they stay apart for colour-blind readers and in grey.
+_DISCRETE = ("#D9F0D3", "#FFFFFF", "#C2A5CF", "#F1A340")
+
+
+def action_map(
+    axes: Axes,
+    plane: Plane,
+    best: Callable[[NDArray[np.floating]], NDArray[Any]],
+    num_actions: int | None,
+    bounds: tuple[float, float] | None = None,
+) -> Any:
+    """The best action over a plane, as the background of an axes.
+
+    Args:
+      best: [N, O] observations -> [N] actions; of several dimensions, the one to draw.
+      num_actions: of a discrete space; None for continuous actions.
+      bounds: of continuous actions.
+
+    Returns:
+      What a colour bar is made from.
+    """
+    x, y, observations = plane.grid(POINTS)
+    actions = np.reshape(best(observations), (POINTS, POINTS))
+    low, high = (-0.5, num_actions - 0.5) if num_actions else (bounds or (None, None))
+    colors: Any = ListedColormap(_DISCRETE[:num_actions]) if num_actions else "PuOr"
+    if num_actions and num_actions > len(_DISCRETE):
+        colors = "tab20"
+    axes.grid(False)
+    axes.set_xlabel(plane.labels[0])
+    axes.set_ylabel(plane.labels[1])
+    axes.set_xlim(*plane.limits[0])
+    axes.set_ylim(*plane.limits[1])
+    return axes.pcolormesh(
+        x, y, actions, cmap=colors, vmin=low, vmax=high, shading="nearest", rasterized=True
+    )
+
+
+def importance_bars(
+    axes: Axes, names: Sequence[str], importance: Sequence[float], color: str = plotting.BLUE
+) -> None:
+    """The share of the reward's variance that each observation entry causes."""
+    positions = np.arange(len(names))
+    axes.barh(positions, importance, color=color)
+    axes.set_yticks(positions, list(names))
+    axes.invert_yaxis()
+    axes.set_xlim(left=0.0)
+    axes.set_xlabel("share of the reward's variance")
+
+
+def draw_trajectory(axes: Axes, plane: Plane, states: NDArray[np.floating]) -> None:
+    """[T, O] states of one episode as a black line, its end a cross; a jump in the angle is no line."""
+    points = plane.project(states).astype(float)
+    widths = np.ptp(np.asarray(plane.limits), axis=1)
+    jumps = np.any(np.abs(np.diff(points, axis=0)) > 0.5 * widths, axis=1)
+    line = np.insert(points, np.flatnonzero(jumps) + 1, np.nan, axis=0)
+    axes.plot(*line.T, color=plotting.BLACK, linewidth=1.2, label="an episode in the environment")
+    axes.plot(*points[-1], "x", color=plotting.BLACK, markersize=8, label="its end", linestyle="")
+
+
+def explained(parts: Mapping[str, Any]) -> Figure:
+    """Optimal actions with an episode, states of bandit and environment, and importance, side by side.
+
+    Args:
+      parts: "name", "environment", "plane", "best", "num_actions", "bounds", "episode" [T, O],
+        "contexts" [N, O], "visited" [N, O], "names", "importance", "action" (its name).
+    """
+    plane: Plane = parts["plane"]
+    with plotting.figure_style():
+        figure = Figure(figsize=(12.0, 4.0))
+        actions, states, bars = figure.subplots(1, 3)
+        drawn = action_map(actions, plane, parts["best"], parts["num_actions"], parts["bounds"])
+        bar = figure.colorbar(drawn, ax=actions, label=parts["action"])
+        if parts["num_actions"]:
+            bar.set_ticks(range(parts["num_actions"]))
+        draw_trajectory(actions, plane, parts["episode"])
+        actions.legend(loc="upper right", fontsize=7, frameon=True)
+        actions.set_title("the bandit's best action", fontsize=10)
+        for name, color, marker in (
+            ("contexts", plotting.SKY_BLUE, "."),
+            ("visited", plotting.VERMILLION, "."),
+        ):
+            label = {
+                "contexts": "contexts of the bandit",
+                "visited": "visited by its optimal policy",
+            }[name]
+            points = plane.project(parts[name])
+            states.plot(*points.T, marker, markersize=2, alpha=0.4, color=color, label=label)
+        states.set_xlim(*plane.limits[0])
+        states.set_ylim(*plane.limits[1])
+        states.set_xlabel(plane.labels[0])
+        states.set_ylabel(plane.labels[1])
+        states.set_title("states", fontsize=10)
+        legend = states.legend(loc="upper right", fontsize=7, frameon=True)
+        for handle in legend.legend_handles:
+            handle.set_alpha(1.0)
+        importance_bars(bars, parts["names"], parts["importance"])
+        bars.set_title("what the reward depends on", fontsize=10)
+        plotting.figure_title(figure, f"{parts['name']}: {parts['summary']}")
+    return figure

@@ -1,0 +1,57 @@
+"""How much of a bandit's reward depends on each entry of the observation."""
+
+import jax
+import jax.numpy as jnp
+
+from scb.environments.synthetic import BanditParams, SyntheticBandit
+
+
+def reward_variance(
+    bandit: SyntheticBandit,
+    observations: jax.Array,
+    key: jax.Array,
+    params: BanditParams | None = None,
+    num_values: int = 32,
+) -> jax.Array:
+    """The share of the reward's variance that one observation entry causes, alone or with others.
+
+    Observation and action are fixed but for one entry, which takes other observations' values; the
+    variance of the reward, averaged over observations and uniform actions, is divided by its
+    variance over everything. That is Sobol's total-effect index where entries are independent: 0 for
+    an entry that the reward ignores, and the entries' sum exceeds 1 where they interact.
+
+    Args:
+      bandit: whose noiseless reward is examined.
+      observations: [N, O]; also where an entry's other values come from.
+      key: decides actions and values.
+      params: the bandit's parameters; its own where None.
+      num_values: that an entry takes in each observation.
+
+    Returns:
+      [O] non-negative.
+    """
+    params = bandit.default_params if params is None else params
+    number, size = observations.shape
+    key_action, key_value = jax.random.split(key)
+    actions = jax.vmap(bandit.action_space().sample)(jax.random.split(key_action, number))
+    reward = jax.vmap(bandit.mean_reward, in_axes=(0, 0, None))
+    picked = jax.random.randint(key_value, (number, num_values), 0, number)
+
+    @jax.jit
+    def entry_variance(entry: jax.Array) -> jax.Array:
+        def varied(value: jax.Array) -> jax.Array:
+            return reward(observations.at[:, entry].set(value), actions, params)
+
+        rewards = jax.vmap(varied, in_axes=1)(observations[picked, entry])
+        return jnp.var(rewards, axis=0, ddof=1).mean()
+
+    shares = jax.lax.map(entry_variance, jnp.arange(size))
+    # Entries are drawn apart from each other in the numerator, and so they are here.
+    independent = jnp.stack(
+        [
+            observations[jax.random.permutation(k, number), i]
+            for i, k in enumerate(jax.random.split(key, size))
+        ],
+        axis=1,
+    )
+    return shares / (jnp.var(reward(independent, actions, params)) + 1e-12)

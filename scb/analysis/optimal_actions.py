@@ -1,0 +1,125 @@
+"""The best action of a bandit in a context, found without training anything.
+
+In a bandit the reward is the Q-function (Liesen et al., 2024, eq. 2), so the optimal policy is an
+argmax over actions: all of them where they are discrete, a grid or a gradient ascent where they are
+continuous.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from gymnax.environments import spaces
+
+from scb.agents.agent import clip_to_space
+from scb.environments.synthetic import BanditParams, SyntheticBandit
+from scb.errors import UserError, unknown_name
+from scb.evaluation import Policy
+
+METHODS = ("gradient", "grid")
+GRID_POINTS = 101  # in each dimension of the action
+LARGEST_GRID = 20_000
+STARTS, STEPS = 16, 64  # of the gradient ascent
+
+
+def optimal_actions(
+    bandit: SyntheticBandit, params: BanditParams | None = None, method: str = "gradient"
+) -> Callable[[jax.Array], jax.Array]:
+    """The bandit's optimal policy.
+
+    Args:
+      bandit: whose noiseless reward is maximised.
+      params: its parameters; its own where None.
+      method: for continuous actions. "gradient" climbs from 16 evenly spread actions and keeps the
+        best; "grid" tries 101 values in each dimension. Discrete actions are all tried.
+
+    Returns:
+      [O] context -> action within the bounds, of the action space's shape. To be jitted and vmapped
+      by the caller.
+
+    Raises:
+      UserError: an unknown method; a grid over more actions than 20 000.
+    """
+    if method not in METHODS:
+        raise unknown_name("method", method, METHODS)
+    params = bandit.default_params if params is None else params
+    space = bandit.action_space()
+    if isinstance(space, spaces.Discrete):
+        candidates = jnp.arange(space.n)
+    elif method == "grid":
+        candidates = _grid(space)
+    else:
+        return _ascent(bandit, params, space)
+
+    def best(context: jax.Array) -> jax.Array:
+        rewards = jax.vmap(bandit.mean_reward, in_axes=(None, 0, None))(context, candidates, params)
+        return candidates[jnp.argmax(rewards)]
+
+    return best
+
+
+def optimal_policy(
+    bandit: SyntheticBandit, params: BanditParams | None = None, method: str = "gradient"
+) -> Policy:
+    """`optimal_actions` as `scb.evaluation.evaluate` takes a policy: of unflattened observations, with a key."""
+    best = optimal_actions(bandit, params, method)
+    return lambda observation, key: best(jnp.ravel(observation))
+
+
+def _bounds(space: spaces.Box) -> tuple[np.ndarray, np.ndarray]:
+    """[A], [A] of the flattened action."""
+    low, high = (
+        np.ravel(np.broadcast_to(np.asarray(x, np.float32), space.shape))
+        for x in (space.low, space.high)
+    )
+    return low, high
+
+
+def _grid(space: spaces.Box) -> jax.Array:
+    """[N, ...] every combination of evenly spaced values."""
+    low, high = _bounds(space)
+    number = GRID_POINTS**low.size
+    if number > LARGEST_GRID:
+        raise UserError(
+            f"a grid of {GRID_POINTS} values over {low.size} action dimensions has {number:.0e} actions: "
+            "use the method gradient."
+        )
+    axes = np.meshgrid(*np.linspace(low, high, GRID_POINTS).T, indexing="ij")
+    return jnp.asarray(np.stack([x.ravel() for x in axes], axis=1).reshape(number, *space.shape))
+
+
+def _ascent(
+    bandit: SyntheticBandit, params: BanditParams, space: spaces.Box
+) -> Callable[[jax.Array], jax.Array]:
+    low, high = (jnp.asarray(x) for x in _bounds(space))
+    # The centre, and a Halton-like spread that is the same in every context.
+    spread = jax.random.uniform(jax.random.key(0), (STARTS - 1, low.size))
+    starts = low + (high - low) * jnp.concatenate([jnp.full((1, low.size), 0.5), spread])
+    # In units of the action's range, so that one step size suits every environment.
+    optimizer = optax.adam(optax.cosine_decay_schedule(0.1, STEPS))
+
+    def reward(unit: jax.Array, context: jax.Array) -> jax.Array:
+        action = jnp.reshape(low + (high - low) * unit, space.shape)
+        return bandit.mean_reward(context, action, params)
+
+    def climb(start: jax.Array, context: jax.Array) -> tuple[jax.Array, jax.Array]:
+        def step(carry: Any, _: None) -> Any:
+            unit, state = carry
+            gradient = jax.grad(reward)(unit, context)
+            updates, state = optimizer.update(-gradient, state)
+            return (jnp.clip(optax.apply_updates(unit, updates), 0.0, 1.0), state), None
+
+        (unit, _), _ = jax.lax.scan(step, (start, optimizer.init(start)), None, STEPS)
+        return unit, reward(unit, context)
+
+    units = (starts - low) / (high - low)
+
+    def best(context: jax.Array) -> jax.Array:
+        ends, rewards = jax.vmap(climb, in_axes=(0, None))(units, context)
+        action = low + (high - low) * ends[jnp.argmax(rewards)]
+        return clip_to_space(action, space)
+
+    return best

@@ -1,0 +1,91 @@
+"""States: those that a bandit shows, and those that a policy visits in an environment."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from gymnax.environments import environment
+
+from scb.environments.synthetic import BanditParams, SyntheticBandit
+
+
+class Trajectories(NamedTuple):
+    """Episodes side by side; `active` is False after an episode's end.
+
+    Attributes:
+      observations: [E, T, O] flattened, before each step.
+      actions: [E, T, ...].
+      rewards: [E, T].
+      active: [E, T].
+    """
+
+    observations: np.ndarray
+    actions: np.ndarray
+    rewards: np.ndarray
+    active: np.ndarray
+
+    def states(self) -> np.ndarray:
+        """[N, O] every visited observation."""
+        return self.observations[self.active]
+
+    def returns(self) -> np.ndarray:
+        """[E] undiscounted."""
+        return np.sum(self.rewards * self.active, axis=1)
+
+
+def bandit_states(
+    bandit: SyntheticBandit,
+    key: jax.Array,
+    number: int,
+    params: BanditParams | None = None,
+) -> np.ndarray:
+    """[number, O] contexts."""
+    params = bandit.default_params if params is None else params
+    contexts, _ = jax.vmap(bandit.reset_env, in_axes=(0, None))(
+        jax.random.split(key, number), params
+    )
+    return np.asarray(contexts)
+
+
+def follow(
+    env: environment.Environment[Any, Any],
+    env_params: Any,
+    policy: Callable[[jax.Array, jax.Array], jax.Array],
+    key: jax.Array,
+    num_episodes: int,
+    num_steps: int | None = None,
+) -> Trajectories:
+    """Episodes of a policy, every step of them recorded.
+
+    Args:
+      policy: (observation, key) -> action, for one environment.
+      num_steps: T, after which an episode is cut; None for the environment's own limit.
+    """
+    steps = int(env_params.max_steps_in_episode) if num_steps is None else num_steps
+
+    def episode(key: jax.Array) -> Any:
+        key_reset, key_steps = jax.random.split(key)
+        observation, state = env.reset_env(key_reset, env_params)
+
+        def step(carry: Any, key: jax.Array) -> Any:
+            observation, state, active = carry
+            key_act, key_step = jax.random.split(key)
+            action = policy(observation, key_act)
+            after, state, reward, terminated, _ = env.step_env(key_step, state, action, env_params)
+            ended = terminated | env.is_truncated(state, env_params)
+            record = (jnp.ravel(observation), action, jnp.reshape(reward, ()), active)
+            return (after, state, active & ~ended), record
+
+        start = (observation, state, jnp.bool_(True))
+        return jax.lax.scan(step, start, jax.random.split(key_steps, steps))[1]
+
+    records = jax.jit(jax.vmap(episode))(jax.random.split(key, num_episodes))
+    return Trajectories(*(np.asarray(x) for x in records))
+
+
+def pick(states: np.ndarray, number: int, seed: int = 0) -> np.ndarray:
+    """[number, O] of [N, O] states, without replacement where there are enough."""
+    rng = np.random.default_rng(seed)
+    return states[rng.choice(len(states), number, replace=len(states) < number)]

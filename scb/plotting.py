@@ -1,0 +1,100 @@
+"""What all figures of the project share: colours, style, estimates with their intervals, and how they are saved.
+
+Figures are `matplotlib.figure.Figure`s of their own: pyplot and its global state stay out, so they
+can be made in a library, a server or a test alike. Colours are those of Okabe and Ito (2008), which
+stay apart for colour-blind readers.
+"""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import matplotlib.style
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from scb.statistics import Estimate
+
+BLACK, ORANGE, SKY_BLUE, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"
+BLUE, VERMILLION, PURPLE = "#0072B2", "#D55E00", "#CC79A7"
+GREY = "#555555"
+
+WIDTH = 9.0  # inches; a page shows them at about 100 px an inch, so 10 pt are 14 px
+DPI = 200
+
+_STYLE: dict[str, Any] = {
+    "axes.axisbelow": True,
+    "axes.grid": True,
+    "axes.spines.right": False,
+    "axes.spines.top": False,
+    "axes.titlelocation": "left",
+    "axes.titlesize": 11,
+    "axes.titleweight": "bold",
+    "figure.constrained_layout.use": True,
+    "figure.facecolor": "white",
+    "font.size": 10,
+    "grid.color": "#DDDDDD",
+    "grid.linewidth": 0.6,
+    "hatch.linewidth": 0.7,
+    "legend.frameon": False,
+    "legend.handlelength": 3.0,
+    "lines.linewidth": 1.8,
+    "lines.markersize": 5.0,
+    "savefig.dpi": DPI,
+}
+
+
+@dataclass(frozen=True)
+class Look:
+    """How one thing is drawn wherever it appears; marker and line style tell it apart in grey too."""
+
+    color: str
+    linestyle: Any
+    marker: str
+
+
+def estimate_row(
+    axes: Axes, position: float, values: NDArray[np.floating], found: Estimate, color: str
+) -> None:
+    """On one line of a horizontal plot: the estimate with its interval, and behind it each value a dot."""
+    axes.plot(values, np.full(values.size, position), ".", color=color, alpha=0.25)
+    ends = [found.value if end is None else end for end in (found.low, found.high)]
+    axes.errorbar(
+        found.value,
+        position,
+        xerr=np.abs(np.subtract(ends, found.value))[:, None],
+        fmt="o",
+        color=color,
+        capsize=3,
+    )
+
+
+@contextmanager
+def figure_style() -> Iterator[None]:
+    """The context in which every figure of the project is drawn."""
+    # "default" first: a reader's own matplotlibrc must not change the figures of a run.
+    with matplotlib.style.context(["default", _STYLE]):
+        yield
+
+
+def figure_title(figure: Figure, text: str) -> None:
+    """The title of the whole figure, on the left."""
+    figure.suptitle(text, x=0.01, ha="left", fontsize=11, fontweight="bold")
+
+
+def legend_below(figure: Figure, entries: tuple[list[Any], list[Any]], columns: int) -> None:
+    """One legend for the whole figure, outside the axes, where it can cover no data."""
+    figure.legend(*entries, loc="outside lower center", ncols=columns, columnspacing=1.5)
+
+
+def save(figure: Figure, path: str | Path) -> Path:
+    """Writes a PNG whose bytes depend on the figure alone: no date, no version in its metadata."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with figure_style():
+        figure.savefig(path, format="png", dpi=DPI, metadata={"Software": None})
+    return path

@@ -1,0 +1,187 @@
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from gymnax.environments import spaces
+
+import scb
+from lpo.cli import scb_main
+from scb.analysis import figures
+from scb.analysis.importance import reward_variance
+from scb.analysis.optimal_actions import optimal_actions, optimal_policy
+from scb.analysis.planes import observation_names, plane_for
+from scb.analysis.states import bandit_states, follow, pick
+from scb.environments.synthetic import BanditConfig, SyntheticBandit
+from scb.environments.zoo import open_bandit
+from scb.errors import UserError
+from scb.evaluation import evaluate
+
+
+def tent(observation_size: int = 3, size: int = 1) -> SyntheticBandit:
+    """Its reward is -sum |a_i - x_0|, so the best action is x_0 within the bounds [-1, 1]."""
+    space = spaces.Box(-1.0, 1.0, (size,))
+    hidden = 2 * size
+    kernel = np.zeros((observation_size + size, hidden), np.float32)
+    for i in range(size):
+        kernel[0, 2 * i : 2 * i + 2] = (-1.0, 1.0)
+        kernel[observation_size + i, 2 * i : 2 * i + 2] = (1.0, -1.0)
+    bandit = SyntheticBandit(observation_size, space, BanditConfig(hidden, "relu"))
+    weights = bandit.init_weights(jax.random.key(0))
+    weights["reward"] = {
+        "Dense_0": {"kernel": kernel, "bias": np.zeros(hidden, np.float32)},
+        "Dense_1": {"kernel": -np.ones((hidden, 1), np.float32), "bias": np.zeros(1, np.float32)},
+    }
+    return SyntheticBandit(observation_size, space, bandit.config, weights, "tent")
+
+
+@pytest.mark.parametrize("method", ["gradient", "grid"])
+@pytest.mark.parametrize("size", [1, 2])
+def test_optimal_action_of_a_known_reward(method, size):
+    contexts = jnp.array([[-0.62, 5.0, 1.0], [0.0, 1.0, 1.0], [0.37, 0.0, 0.0], [3.0, 0.0, 0.0]])
+    best = jax.jit(jax.vmap(optimal_actions(tent(size=size), method=method)))(contexts)
+    expected = np.repeat([[-0.62], [0.0], [0.37], [1.0]], size, axis=1)
+    # Half a cell of the grid is 0.01.
+    np.testing.assert_allclose(best, expected, atol=0.011)
+
+
+def test_gradient_is_no_worse_than_the_grid_in_a_discovered_bandit():
+    bandit = open_bandit("Synthetic-Pendulum-v1")
+    contexts = jnp.asarray(bandit_states(bandit, jax.random.key(1), 200))
+    rewards = {
+        method: jax.vmap(bandit.mean_reward, in_axes=(0, 0, None))(
+            contexts,
+            jax.jit(jax.vmap(optimal_actions(bandit, method=method)))(contexts),
+            bandit.default_params,
+        )
+        for method in ("gradient", "grid")
+    }
+    spread = float(np.std(rewards["grid"]))
+    assert float(np.min(rewards["gradient"] - rewards["grid"])) > -0.02 * spread
+
+
+def test_discrete_optimum_is_the_argmax_over_all_actions():
+    bandit = open_bandit("Synthetic-Acrobot-v1")
+    contexts = jnp.asarray(bandit_states(bandit, jax.random.key(1), 50))
+    every = jax.vmap(
+        lambda a: jax.vmap(bandit.mean_reward, in_axes=(0, None, None))(
+            contexts, a, bandit.default_params
+        )
+    )(jnp.arange(3))
+    best = jax.vmap(optimal_actions(bandit))(contexts)
+    np.testing.assert_array_equal(best, np.argmax(every, axis=0))
+
+
+def test_a_grid_too_large_and_an_unknown_method_are_refused():
+    with pytest.raises(UserError, match="3 action dimensions"):
+        optimal_actions(tent(size=3), method="grid")
+    with pytest.raises(UserError, match="did you mean grid"):
+        optimal_actions(tent(), method="grids")
+
+
+def test_optimal_policy_of_a_shipped_bandit_balances_the_pole():
+    env, env_params = scb.make("CartPole-v1")
+    policy = optimal_policy(open_bandit("Synthetic-CartPole-v1"))
+    returns = jax.jit(lambda k: evaluate(env, env_params, policy, k, 8).returns)(jax.random.key(3))
+    assert float(jnp.median(returns)) == 500.0
+
+
+def test_reward_variance_is_zero_for_entries_that_the_reward_ignores():
+    observations = jax.random.normal(jax.random.key(0), (400, 3))
+    importance = reward_variance(tent(), observations, jax.random.key(1))
+    np.testing.assert_array_equal(importance[1:], 0.0)
+    # -|a - x| of independent uniform a in [-1, 1] and normal x: the share by simulation.
+    rng = np.random.default_rng(0)
+    a, x = rng.uniform(-1, 1, (20_000, 1)), rng.normal(size=(20_000, 64))
+    r = -np.abs(a - x)
+    assert float(importance[0]) == pytest.approx(r.var(axis=1).mean() / r.var(), abs=0.1)
+
+
+def test_follow_earns_what_evaluate_earns():
+    env, env_params = scb.make("CartPole-v1")
+
+    def policy(observation, key):
+        return (observation[2] > 0).astype(jnp.int32)
+
+    followed = follow(env, env_params, policy, jax.random.key(0), 64)
+    evaluated = evaluate(env, env_params, policy, jax.random.key(1), 64)
+    lengths = followed.active.sum(axis=1)
+    assert followed.active[:, 0].all() and not followed.active[:, -1].any()
+    np.testing.assert_array_equal(followed.returns(), lengths)
+    # Other start states, the same distribution: the policy falls after some forty steps.
+    assert np.mean(lengths) == pytest.approx(float(evaluated.lengths.mean()), rel=0.15)
+    assert followed.states().shape == (lengths.sum(), 4)
+    # A pole's first observation is within 0.05 of zero, as the environment says.
+    assert np.abs(followed.observations[:, 0]).max() <= 0.05
+
+
+def test_pick_repeats_only_where_it_must():
+    states = np.arange(10.0)[:, None]
+    assert len(np.unique(pick(states, 10))) == 10
+    assert pick(states, 25).shape == (25, 1)
+
+
+def test_pendulum_is_drawn_over_its_angle():
+    angles = np.linspace(-3, 3, 50)
+    states = np.stack([np.cos(angles), np.sin(angles), 2 * angles], axis=1)
+    plane = plane_for("Pendulum-v1", states)
+    np.testing.assert_allclose(plane.project(states)[:, 0], angles)
+    np.testing.assert_allclose(plane.embed(plane.project(states)), states, atol=1e-12)
+
+
+def test_a_plane_holds_the_less_important_entries_at_their_median():
+    states = np.random.default_rng(0).normal([1.0, 2.0, 3.0, 4.0], size=(500, 4))
+    plane = plane_for("CartPole-v1", states, importance=[0.1, 0.5, 0.2, 0.9])
+    assert plane.labels == ("velocity (m/s)", "angular velocity (rad/s)")
+    x, y, nodes = plane.grid(5)
+    assert nodes.shape == (25, 4)
+    np.testing.assert_allclose(nodes[:, 0], np.median(states[:, 0]), rtol=1e-6)
+    np.testing.assert_allclose(nodes[1, [1, 3]], [x[1], y[0]], rtol=1e-6)
+    with pytest.raises(UserError, match="two or more"):
+        plane_for("mine", states[:, :1])
+
+
+def test_unknown_environments_have_numbered_observations():
+    assert observation_names("mine", 2) == ("observation 0", "observation 1")
+    assert observation_names("CartPole-v1", 3)[0] == "observation 0"
+
+
+def test_a_jump_of_the_angle_is_not_drawn_as_a_line():
+    from matplotlib.figure import Figure
+
+    angles = np.array([3.0, 3.1, -3.1, -3.0])
+    states = np.stack([np.cos(angles), np.sin(angles), np.zeros(4)], axis=1)
+    plane = plane_for("Pendulum-v1", states + np.array([0, 0, 1.0]))
+    axes = Figure().subplots()
+    figures.draw_trajectory(axes, plane, states)
+    x = axes.lines[0].get_xdata()
+    assert len(x) == 5 and np.isnan(x[2])
+
+
+def test_explain_writes_what_it_found(tmp_path, capsys):
+    arguments = ["explain", "--bandit", "Synthetic-MountainCar-v0", "--episodes", "8"]
+    assert scb_main([*arguments, "--out", str(tmp_path / "a")]) == 0
+    numbers = json.loads((tmp_path / "a" / "explain.json").read_text())
+    # Random actions never reach the goal and earn -200.
+    assert numbers["return_of_optimal_policy"]["value"] > -150
+    assert set(numbers["importance"]) == {"position", "velocity"}
+    # A car is pushed the way it rolls.
+    assert numbers["importance"]["velocity"] > numbers["importance"]["position"]
+    assert (tmp_path / "a" / "explain.png").stat().st_size > 10_000
+    assert "of the reward's variance: velocity" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--bandit", "Synthetic-Pendulum"], "did you mean"),
+        (["--episodes", "0"], "episodes is 0"),
+        (["--seed", "-1"], "seed is -1"),
+        (["--evaluation-environment", "CartPole-v1"], "take the bandit of that environment"),
+    ],
+)
+def test_explain_refuses_what_makes_no_sense(arguments, said, capsys, tmp_path):
+    assert scb_main(["explain", "--out", str(tmp_path / "a"), *arguments]) == 2
+    assert said in capsys.readouterr().err
+    assert not (tmp_path / "a").exists()
