@@ -10,10 +10,10 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 PYTEST := $(BIN)/python -m pytest -q -n auto --dist loadfile --cov --cov-report=term --cov-fail-under=90
 
 .DEFAULT_GOAL := help
-.PHONY: help run test test-all lint format bench clean
+.PHONY: help run test test-all lint format bench experiments clean
 
 help: ## list the commands
-	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-9s %s\n", $$1, $$2 }' Makefile
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-11s %s\n", $$1, $$2 }' Makefile
 
 run: $(INSTALLED) ## learn an objective, train PPO with it, judge it: runs/quick/report.html
 	@$(BIN)/lpo run --preset quick $(if $(wildcard runs/quick/config.json),--resume,--out) runs/quick
@@ -35,6 +35,9 @@ format: $(INSTALLED) ## put every file into the project's format
 
 bench: $(INSTALLED) .venv-rejax/.installed ## train agents in the bandits beside rejax's: time and return
 	@$(BIN)/python -m experiments.benchmark --rejax-python .venv-rejax/bin/python
+
+experiments: $(INSTALLED) ## the paper's experiments, in minutes each: docs/experiments.md
+	@$(BIN)/python -m experiments --preset quick
 
 # rejax needs a gymnax that this project doesn't run on, so it gets an environment of its own.
 .venv-rejax/.installed: $(INSTALLED)

@@ -53,8 +53,11 @@ def explain(
     earned = estimate(trajectories.returns())
     best = jax.jit(jax.vmap(optimal_actions(bandit)))
     discrete = isinstance(space, spaces.Discrete)
-    first = 0 if discrete else np.ravel(np.broadcast_to(space.low, space.shape))[0]
-    last = 0 if discrete else np.ravel(np.broadcast_to(space.high, space.shape))[0]
+    first, last = (
+        (0, 0)
+        if discrete
+        else (_flat(space.low, space.shape)[0], _flat(space.high, space.shape)[0])
+    )
 
     def drawn(observations: np.ndarray) -> np.ndarray:
         actions = np.asarray(best(jnp.asarray(observations)))
@@ -77,10 +80,12 @@ def explain(
         return numbers, {}
     several = not discrete and bandit.num_actions > 1
     everything = np.concatenate([contexts, visited[:: max(1, len(visited) // STATES)]])
+    observed = env.observation_space(env_params)
+    box = (_flat(observed.low, observed.shape), _flat(observed.high, observed.shape))
     parts = {
         "name": bandit.name,
         "summary": f"its optimal policy earns {earned} in {environment_name}",
-        "plane": plane_for(environment_name, everything, importance.tolist()),
+        "plane": plane_for(environment_name, everything, importance.tolist(), box),
         "best": drawn,
         "num_actions": int(space.n) if discrete else None,
         "bounds": None if discrete else (float(first), float(last)),
@@ -92,6 +97,10 @@ def explain(
         "action": "action" + (" (first dimension)" if several else ""),
     }
     return numbers, parts
+
+
+def _flat(bound: Any, shape: tuple[int, ...]) -> np.ndarray:
+    return np.ravel(np.broadcast_to(np.asarray(bound), shape))
 
 
 def explain_command(

@@ -60,7 +60,10 @@ class Plane:
 
 
 def plane_for(
-    environment: str, observations: Floats, importance: Sequence[float] | None = None
+    environment: str,
+    observations: Floats,
+    importance: Sequence[float] | None = None,
+    bounds: tuple[Floats, Floats] | None = None,
 ) -> Plane:
     """The view of an environment's observations.
 
@@ -69,6 +72,7 @@ def plane_for(
       observations: [N, O]; their range (without the outer half per cent at either end) is shown, and
         entries off the plane are held at their median.
       importance: [O]; the two largest choose the entries of the plane. The first two where None.
+      bounds: ([O], [O]) of the observation space; nothing outside is shown.
 
     Raises:
       UserError: observations of fewer than two entries.
@@ -80,6 +84,8 @@ def plane_for(
             f"{environment} has observations of {size} entry: a plane needs two or more."
         )
     low, high = np.percentile(observations, [0.5, 99.5], axis=0)
+    if bounds is not None:
+        low, high = np.maximum(low, bounds[0]), np.minimum(high, bounds[1])
     if environment == "Pendulum-v1" and size == 3:
         speed = float(np.abs([low[2], high[2]]).max())
 

@@ -1,0 +1,109 @@
+"""The paper's experiments: what there is, and all of them in one go.
+
+    python -m experiments --list
+    python -m experiments --preset quick
+
+The second runs every experiment of the paper with a preset, continues what was interrupted, and
+writes docs/experiments.md, which says of each what the paper claims and what was found.
+"""
+
+import argparse
+import importlib
+import pkgutil
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from experiments import page
+from experiments.page import Experiment
+
+
+def modules() -> list[str]:
+    """Names of the modules that are commands."""
+    folder = Path(__file__).parent
+    names = (m.name for m in pkgutil.iter_modules([str(folder)]))
+    return [n for n in names if n not in ("__main__", "page", "rejax_peer")]
+
+
+def found() -> dict[str, Experiment]:
+    """{name: experiment} of the paper."""
+    loaded = {name: importlib.import_module(f"experiments.{name}") for name in modules()}
+    return {name: m.EXPERIMENT for name, m in loaded.items() if hasattr(m, "EXPERIMENT")}
+
+
+def listing() -> str:
+    """What `--list` prints."""
+    experiments = found()
+    lines = ["The paper's experiments (python -m experiments.NAME --preset quick|paper):", ""]
+    for name, experiment in experiments.items():
+        minutes = ", ".join(f"{p} {m} min" for p, m in experiment.minutes.items())
+        lines += [
+            f"  {name}: {experiment.title}",
+            f"    {experiment.paper}; {minutes} on two cores; needs {experiment.needs or 'nothing more'}",
+        ]
+    lines += ["", "Others (--help says what they take):", ""]
+    for name in modules():
+        if name not in experiments:
+            document = importlib.import_module(f"experiments.{name}").__doc__ or ""
+            lines.append(f"  {name}: {document.splitlines()[0]}")
+    return "\n".join(lines)
+
+
+def overview(experiments: Sequence[Experiment], data: Path) -> str:
+    """The page with all verdicts, from the reports that there are."""
+    lines = ["# The paper's experiments", "", "`python -m experiments --preset quick`", ""]
+    for experiment in experiments:
+        path = data / f"{experiment.name}.json"
+        if not path.exists():
+            continue
+        report = page.read(path)
+        lines += [
+            f"## [{experiment.title}]({experiment.name}.md)",
+            "",
+            f"**The paper** ({experiment.paper}): {experiment.claim}",
+            "",
+            f"**Here** (preset {report['preset']}): {experiment.verdict(report)}",
+            "",
+            f"![{experiment.title}](figures/{experiment.name}.png)",
+            "",
+        ]
+    return "\n".join(lines)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """The command."""
+    parser = argparse.ArgumentParser(
+        prog="python -m experiments",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--list", action="store_true", help="what there is, and how long it takes")
+    parser.add_argument("--preset", choices=("quick", "paper"), default="quick")
+    parser.add_argument("--only-render", action="store_true", help="measure nothing")
+    parser.add_argument("--data", type=Path, default=page.DATA, help="for the reports")
+    parser.add_argument("--docs", type=Path, default=page.DOCS, help="for pages and figures")
+    arguments = parser.parse_args(argv)
+    if arguments.list:
+        print(listing())
+        return 0
+    experiments = found()
+    failed = []
+    for name, experiment in experiments.items():
+        out = arguments.data / f"{name}.json"
+        if arguments.only_render and not out.exists():
+            continue
+        print(f"{name} ...", flush=True)
+        flags = ["--preset", arguments.preset, "--out", str(out), "--docs", str(arguments.docs)]
+        if arguments.only_render:
+            flags.append("--only-render")
+        if page.main(experiment, flags):
+            failed.append(name)
+    arguments.docs.mkdir(parents=True, exist_ok=True)
+    text = overview(list(experiments.values()), arguments.data)
+    (arguments.docs / "experiments.md").write_text(text)
+    print(f"written: {arguments.docs / 'experiments.md'}")
+    return 2 if failed else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,183 @@
+"""What the paper's experiments share: presets, a report that is continued, and a page of one form.
+
+An experiment is a module with an `EXPERIMENT` and a `main`. Its report is a JSON object that says
+what was measured, with which preset and versions, and how long it took; page and figure are made
+from it alone. What a report holds already is not measured again, so that the same command continues
+an interrupted one.
+"""
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from lpo.cli import configure_jax
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from scb.statistics import Estimate
+
+DATA = Path("docs/data")
+DOCS = Path("docs")
+Save = Callable[[], None]
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """A figure or table of the paper.
+
+    Attributes:
+      name: of the module and of the files that it writes.
+      title: of its page.
+      paper: which figure or table of Liesen et al. (2024) it is.
+      claim: what the paper says, in a sentence.
+      presets: {"quick": {...}, "paper": {...}}; what they hold is the experiment's own.
+      minutes: {preset: roughly how long it takes on two cores}.
+      needs: what it needs beyond the library; empty for nothing.
+      measure: (plan, report, save) fills the report in, and saves after every part.
+      verdict: report -> does the claim hold here, in one or two sentences with figures.
+      body: report -> the lines of the page below the figure.
+      draw: report -> the figure.
+    """
+
+    name: str
+    title: str
+    paper: str
+    claim: str
+    presets: Mapping[str, Mapping[str, Any]]
+    minutes: Mapping[str, str]
+    measure: Callable[[Mapping[str, Any], dict[str, Any], Save], None]
+    verdict: Callable[[Mapping[str, Any]], str]
+    body: Callable[[Mapping[str, Any]], list[str]]
+    draw: Callable[[Mapping[str, Any]], "Figure"]
+    needs: str = ""
+
+
+def page(experiment: Experiment, report: Mapping[str, Any]) -> str:
+    """The page in Markdown: the paper's claim, ours, the figure, the tables, how it was measured."""
+    machine, versions = report["machine"], report["versions"]
+    note = ""
+    if report["preset"] == "quick":
+        note = " The quick preset has fewer runs or steps than the paper."
+    lines = [
+        f"# {experiment.title}",
+        "",
+        f"`python -m experiments.{experiment.name} --preset {report['preset']}`",
+        "",
+        f"**The paper** ({experiment.paper}): {experiment.claim}",
+        "",
+        f"**Here**: {experiment.verdict(report)}",
+        "",
+        f"![{experiment.title}](figures/{experiment.name}.png)",
+        "",
+        *experiment.body(report),
+        "",
+        f"Preset `{report['preset']}`.{note} Measured in {report['seconds'] / 60:.1f} minutes on "
+        f"{machine['cores']} cores, {machine['processor']}, accelerator: {machine['accelerator']}; "
+        + ", ".join(f"{name} {version}" for name, version in versions.items())
+        + ".",
+        "",
+    ]
+    return "\n".join(lines)
+
+
+def text(estimate: "Estimate | Mapping[str, Any]", places: int = 0, sign: bool = False) -> str:
+    """An estimate with its interval, with a real minus sign."""
+    values = estimate if isinstance(estimate, Mapping) else estimate.as_dict()
+    value = f"{values['value']:{'+' if sign else ''}.{places}f}"
+    if values["low"] is not None:
+        value += f" [{values['low']:.{places}f}, {values['high']:.{places}f}]"
+    return value.replace("-", "\u2212")
+
+
+def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    """A Markdown table."""
+    return [
+        f"| {' | '.join(head)} |",
+        "| " + " | ".join("---" for _ in head) + " |",
+        *(f"| {' | '.join(row)} |" for row in rows),
+    ]
+
+
+def main(experiment: Experiment, argv: Sequence[str] | None = None) -> int:
+    """The command line of an experiment.
+
+    Returns:
+      The exit status: 2 where the user asked for what cannot be, with one sentence on stderr.
+    """
+    parser = argparse.ArgumentParser(
+        prog=f"python -m experiments.{experiment.name}",
+        description=f"{experiment.title}. The paper ({experiment.paper}): {experiment.claim}",
+    )
+    parser.add_argument("--preset", choices=sorted(experiment.presets), default="quick")
+    parser.add_argument("--out", type=Path, help="the report; docs/data/NAME.json")
+    parser.add_argument("--docs", type=Path, default=DOCS, help="for the page and the figure")
+    parser.add_argument("--only-render", action="store_true", help="measure nothing")
+    arguments = parser.parse_args(argv)
+    configure_jax()
+
+    from scb.errors import UserError
+
+    out = DATA / f"{experiment.name}.json" if arguments.out is None else arguments.out
+    try:
+        report = read(out, missing_is_new=not arguments.only_render)
+        if not arguments.only_render:
+            _measure(experiment, arguments.preset, report, out)
+        render(experiment, report, arguments.docs)
+    except UserError as error:
+        print(f"{experiment.name}: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+def render(experiment: Experiment, report: Mapping[str, Any], docs: Path) -> None:
+    """Writes docs/NAME.md and docs/figures/NAME.png."""
+    from scb import plotting
+
+    docs.mkdir(parents=True, exist_ok=True)
+    (docs / f"{experiment.name}.md").write_text(page(experiment, report))
+    plotting.save(experiment.draw(report), docs / "figures" / f"{experiment.name}.png")
+
+
+def _measure(experiment: Experiment, preset: str, report: dict[str, Any], out: Path) -> None:
+    from scb.artefacts import machine_description, package_versions
+    from scb.errors import UserError
+    from scb.runs import write_json
+
+    if report.get("preset", preset) != preset:
+        raise UserError(
+            f"{out} holds the preset {report['preset']}: choose another --out for the preset {preset}."
+        )
+    before, start = report.get("seconds", 0.0), time.monotonic()
+    report |= {
+        "preset": preset,
+        "versions": package_versions(),
+        "machine": machine_description(),
+    }
+
+    def save() -> None:
+        report["seconds"] = round(before + time.monotonic() - start, 1)
+        out.parent.mkdir(parents=True, exist_ok=True)
+        write_json(out, report)
+
+    experiment.measure(experiment.presets[preset], report, save)
+    save()
+
+
+def read(path: Path, missing_is_new: bool = False) -> dict[str, Any]:
+    """A report from its file; a UserError where there is none."""
+    from scb.errors import UserError
+
+    if missing_is_new and not path.exists():
+        return {}
+    try:
+        return dict(json.loads(path.read_text()))
+    except (OSError, TypeError, ValueError) as error:
+        raise UserError(
+            f"{path} is no report of this command ({error}): measure first, or choose another --out."
+        ) from error

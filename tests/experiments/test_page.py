@@ -1,0 +1,97 @@
+import json
+
+import pytest
+from matplotlib.figure import Figure
+
+from experiments import __main__ as everything
+from experiments import page
+from experiments.page import Experiment, table, text
+from scb.statistics import Estimate
+
+
+def counting(parts=("a", "b"), fail_at=None) -> Experiment:
+    """An experiment that writes down how often each of its parts was measured."""
+
+    def measure(plan, report, save):
+        for name in parts:
+            if name in report.setdefault("parts", {}):
+                continue
+            if name == fail_at:
+                raise KeyboardInterrupt
+            report["parts"][name] = plan["value"]
+            report["measured"] = report.get("measured", 0) + 1
+            save()
+
+    return Experiment(
+        name="counting",
+        title="Counting",
+        paper="no figure",
+        claim="parts are measured once.",
+        presets={"quick": {"value": 1}, "paper": {"value": 2}},
+        minutes={"quick": "0", "paper": "0"},
+        measure=measure,
+        verdict=lambda report: f"{report['measured']} measured.",
+        body=lambda report: table(["part"], [[x] for x in report["parts"]]),
+        draw=lambda report: Figure(figsize=(2, 2)),
+    )
+
+
+def test_an_interrupted_experiment_measures_only_what_is_missing(tmp_path):
+    flags = ["--out", str(tmp_path / "c.json"), "--docs", str(tmp_path / "docs")]
+    with pytest.raises(KeyboardInterrupt):
+        page.main(counting(fail_at="b"), flags)
+    assert page.main(counting(), flags) == 0
+    report = json.loads((tmp_path / "c.json").read_text())
+    assert report["parts"] == {"a": 1, "b": 1} and report["measured"] == 2
+    written = (tmp_path / "docs" / "counting.md").read_text()
+    assert "**The paper** (no figure): parts are measured once." in written
+    assert "**Here**: 2 measured." in written
+    assert "quick preset has fewer" in written
+    assert (tmp_path / "docs" / "figures" / "counting.png").exists()
+
+
+def test_another_preset_does_not_continue_a_report(tmp_path, capsys):
+    flags = ["--out", str(tmp_path / "c.json"), "--docs", str(tmp_path)]
+    assert page.main(counting(), flags) == 0
+    assert page.main(counting(), [*flags, "--preset", "paper"]) == 2
+    assert "choose another --out" in capsys.readouterr().err
+    assert json.loads((tmp_path / "c.json").read_text())["preset"] == "quick"
+
+
+@pytest.mark.parametrize("content", [None, "{", "[1, 2]"])
+def test_rendering_without_a_report_says_so(tmp_path, capsys, content):
+    out = tmp_path / "c.json"
+    if content is not None:
+        out.write_text(content)
+    assert page.main(counting(), ["--only-render", "--out", str(out), "--docs", str(tmp_path)]) == 2
+    assert "is no report of this command" in capsys.readouterr().err
+
+
+def test_estimates_have_real_minus_signs():
+    assert text(Estimate(-3.25, -4.0, -2.5, 9), 1) == "−3.2 [−4.0, −2.5]"
+    assert text(Estimate(3.0, None, None, 1), sign=True) == "+3"
+
+
+def test_every_experiment_says_what_it_is_and_takes():
+    for name, experiment in everything.found().items():
+        assert experiment.name == name
+        assert set(experiment.presets) == set(experiment.minutes) == {"quick", "paper"}
+        assert experiment.claim.endswith(".")
+
+
+def test_the_list_names_every_command(capsys):
+    assert everything.main(["--list"]) == 0
+    printed = capsys.readouterr().out
+    for name in everything.modules():
+        assert f"  {name}: " in printed
+    assert "quick 1 min" in printed
+    assert "rejax_peer" not in printed
+
+
+def test_all_experiments_in_one_go_leave_one_page(tmp_path, monkeypatch):
+    monkeypatch.setattr(everything, "found", lambda: {"counting": counting()})
+    flags = ["--data", str(tmp_path / "data"), "--docs", str(tmp_path / "docs")]
+    assert everything.main(flags) == 0
+    overview = (tmp_path / "docs" / "experiments.md").read_text()
+    assert "[Counting](counting.md)" in overview and "2 measured." in overview
+    assert everything.main([*flags, "--preset", "paper"]) == 2
