@@ -306,15 +306,14 @@ def test_inner_agents_train_for_the_horizon_and_know_how_far_they_are(config):
     task = TaskTraining(replace(config, horizons=(0.5, 1.0, 2.0), reward_noise=0.0), PENDULUM)
     task.agent = replace(task.agent, drift=watch)
     hyperparameters = task.base_hyperparameters
+    fitness = jax.jit(task.fitness, static_argnums=2)
     for horizon, fractions in (
         (1 / 3, {0.0}),  # one batch of three
         (1.0, {0.0, 1 / 3, 2 / 3}),
         (2.0, {0.0, 1 / 6, 2 / 6, 3 / 6, 4 / 6, 5 / 6}),
     ):
         seen.clear()
-        jax.block_until_ready(
-            jax.jit(task.fitness, static_argnums=2)(0.0, jax.random.key(0), 1, horizon)
-        )
+        jax.block_until_ready(fitness(0.0, jax.random.key(0), 1, horizon))
         jax.effects_barrier()
         assert set(np.round(seen, 5)) == set(np.round(list(fractions), 5))
     assert hyperparameters.horizon is None

@@ -334,6 +334,7 @@ class KilledRun(Run):
             raise Killed
 
 
+@pytest.mark.slow
 def test_a_resumed_sequential_search_ends_with_the_same_bytes(trained_in_turns, tmp_path):
     whole, _, outcome = trained_in_turns
     run = KilledRun.open(tmp_path / "run", config_dict(SEQUENTIAL))
