@@ -18,6 +18,7 @@ from scb.agents.agent import scale_to_space
 from scb.agents.off_policy import (
     OffPolicyAgent,
     OffPolicyConfig,
+    OffPolicyState,
     Transition,
     gradient_update,
     polyak_average,
@@ -134,6 +135,31 @@ class SAC(OffPolicyAgent):
             return action
         squashed = jnp.tanh(outputs[0]) if mode else _sample(key, *outputs)[0]
         return scale_to_space(squashed, self.env.action_space(env_params))
+
+    def distribution(
+        self, state: OffPolicyState, observation: jax.Array, env_params: Any
+    ) -> distrax.Distribution:
+        """[O] observation -> what the agent draws its action from; a continuous one before the tanh."""
+        policy, _ = self._networks(env_params)
+        inputs = self._inputs(state, jnp.ravel(observation))
+        outputs = policy.apply(state.learner.params["policy"], inputs)
+        if isinstance(outputs, tuple):
+            return distrax.MultivariateNormalDiag(*outputs)
+        return outputs
+
+    def q_value(
+        self, state: OffPolicyState, observation: jax.Array, action: jax.Array, env_params: Any
+    ) -> jax.Array:
+        """[O] observation, action -> [] the smaller of the two critics' values."""
+        _, critics = self._networks(env_params)
+        inputs = self._inputs(state, jnp.ravel(observation))
+        params = state.learner.params["critics"]
+        discrete, size = self._space(env_params)
+        if discrete:
+            q: jax.Array = critics.apply(params, inputs)[:, action]
+        else:
+            q = critics.apply(params, inputs, jnp.reshape(action, (size,)))
+        return q.min(axis=0)
 
     def learn(
         self,
