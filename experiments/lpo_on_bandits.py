@@ -323,7 +323,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def measure(preset: str, runs: Path, out: Path, report: dict[str, Any]) -> None:
     """Does what the report lacks, and writes it after every part."""
-    from lpo.commands import objective_of_run
+    from lpo.learning import objective_of_run
     from lpo.objectives import Objective, load_objective
     from scb.artefacts import machine_description, package_versions
     from scb.errors import UserError
@@ -424,7 +424,7 @@ def _judge(
         seeds,
         setting=setting,
         backend=backend,
-        points=10,
+        points=15,
     ).curves
     of = {curve.objective: curve for curve in curves}
     finals, areas = (

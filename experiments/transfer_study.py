@@ -288,7 +288,7 @@ def _measure(
 
 def _learn(arguments: argparse.Namespace, name: str, seed: int, entry: dict[str, Any]) -> Any:
     """A variation's objective of one search, and into the entry what it took."""
-    from lpo.commands import objective_of_run
+    from lpo.learning import objective_of_run
     from scb.runs import command_of
 
     settings = settings_of(name, seed, arguments.generations, arguments.population_size)

@@ -277,7 +277,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = parser.parse_args(argv)
     configure_jax()
 
-    from lpo import figures
+    from lpo import drift_figures
     from lpo.objectives import load_objective, zoo_names
     from scb import plotting
     from scb.artefacts import package_versions
@@ -302,7 +302,9 @@ def main(argv: Sequence[str] | None = None) -> int:
             if comparisons is None
             else [read_comparison(path, formulas) for path in comparisons],
         }
-        figure = figures.drift_and_gradient([load_objective(name) for name in names], PROGRESS)
+        figure = drift_figures.drift_and_gradient(
+            [load_objective(name) for name in names], PROGRESS
+        )
     except UserError as error:
         print(f"understanding: {error}", file=sys.stderr)
         return 2

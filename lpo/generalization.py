@@ -113,6 +113,9 @@ def training_setting(
 
 
 def _rounded_to_points(config: PPOConfig, points: int) -> PPOConfig:
+    evaluations = config.num_iterations / evaluation_interval(config.num_iterations, points)
+    if points / 2 <= evaluations <= points * 2:
+        return config
     # A prime number of iterations has no divisors to evaluate at: round up to a multiple of the
     # points.
     iterations = -(-config.num_iterations // points) * points
@@ -144,10 +147,10 @@ def learning_curves(
       environment: a name that `scb.make` takes.
       objective: what replaces PPO's surrogate.
       seeds: one agent each; the same seeds pair agents of different objectives.
-      setting: PPO's; the environment's own where None. Its steps are rounded up to a multiple of
-        `points` batches.
+      setting: PPO's; the environment's own where None. Where its number of batches has no divisor that
+        gives about `points` evaluations, it is rounded up to a multiple of `points`.
       backend: Brax physics ("generalized", "positional", "spring"); only for Brax environments.
-      points: evaluations along the training, the untrained agent not counted.
+      points: about how many evaluations along the training, the untrained agent not counted.
       episodes: of each evaluation.
       mode_actions: evaluate the most likely actions rather than sampled ones.
     """

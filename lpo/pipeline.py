@@ -11,7 +11,7 @@ from typing import Any
 
 from rich.console import Console
 
-from lpo import figures, report
+from lpo import drift_figures, figures, report
 from lpo.certificate import certify
 from lpo.generalization import (
     Comparison,
@@ -314,7 +314,7 @@ def _figures(
         )
     for name, comparison in comparisons.items():
         drawn[name] = figures.learning_curves(comparison.curves)
-    drawn["drift_heatmaps"] = figures.drift_heatmaps(objectives)
+    drawn["drift_heatmaps"] = drift_figures.drift_heatmaps(objectives)
     paths = {}
     for name, figure in drawn.items():
         paths[name] = folder / "figures" / f"{name.replace('/', '-')}.png"

@@ -111,7 +111,7 @@ def test_the_page_says_costs_returns_and_differences(report, tmp_path):
 
 
 def test_the_settings_of_every_preset_are_those_of_the_command():
-    from lpo.commands import meta_training_config
+    from lpo.learning import meta_training_config
 
     for preset in module.PRESETS.values():
         for search in preset["searches"].values():

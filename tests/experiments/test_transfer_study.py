@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from experiments import transfer_study as module
-from lpo.commands import meta_training_config
+from lpo.learning import meta_training_config
 from scb import plotting
 
 DOCS = Path(__file__).parents[2] / "docs"

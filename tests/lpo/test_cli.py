@@ -15,7 +15,7 @@ import pytest
 from gymnax.environments import spaces
 
 import lpo
-from lpo import cli, commands
+from lpo import cli, commands, learning
 from lpo.alignment import FITNESSES
 from lpo.drift import NoDrift
 from lpo.generalization import LearningCurves
@@ -525,14 +525,14 @@ def test_meta_train_writes_an_objective_that_loads(
 ):
     from scb.evolution import evolve
 
-    configured = commands.meta_training_config
+    configured = learning.meta_training_config
 
     def small(settings):
         config = configured(settings)
         evolution = replace(config.evolution, mean_evaluations=2)
         return replace(config, agent=tiny_agent, drift=tiny_drift, evolution=evolution)
 
-    monkeypatch.setattr(commands, "meta_training_config", small)
+    monkeypatch.setattr(learning, "meta_training_config", small)
     monkeypatch.setattr(commands, "evolve", evolve)
     flags = {
         "population-size": 2,
@@ -588,7 +588,7 @@ def test_flags_of_meta_train_reach_the_configuration():
         "backend": "spring",
         "seed": 9,
     }
-    config = commands.meta_training_config(flags)
+    config = learning.meta_training_config(flags)
     evolution = config.evolution
     assert (config.tasks, config.fitness) == (("Pendulum-v1",), "area")
     assert (config.reward_noise, config.drift.base, config.contexts) == (1.5, "none", 40)
@@ -598,26 +598,26 @@ def test_flags_of_meta_train_reach_the_configuration():
     assert (evolution.sigma, evolution.learning_rate) == (0.2, 0.3)
     # And what is left out keeps its default.
     default = MetaTrainingConfig()
-    unset = commands.meta_training_config(dict.fromkeys(flags))
+    unset = learning.meta_training_config(dict.fromkeys(flags))
     assert replace(unset, evolution=default.evolution) == default
     for name in ("strategy", "sigma", "learning_rate", "mean_evaluations"):
         assert getattr(unset.evolution, name) == getattr(default.evolution, name)
 
 
 def test_lists_of_meta_train_reach_the_configuration():
-    config = commands.meta_training_config(
+    config = learning.meta_training_config(
         {"tasks": "Synthetic-Pendulum-v1, Synthetic-CartPole-v1", "horizons": "0.5,2"}
     )
     assert config.tasks == ("Synthetic-Pendulum-v1", "Synthetic-CartPole-v1")
     assert config.horizons == (0.5, 2.0)
     # Returns of different tasks have different scales.
     assert config.evolution.combine == "ranks"
-    judged = commands.meta_training_config({"validate": True, "evaluate_mean_every": 5})
+    judged = learning.meta_training_config({"validate": True, "evaluate_mean_every": 5})
     assert (judged.validation, judged.evolution.mean_evaluations) == (True, 16)
     assert judged.evolution.evaluate_mean_every == 5
-    temporal = commands.meta_training_config({"temporal": True})
+    temporal = learning.meta_training_config({"temporal": True})
     assert temporal.drift.temporal
-    assert temporal.horizons == commands.TEMPORAL_HORIZONS
+    assert temporal.horizons == learning.TEMPORAL_HORIZONS
     assert temporal.evolution.combine == "mean"
 
 
@@ -652,7 +652,7 @@ def test_align_measures_every_combination_and_stores_it(monkeypatch, working_fol
 
 def test_inner_agents_hyperparameters_are_read_from_one_line(one_sentence):
     def config(text):
-        return commands.meta_training_config({"hyperparameters": text})
+        return learning.meta_training_config({"hyperparameters": text})
 
     lists = config("learning_rate=0.0003,0.001 policy_output_scale=1").hyperparameters
     assert lists == {"learning_rate": (0.0003, 0.001), "policy_output_scale": (1.0,)}

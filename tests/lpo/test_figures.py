@@ -12,7 +12,7 @@ import pytest
 from matplotlib import pyplot
 from matplotlib.collections import FillBetweenPolyCollection, QuadMesh
 
-from lpo import figures
+from lpo import drift_figures, figures
 from lpo.generalization import LearningCurves
 from lpo.objectives import Objective, load_objective
 from scb import plotting
@@ -125,7 +125,7 @@ def test_nothing_to_draw_is_refused():
     with pytest.raises(UserError, match="no learning curves"):
         figures.learning_curves([])
     with pytest.raises(UserError, match="no objectives"):
-        figures.drift_heatmaps([])
+        drift_figures.drift_heatmaps([])
     with pytest.raises(UserError, match="no generation"):
         figures.meta_training_curve([], "Synthetic-Pendulum-v1", "return")
 
@@ -144,7 +144,7 @@ def test_objectives_are_told_apart_without_colour():
 
 def test_ppo_is_free_inside_the_clip_and_linear_outside():
     # f = (r - 1.2) A above the clip for A > 0, (r - 0.8) A below it for A < 0.
-    drift, gradient = figures.drift_surface(
+    drift, gradient = drift_figures.drift_surface(
         load_objective("ppo"), np.array([0.5, 0.9, 1.0, 1.1, 1.5]), np.array([-2.0, 2.0])
     )
     np.testing.assert_allclose(drift, [[0.6, 0, 0, 0, 0], [0, 0, 0, 0, 0.6]], atol=1e-6)
@@ -153,7 +153,7 @@ def test_ppo_is_free_inside_the_clip_and_linear_outside():
 
 
 def test_the_heat_map_of_ppo_is_zero_inside_the_clip():
-    figure = figures.drift_heatmaps([load_objective("ppo")])
+    figure = drift_figures.drift_heatmaps([load_objective("ppo")])
     mesh = meshes(figure)[0][0]
     values = np.asarray(mesh.get_array())
     ratios = mesh.get_coordinates()[0, :, 0]
@@ -164,7 +164,7 @@ def test_the_heat_map_of_ppo_is_zero_inside_the_clip():
 
 
 def test_panels_of_a_row_share_one_scale_and_directions_are_centred_on_zero():
-    figure = figures.drift_heatmaps([load_objective(n) for n in ("ppo", "dpo", "none")])
+    figure = drift_figures.drift_heatmaps([load_objective(n) for n in ("ppo", "dpo", "none")])
     for row in meshes(figure):
         assert len({(mesh.norm.vmin, mesh.norm.vmax) for mesh in row}) == 1
     norm = meshes(figure)[1][0].norm
@@ -174,16 +174,18 @@ def test_panels_of_a_row_share_one_scale_and_directions_are_centred_on_zero():
 
 def test_one_extreme_corner_does_not_make_the_others_look_flat():
     spike = Objective("spike", SpikeDrift(), jnp.zeros(()))
-    figure = figures.drift_heatmaps([load_objective("ppo"), spike])
+    figure = drift_figures.drift_heatmaps([load_objective("ppo"), spike])
     assert meshes(figure)[0][0].norm.vmax < 10.0
 
 
 @pytest.mark.parametrize(("name", "turns_back"), [("ppo", False), ("dpo", True)])
 def test_only_an_objective_that_moves_the_policy_back_is_hatched(name, turns_back):
     # DPO, A = -3, r = 0.4: d/dr (r A - f) = A (1 - (1 - sech^2(A log r / 0.6)) / r) = 4.5 > 0.
-    _, gradient = figures.drift_surface(load_objective(name), np.array([0.4]), np.array([-3.0]))
+    _, gradient = drift_figures.drift_surface(
+        load_objective(name), np.array([0.4]), np.array([-3.0])
+    )
     assert (gradient[0, 0] > 1.0) == turns_back
-    [legend] = figures.drift_heatmaps([load_objective(name)]).legends
+    [legend] = drift_figures.drift_heatmaps([load_objective(name)]).legends
     said = [text.get_text() for text in legend.get_texts()]
     assert ("update moves the policy back" in said) == turns_back
 
@@ -286,7 +288,7 @@ def all_figures():
         figures.learning_curves([curve(), curve("dpo"), curve("a-rather-long-name")]),
         figures.meta_training_curve(generations(4), "Pendulum-v1", "area"),
         figures.environment_steps(steps, steps),
-        figures.drift_heatmaps([load_objective("ppo"), load_objective("dpo")]),
+        drift_figures.drift_heatmaps([load_objective("ppo"), load_objective("dpo")]),
     ]
 
 

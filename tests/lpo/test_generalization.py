@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from lpo import generalization
 from lpo.generalization import (
     Comparison,
     LearningCurves,
@@ -19,7 +20,7 @@ from lpo.generalization import (
     training_setting,
 )
 from lpo.objectives import Objective, load_objective
-from scb.agents.ppo import PPOHyperparameters
+from scb.agents.ppo import PPOConfig, PPOHyperparameters
 from scb.agents.settings import Setting
 from scb.errors import UserError
 
@@ -190,6 +191,14 @@ def test_seeds_differ_from_each_other(trained):
 def test_the_same_seeds_and_objective_give_the_same_curves(trained, arguments, objectives):
     again = learning_curves(objective=objectives[0], **arguments)
     np.testing.assert_array_equal(again.returns, trained["ppo"].returns)
+
+
+@pytest.mark.parametrize(
+    ("iterations", "points", "trained"), [(15, 10, 15), (100, 15, 100), (97, 15, 105)]
+)
+def test_a_training_is_as_long_as_its_setting_where_divisors_allow(iterations, points, trained):
+    config = PPOConfig(num_envs=1, num_steps=8, total_steps=8 * iterations, num_minibatches=1)
+    assert generalization._rounded_to_points(config, points).num_iterations == trained
 
 
 def test_training_is_rounded_up_to_a_multiple_of_the_points(trained):

@@ -11,7 +11,7 @@ import pytest
 from matplotlib.collections import QuadMesh
 
 from experiments.understanding import words
-from lpo import figures
+from lpo import drift_figures
 from lpo.drift import LearnedDrift
 from lpo.objectives import Objective, load_objective
 from lpo.understanding import REGIONS, Analysis, analyze, classify, is_temporal, midpoints, surface
@@ -165,7 +165,9 @@ def test_the_figure_has_a_row_for_every_fraction_of_a_temporal_drift():
     drift = LearnedDrift(hidden_size=2, temporal=True)
     temporal = Objective("late", drift, drift.init(jax.random.key(0)))
     assert is_temporal(temporal) and not is_temporal(load_objective("dpo"))
-    figure = figures.drift_and_gradient([load_objective("ppo"), temporal], progress=(0.0, 1.0))
+    figure = drift_figures.drift_and_gradient(
+        [load_objective("ppo"), temporal], progress=(0.0, 1.0)
+    )
     meshes = [
         mesh
         for axes in figure.axes
@@ -191,4 +193,4 @@ def test_sentences_say_the_numbers():
 
 def test_a_figure_of_nothing_is_refused():
     with pytest.raises(UserError, match="there are no objectives to draw"):
-        figures.drift_and_gradient([])
+        drift_figures.drift_and_gradient([])

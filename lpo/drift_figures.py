@@ -1,0 +1,316 @@
+"""Figures of drifts: what they charge, and what they do to the update, over ratio and advantage."""
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import LinearSegmentedColormap, ListedColormap, Normalize
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from matplotlib.ticker import MaxNLocator, NullLocator
+from numpy.typing import NDArray
+
+from lpo.understanding import CLIP, REGIONS, analyze, is_temporal
+from scb.errors import UserError
+from scb.plotting import (
+    GREEN,
+    GREY,
+    ORANGE,
+    PURPLE,
+    SKY_BLUE,
+    VERMILLION,
+    WIDTH,
+    figure_style,
+    figure_title,
+    legend_below,
+)
+
+if TYPE_CHECKING:
+    from lpo.objectives import Objective
+
+RATIOS = (0.4, 1.8)
+ADVANTAGES = (-3.0, 3.0)
+# Of `lpo.understanding.REGIONS`. What stops or turns an update is dark, what leaves it alone is pale.
+_REGION_COLORS = {
+    "rolls back": VERMILLION,
+    "flat": GREY,
+    "cautious": ORANGE,
+    "free": "#F2F2F2",
+    "optimistic": SKY_BLUE,
+    "amplified": GREEN,
+    "hindered": PURPLE,
+}
+# Below this a penalty or a gradient is drawn as none: rounding of 32-bit floats, or a dead zone.
+NEGLIGIBLE = 1e-3
+
+
+def drift_heatmaps(objectives: "Sequence[Objective]", progress: float = 0.5) -> Figure:
+    """What objectives charge for moving away, and where that makes an update stop or turn round.
+
+    First row: the drift f(r, A) over ratio and advantage. Second row: the gradient d/dr (r A - f)
+    of the whole objective; it has A's sign where the update goes on, is zero where it stops, and is
+    hatched where it turns against the advantage and moves the policy back. The panels of a row
+    share one colour scale.
+
+    Args:
+      objectives: side by side, in this order.
+      progress: fraction of training done, for drifts that depend on it.
+    """
+    if not objectives:
+        raise UserError("there are no objectives to draw: give at least one.")
+    ratios = np.linspace(*RATIOS, 281)
+    advantages = np.linspace(*ADVANTAGES, 241)
+    surfaces = [drift_surface(o, ratios, advantages, progress) for o in objectives]
+    drifts = [drift for drift, _ in surfaces]
+    gradients = [gradient for _, gradient in surfaces]
+    with figure_style():
+        figure = Figure(figsize=(WIDTH, 6.4))
+        grid = figure.subplots(2, len(objectives), sharex=True, sharey=True, squeeze=False)
+        # The dark end of the map is cut off: contours would drown in it.
+        pale_is_none = LinearSegmentedColormap.from_list(
+            "drift", colormaps["magma_r"](np.linspace(0.0, 0.85, 256))
+        )
+        penalty = _Scale(pale_is_none, Normalize(0.0, _largest(drifts)))
+        largest = _largest([np.abs(g) for g in gradients])
+        direction = _Scale(colormaps["RdBu_r"], Normalize(-largest, largest))
+        levels = [t for t in MaxNLocator(7).tick_values(0.0, penalty.norm.vmax or 1.0) if t > 0]
+        turns_back = False
+        for column, (objective, drift, gradient) in enumerate(
+            zip(objectives, drifts, gradients, strict=True)
+        ):
+            top, bottom = grid[0, column], grid[1, column]
+            penalty.draw(top, ratios, advantages, drift)
+            if drift.max() > NEGLIGIBLE:
+                top.contour(
+                    ratios,
+                    advantages,
+                    drift,
+                    [NEGLIGIBLE],
+                    colors="black",
+                    linewidths=1.0,
+                    linestyles="--",
+                )
+                top.contour(ratios, advantages, drift, levels, colors="black", linewidths=0.6)
+            direction.draw(bottom, ratios, advantages, gradient)
+            back = gradient * np.sign(advantages)[:, None]
+            if back.min() < -NEGLIGIBLE:
+                bottom.contourf(
+                    ratios,
+                    advantages,
+                    back,
+                    [-np.inf, -NEGLIGIBLE],
+                    colors="none",
+                    hatches=["////"],
+                )
+                bottom.contour(
+                    ratios,
+                    advantages,
+                    back,
+                    [-NEGLIGIBLE],
+                    colors="black",
+                    linewidths=0.8,
+                    linestyles="-",  # matplotlib's default for negative levels is dashed
+                )
+                turns_back = True
+            top.set_title(objective.name, loc="center")
+            bottom.set_xlabel(r"ratio $r = \pi(a|s)\,/\,\pi_{\mathrm{old}}(a|s)$")
+            for axes in (top, bottom):
+                axes.axvline(1.0, color=GREY, linewidth=0.9)
+                axes.grid(visible=False)
+        for row, scale, label in (
+            (0, penalty, "drift f (penalty)"),
+            (1, direction, "gradient d/dr (r A − f)"),
+        ):
+            grid[row, 0].set_ylabel("advantage A\n(standard deviations)")
+            bar = figure.colorbar(
+                ScalarMappable(scale.norm, scale.map),
+                ax=list(grid[row]),
+                extend="neither" if scale.covers else ("max" if row == 0 else "both"),
+                aspect=16,
+                pad=0.02,
+            )
+            bar.set_label(label)
+            if row == 0:
+                for level in levels:
+                    bar.ax.axhline(level, color="black", linewidth=0.6)
+        handles: list[Artist] = [
+            Line2D([], [], color="black", linewidth=1.0, linestyle="--"),
+            Line2D([], [], color="black", linewidth=0.6),
+        ]
+        names = [f"penalty begins (f = {NEGLIGIBLE:g})", "levels of f, as in the colour bar"]
+        if turns_back:
+            handles.append(Patch(facecolor="white", edgecolor="black", hatch="////", linewidth=0.8))
+            names.append("update moves the policy back")
+        figure_title(
+            figure, "Drift (top) and the direction in which it lets the policy move (bottom)"
+        )
+        legend_below(figure, (handles, names), columns=3)
+    return figure
+
+
+def drift_surface(
+    objective: "Objective",
+    ratios: NDArray[np.floating],
+    advantages: NDArray[np.floating],
+    progress: float = 0.5,
+) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
+    """Drift and gradient of the whole objective on a grid.
+
+    Args:
+      ratios: [R], > 0.
+      advantages: [A].
+      progress: fraction of training done.
+
+    Returns:
+      [A, R] drift f, and [A, R] d/dr (r A - f).
+    """
+
+    def drift(ratio: jax.Array, advantage: jax.Array) -> jax.Array:
+        fraction = jnp.full((1,), progress, jnp.float32)
+        return objective.drift(
+            objective.parameters, jnp.log(ratio)[None], advantage[None], fraction
+        )[0]
+
+    def over_grid(function: Callable[..., Any]) -> Callable[..., Any]:
+        return jax.jit(jax.vmap(jax.vmap(function, in_axes=(0, None)), in_axes=(None, 0)))
+
+    value, slope = over_grid(jax.value_and_grad(drift))(
+        jnp.asarray(ratios, jnp.float32), jnp.asarray(advantages, jnp.float32)
+    )
+    return np.asarray(value), np.asarray(advantages)[:, None] - np.asarray(slope)
+
+
+def drift_and_gradient(
+    objectives: "Sequence[Objective]", progress: Sequence[float] = (0.0, 0.5, 1.0)
+) -> Figure:
+    """What objectives charge, where that lets a policy move, and what it amounts to.
+
+    A row an objective; one that changes over the training has a row for each of its fractions.
+    Columns: the drift f, the gradient d/d(log r) (r A - f), and the regions of
+    `lpo.understanding.REGIONS`. The panels of a column share one scale.
+
+    Args:
+      objectives: from top to bottom.
+      progress: fractions of training done, for drifts that depend on it.
+    """
+    if not objectives:
+        raise UserError("there are no objectives to draw: give at least one.")
+    rows = [
+        (
+            o.name if len(fractions) == 1 else f"{o.name}\n{100 * fraction:g} % of training",
+            analyze(o, fraction),
+        )
+        for o in objectives
+        for fractions in [progress if is_temporal(o) else (0.5,)]
+        for fraction in fractions
+    ]
+    names = list(REGIONS)
+    with figure_style():
+        figure = Figure(figsize=(WIDTH, 1.7 + 1.9 * len(rows)))
+        grid = figure.subplots(len(rows), 3, sharex=True, sharey=True, squeeze=False)
+        pale_is_none = LinearSegmentedColormap.from_list(
+            "drift", colormaps["magma_r"](np.linspace(0.0, 0.85, 256))
+        )
+        penalty = _Scale(pale_is_none, Normalize(0.0, _largest([a.drift for _, a in rows])))
+        largest = _largest([np.abs(a.gradient) for _, a in rows])
+        direction = _Scale(colormaps["RdBu_r"], Normalize(-largest, largest))
+        classes = ListedColormap([_REGION_COLORS[name] for name in names])
+        for row, (label, analysis) in zip(grid, rows, strict=True):
+            ratios, advantages = np.exp(analysis.log_ratios), analysis.advantages
+            penalty.draw(row[0], ratios, advantages, analysis.drift)
+            direction.draw(row[1], ratios, advantages, analysis.gradient)
+            row[2].pcolormesh(
+                ratios,
+                advantages,
+                analysis.regions,
+                cmap=classes,
+                norm=Normalize(-0.5, len(names) - 0.5),
+                shading="nearest",
+                rasterized=True,
+            )
+            for axes in row:
+                for x, linestyle in ((1.0, "-"), (1.0 - CLIP, ":"), (1.0 + CLIP, ":")):
+                    axes.axvline(x, color=GREY, linewidth=0.9, linestyle=linestyle)
+                axes.axhline(0.0, color=GREY, linewidth=0.9)
+                axes.grid(visible=False)
+            row[0].set_ylabel("advantage A\n(standard deviations)", fontsize=9)
+            row[0].annotate(
+                label,
+                (-0.36, 0.5),
+                xycoords="axes fraction",
+                rotation=90,
+                ha="right",
+                va="center",
+                fontweight="bold",
+            )
+        grid[0, 0].set_xscale("log")
+        grid[0, 0].set_xticks([0.5, 0.8, 1.0, 1.2, 2.0], ["0.5", "0.8", "1", "1.2", "2"])
+        grid[0, 0].xaxis.set_minor_locator(NullLocator())
+        for axes, title in zip(
+            grid[0],
+            ("drift f (penalty)", "gradient d/d(log r) (r A − f)", "what that amounts to"),
+            strict=True,
+        ):
+            axes.set_title(title, fontsize=10, weight="normal")
+        for axes in grid[-1]:
+            axes.set_xlabel(r"ratio $r = \pi(a|s)\,/\,\pi_{\mathrm{old}}(a|s)$")
+        for column, scale, extend in ((0, penalty, "max"), (1, direction, "both")):
+            figure.colorbar(
+                ScalarMappable(scale.norm, scale.map),
+                ax=list(grid[:, column]),
+                location="bottom",
+                extend="neither" if scale.covers else extend,
+                aspect=18,
+                pad=0.02,
+            )
+        # The third column has its legend where the others have their scales.
+        shown = [i for i in range(len(names)) if any((a.regions == i).any() for _, a in rows)]
+        figure_title(figure, "What a drift charges, and what it does to the update")
+        legend_below(
+            figure,
+            (
+                [
+                    Patch(facecolor=_REGION_COLORS[names[i]], edgecolor=GREY, linewidth=0.6)
+                    for i in shown
+                ]
+                + [Line2D([], [], color=GREY, linewidth=0.9, linestyle=":")],
+                [names[i] for i in shown] + ["PPO's clip, 0.2"],
+            ),
+            columns=4,
+        )
+    return figure
+
+
+class _Scale:
+    """A colour scale that all panels of a row share."""
+
+    def __init__(self, colors: Any, norm: Normalize) -> None:
+        self.map, self.norm, self.covers = colors, norm, True
+
+    def draw(
+        self,
+        axes: Axes,
+        x: NDArray[np.floating],
+        y: NDArray[np.floating],
+        values: NDArray[np.floating],
+    ) -> None:
+        axes.pcolormesh(
+            x, y, values, cmap=self.map, norm=self.norm, shading="gouraud", rasterized=True
+        )
+        self.covers &= bool(np.abs(values).max() <= (self.norm.vmax or 0.0))
+
+
+def _largest(surfaces: list[NDArray[np.floating]]) -> float:
+    # One extreme corner of one objective must not make the others look flat; the pointed end of the
+    # colour bar says that there is more.
+    values = np.concatenate([s.ravel() for s in surfaces])
+    largest, usual = float(values.max()), float(np.quantile(values, 0.99))
+    bound = largest if largest <= 1.5 * usual else usual
+    return bound if bound > 0 else 1.0
