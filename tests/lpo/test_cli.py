@@ -202,7 +202,7 @@ def no_training(monkeypatch):
     def refuse(*arguments, **named):
         raise AssertionError("this must fail before any training")
 
-    monkeypatch.setattr(commands, "evolve", refuse)
+    monkeypatch.setattr(learning, "evolve", refuse)
     monkeypatch.setattr(commands, "run_pipeline", refuse)
     monkeypatch.setattr("lpo.generalization.PPO", refuse)
 
@@ -250,7 +250,7 @@ def interrupted(working_folder, monkeypatch, capsys) -> Path:
     def interrupt(*arguments):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(commands, "evolve", interrupt)
+    monkeypatch.setattr(learning, "evolve", interrupt)
     arguments = ["--population-size", "4", "--reward-noise", "2", "--out", "started"]
     assert cli.main(["meta-train", *arguments]) == 130
     error = capsys.readouterr().err
@@ -284,7 +284,7 @@ def test_a_resumed_run_takes_the_stored_settings(interrupted, monkeypatch):
         seen.append((config.population_size, problem.config.reward_noise, run.resumed))
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(commands, "evolve", record)
+    monkeypatch.setattr(learning, "evolve", record)
     assert cli.main(["meta-train", "--resume", str(interrupted)]) == 130
     # The same flags again are no contradiction.
     repeated = ["--population-size", "4", "--resume", str(interrupted)]
@@ -533,7 +533,7 @@ def test_meta_train_writes_an_objective_that_loads(
         return replace(config, agent=tiny_agent, drift=tiny_drift, evolution=evolution)
 
     monkeypatch.setattr(learning, "meta_training_config", small)
-    monkeypatch.setattr(commands, "evolve", evolve)
+    monkeypatch.setattr(learning, "evolve", evolve)
     flags = {
         "population-size": 2,
         "generations": 2,
@@ -563,7 +563,7 @@ def test_meta_train_writes_an_objective_that_loads(
     def interrupt(*arguments):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(commands, "evolve", interrupt)
+    monkeypatch.setattr(learning, "evolve", interrupt)
     program, *again = shlex.split(objective.metadata["command"])
     assert program == "lpo"
     assert cli.main([*again, "--out", "again"]) == 130
