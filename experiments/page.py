@@ -43,6 +43,7 @@ class Experiment:
       verdict: report -> does the claim hold here, in one or two sentences with figures.
       body: report -> the lines of the page below the figure.
       draw: report -> the figure.
+      extras: (report, docs) writes what the page shows beside the figure; None for nothing.
     """
 
     name: str
@@ -56,6 +57,7 @@ class Experiment:
     body: Callable[[Mapping[str, Any]], list[str]]
     draw: Callable[[Mapping[str, Any]], "Figure"]
     needs: str = ""
+    extras: Callable[[Mapping[str, Any], Path], None] | None = None
 
 
 def page(experiment: Experiment, report: Mapping[str, Any]) -> str:
@@ -142,6 +144,8 @@ def render(experiment: Experiment, report: Mapping[str, Any], docs: Path) -> Non
     docs.mkdir(parents=True, exist_ok=True)
     (docs / f"{experiment.name}.md").write_text(page(experiment, report))
     plotting.save(experiment.draw(report), docs / "figures" / f"{experiment.name}.png")
+    if experiment.extras is not None:
+        experiment.extras(report, docs)
 
 
 def _measure(experiment: Experiment, preset: str, report: dict[str, Any], out: Path) -> None:

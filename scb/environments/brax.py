@@ -122,6 +122,11 @@ class BraxEnvironment(environment.Environment[BraxState, BraxParams]):
         return self._name
 
     @property
+    def brax_env(self) -> "brax.envs.Env":
+        """Brax's own environment."""
+        return self._brax
+
+    @property
     def backend(self) -> str:
         """The physics: "generalized", "positional", "spring" or "mjx"."""
         return self._backend

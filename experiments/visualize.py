@@ -1,0 +1,210 @@
+"""Agents that were trained in a bandit, acting in the environment: classic control as GIFs, Hopper as a page.
+
+    python -m experiments.visualize
+
+PPO agents train for 10 000 steps in each bandit of the zoo; the best of them by other episodes is
+shown. The GIFs lie beside the page, Brax's viewer (which loads its script from the web) in
+runs/visualize.
+"""
+
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from experiments.page import Experiment, Save, table, text
+from experiments.page import main as run
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+ENVIRONMENTS = (
+    "Acrobot-v1",
+    "CartPole-v1",
+    "MountainCar-v0",
+    "MountainCarContinuous-v0",
+    "Pendulum-v1",
+)
+HOPPER = "hopper (spring)"
+FRAMES = 6  # of the film strip
+PICTURES = 125  # of a GIF at most: five seconds
+VIEWER = Path("runs/visualize/hopper.html")
+
+
+def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None:
+    """An environment at a time: train, choose, record."""
+    for name in (*ENVIRONMENTS, HOPPER):
+        if name not in report.setdefault("environments", {}):
+            report["environments"][name] = _show(name, plan)
+            save()
+
+
+def _show(name: str, plan: Mapping[str, Any]) -> dict[str, Any]:
+    import jax
+
+    import scb
+    from scb.agents.hyperparameters import inner_loop
+    from scb.analysis import animation
+    from scb.analysis.states import follow
+    from scb.environments.zoo import open_bandit
+    from scb.statistics import estimate
+
+    brax = name == HOPPER
+    environment = "hopper" if brax else name
+    env, env_params = scb.make(environment, **({"backend": "spring"} if brax else {}))
+    bandit = open_bandit(f"Synthetic-{environment}")
+    inner = inner_loop("ppo", environment, env.action_space(env_params), sampled=False)
+    agent = inner.agent(bandit)
+    key_train, key_choose, key_show = jax.random.split(jax.random.key(plan["seed"]), 3)
+    episodes = plan["brax_episodes"] if brax else plan["episodes"]
+
+    @jax.jit
+    @jax.vmap
+    def train(key: Any) -> Any:
+        state = agent.train(key, inner.hyperparameters, bandit.default_params)
+        found = agent.evaluate(state, key_choose, episodes, env, env_params, mode=True)
+        return state, found.returns.mean()
+
+    states, returns = train(jax.random.split(key_train, plan["agents"]))
+    best = int(np.argmax(returns))
+    state = jax.tree.map(lambda x: x[best], states)
+
+    def policy(observation: Any, key: Any) -> Any:
+        return agent.act(state, observation, key, bandit.default_params, mode=True)
+
+    entry: dict[str, Any] = {"agents": estimate(np.asarray(returns, float)).as_dict()}
+    if brax:
+        _, shown = animation.save_brax_html(VIEWER, env, policy, key_show, plan["brax_steps"])
+        return {**entry, "shown": round(shown, 1), "steps": plan["brax_steps"]}
+    trajectories = follow(env, env_params, policy, key_show, 1)
+    observations = trajectories.states()
+    return {
+        **entry,
+        "shown": round(float(trajectories.returns()[0]), 1),
+        "steps": len(observations),
+        "every": plan["every"],
+        "film": [" ".join(f"{x:.4g}" for x in o) for o in observations[:: plan["every"]]],
+    }
+
+
+def film(entry: Mapping[str, Any]) -> np.ndarray:
+    """[T, O] observations of an episode, every few steps."""
+    return np.array([[float(x) for x in line.split()] for line in entry["film"]])
+
+
+def animate(report: Mapping[str, Any], docs: Path) -> None:
+    """Writes the GIFs."""
+    from scb.analysis.animation import save_gif
+
+    for name, entry in report["environments"].items():
+        if "film" in entry:
+            path = docs / "figures" / f"visualize_{name}.gif"
+            save_gif(path, name, film(entry)[:PICTURES], entry["every"])
+
+
+def _number(value: float, places: int) -> str:
+    return f"{value:.{places}f}".replace("-", "\u2212")
+
+
+def verdict(report: Mapping[str, Any]) -> str:
+    """What is seen, in figures."""
+    shown = "; ".join(
+        f"{name} {_number(entry['shown'], 0)}" for name, entry in report["environments"].items()
+    )
+    return (
+        "each agent below learned for 10 000 steps in a bandit, without one step of the environment that it is "
+        f"shown in. The episodes shown earn: {shown}."
+    )
+
+
+def body(report: Mapping[str, Any]) -> list[str]:
+    """The GIFs and the table."""
+    gifs = [
+        f"![{name}: an agent trained in its bandit](figures/visualize_{name}.gif)"
+        for name in report["environments"]
+        if name != HOPPER
+    ]
+    rows = [
+        [name, text(entry["agents"]), _number(entry["shown"], 1)]
+        for name, entry in report["environments"].items()
+    ]
+    return [
+        " ".join(gifs),
+        "",
+        f"Hopper's episode (on `spring` physics) is in `{VIEWER}` after the command has run: a page with Brax's "
+        "viewer.",
+        "",
+        *table(
+            ["environment", "return of the agents, IQM [95 %]", "return of what is shown"], rows
+        ),
+        "",
+        "PPO with the paper's fixed hyperparameters; the agent shown is the best of them by other episodes. Most "
+        "likely actions.",
+    ]
+
+
+def draw(report: Mapping[str, Any]) -> "Figure":
+    """A film strip: a row an environment, from the first step to the last."""
+    from matplotlib.figure import Figure
+
+    from scb import plotting
+    from scb.analysis.animation import picture
+
+    films = {n: e for n, e in report["environments"].items() if "film" in e}
+    with plotting.figure_style():
+        figure = Figure(figsize=(plotting.WIDTH, 1.6 * len(films)))
+        panels: Any = figure.subplots(len(films), FRAMES, squeeze=False)
+        for row, (name, entry) in zip(panels, films.items(), strict=True):
+            observations = film(entry)
+            pictures = np.linspace(0, len(observations) - 1, FRAMES).astype(int)
+            for axes, number in zip(row, pictures, strict=True):
+                picture(axes, name, observations[number])
+                step = number * entry["every"]
+                axes.set_title(f"step {step}", fontsize=8, fontweight="normal")
+            row[0].set_title(f"{name}\nstep 0", fontsize=8)
+        plotting.figure_title(figure, "Agents trained in a bandit, in its environment")
+    return figure
+
+
+EXPERIMENT = Experiment(
+    name="visualize",
+    title="Agents trained in a bandit, acting in the environment",
+    paper="figure 1, what its agents do",
+    claim="agents trained for 10 000 steps in a bandit do well in the environment, which they have never seen.",
+    presets={
+        "quick": {
+            "agents": 4,
+            "episodes": 20,
+            "brax_episodes": 4,
+            "brax_steps": 300,
+            "every": 2,
+            "seed": 50_000,
+        },
+        "paper": {
+            "agents": 20,
+            "episodes": 50,
+            "brax_episodes": 10,
+            "brax_steps": 1000,
+            "every": 2,
+            "seed": 50_000,
+        },
+    },
+    minutes={"quick": "2", "paper": "5"},
+    needs="a browser with access to the web for Hopper's page",
+    measure=measure,
+    verdict=verdict,
+    body=body,
+    draw=draw,
+    extras=animate,
+)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """The command."""
+    return run(EXPERIMENT, argv)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

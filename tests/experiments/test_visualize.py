@@ -1,0 +1,44 @@
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from experiments import visualize
+
+COMMITTED = Path(__file__).parents[2] / "docs" / "data" / "visualize.json"
+
+
+@pytest.fixture
+def report():
+    return json.loads(COMMITTED.read_text())
+
+
+def test_the_strip_shows_an_episode_from_its_start_to_its_end(report):
+    figure = visualize.draw(report)
+    assert len(figure.axes) == len(visualize.ENVIRONMENTS) * visualize.FRAMES
+    shown = visualize.film(report["environments"]["MountainCar-v0"])
+    assert -0.6 <= shown[0, 0] <= -0.4 < 0.3 < shown[-1, 0]
+
+
+def test_gifs_are_made_from_the_report(report, tmp_path):
+    entry = report["environments"]["Pendulum-v1"]
+    few = {"environments": {"Pendulum-v1": {**entry, "film": entry["film"][:5]}}}
+    visualize.animate(few, tmp_path)
+    with Image.open(tmp_path / "figures" / "visualize_Pendulum-v1.gif") as gif:
+        assert gif.n_frames == 5
+
+
+def test_the_page_says_what_the_shown_episodes_earn(report):
+    said = visualize.verdict(report)
+    assert "CartPole-v1 500" in said and "Pendulum-v1 −" in said
+    assert sum(line.startswith("| ") for line in visualize.body(report)) == 8
+
+
+@pytest.mark.slow
+def test_an_agent_is_trained_in_its_bandit_and_shown():
+    entry = visualize._show("CartPole-v1", {"agents": 2, "episodes": 2, "seed": 1, "every": 50})
+    assert entry["shown"] == entry["steps"] == 500
+    assert visualize.film(entry).shape == (10, 4)
+    assert np.abs(visualize.film(entry)[0]).max() <= 0.05
