@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from scb.statistics import Estimate
 
 SOURCES = ("bandit", "environment")
+BANDIT = "LPO (bandit)"
 CLIPS = ("ppo-0.1", "ppo", "ppo-0.3", "ppo-0.5", "ppo-1")
 TUNING_SEED = 22_000  # the clip is chosen on these agents, and reported on others
 REPORTING_SEED = 10_000
@@ -94,7 +95,7 @@ PRESETS: dict[str, dict[str, Any]] = {
 
 
 def pooled(
-    returns: Sequence[Sequence[float]], reference: Sequence[float] | None = None
+    returns: Sequence[Sequence[float]], reference: Sequence[Sequence[float]] | None = None
 ) -> "Estimate":
     """The interquartile mean over searches and agents, or its difference to a reference on the same agents.
 
@@ -103,29 +104,31 @@ def pooled(
 
     Args:
       returns: [searches][agents].
-      reference: [agents] of the same seeds.
+      reference: [other searches][agents] of the same seeds.
     """
     from scb.statistics import Estimate, iqm
 
     values = np.asarray(returns)
-    searches, agents = values.shape
+    others = None if reference is None else np.asarray(reference)
+    agents = values.shape[1]
     rng = np.random.default_rng(0)
 
-    def statistic(search: Any, agent: Any) -> np.ndarray:
+    def middle(of: np.ndarray, search: np.ndarray, agent: np.ndarray) -> np.ndarray:
         """[N, searches], [N, agents] indices -> [N]."""
-        drawn = values[search[:, :, None], agent[:, None, :]].reshape(len(search), -1)
-        middle = iqm(drawn, axis=1)
-        return middle if reference is None else middle - iqm(np.asarray(reference)[agent], axis=1)
+        return iqm(of[search[:, :, None], agent[:, None, :]].reshape(len(search), -1), axis=1)
 
-    low, high = np.percentile(
-        statistic(
-            rng.integers(0, searches, (RESAMPLES, searches)),
-            rng.integers(0, agents, (RESAMPLES, agents)),
-        ),
-        [2.5, 97.5],
-    )
-    value = statistic(np.arange(searches)[None], np.arange(agents)[None])[0]
-    return Estimate(float(value), float(low), float(high), values.size)
+    def statistic(number: int, drawn: bool) -> np.ndarray:
+        """[number] of resamples, or once of all that there is."""
+
+        def indices(size: int) -> np.ndarray:
+            return rng.integers(0, size, (number, size)) if drawn else np.arange(size)[None]
+
+        agent = indices(agents)
+        found = middle(values, indices(len(values)), agent)
+        return found if others is None else found - middle(others, indices(len(others)), agent)
+
+    low, high = np.percentile(statistic(RESAMPLES, drawn=True), [2.5, 97.5])
+    return Estimate(float(statistic(1, drawn=False)[0]), float(low), float(high), values.size)
 
 
 def search_curve(metrics: Sequence[Mapping[str, Any]], seconds: Sequence[float]) -> dict[str, Any]:
@@ -185,18 +188,27 @@ def markdown(report: Mapping[str, Any]) -> str:
     ]
     for name, table in report["evaluations"].items():
         lines += ["", f"## {name}", "", table["protocol"], ""]
+        finals, areas = table["finals"], table["areas"]
         lines += [
-            "| objective | final return, IQM [95 %] | area under the curve | difference to PPO |",
-            "| --- | --- | --- | --- |",
+            "| objective | final return, IQM [95 %] | area under the curve |",
+            "| --- | --- | --- |",
+            *(f"| {o} | {_text(pooled(finals[o]))} | {_text(pooled(areas[o]))} |" for o in finals),
+            "",
+            f"| {BANDIT} against | final return | area under the curve |",
+            "| --- | --- | --- |",
+            *(
+                f"| {o} | {_text(pooled(finals[BANDIT], finals[o]), sign=True)} "
+                f"| {_text(pooled(areas[BANDIT], areas[o]), sign=True)} |"
+                for o in finals
+                if o != BANDIT
+            ),
         ]
-        reference = table["finals"]["ppo"][0]
-        for objective, finals in table["finals"].items():
-            difference = "" if objective == "ppo" else _text(pooled(finals, reference), sign=True)
-            lines.append(
-                f"| {objective} | {_text(pooled(finals))} | {_text(pooled(table['areas'][objective]))} | {difference} |"
-            )
         if "tuned" in table:
-            lines += ["", f"The tuned clip, chosen on other agents, is {table['tuned']}."]
+            sweep = ", ".join(
+                f"{clip} {value:.0f}".replace(" -", " \u2212")
+                for clip, value in table["sweep"].items()
+            )
+            lines += ["", f"The tuned clip is {table['tuned']}: on other agents {sweep}."]
     machine = report["machine"]
     lines += [
         "",
@@ -216,6 +228,7 @@ def _text(x: "Estimate", sign: bool = False) -> str:
 def draw(report: Mapping[str, Any]) -> "Figure":
     """(i) over generations, (ii) over steps and minutes; (iii) Pendulum; (iv) Hopper."""
     from matplotlib.figure import Figure
+    from matplotlib.ticker import EngFormatter, LogLocator, NullFormatter, StrMethodFormatter
 
     from scb import plotting
 
@@ -257,12 +270,16 @@ def draw(report: Mapping[str, Any]) -> "Figure":
             panel.legend(fontsize=8)
         for panel in panels[1:]:
             panel.set_xscale("log")
+            panel.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+            panel.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+            panel.xaxis.set_minor_formatter(NullFormatter())
+        panels[1].xaxis.set_major_formatter(EngFormatter(sep=""))
         panels[0].set_ylabel("return on Pendulum of agents\ntrained with the search's mean")
         below = bottom.subplots(1, len(report["evaluations"]), squeeze=False)[0]
         for panel, (name, table) in zip(below, report["evaluations"].items(), strict=True):
             _dots(panel, table)
             number = "(iv)" if name.startswith("Hopper") else "(iii)"
-            panel.set_title(f"{number} {name}", fontsize=9)
+            panel.set_title(f"{number} {name}".replace(", ", ",\n", 1), fontsize=9)
     return figure
 
 

@@ -57,8 +57,16 @@ def test_searches_that_differ_widen_the_interval_beyond_that_of_their_agents():
 def test_a_difference_is_paired_by_agent():
     # Every agent is 10 better than the reference's: a difference of exactly 10, whoever is drawn.
     reference = [0.0, 100.0, -300.0, 50.0]
-    x = module.pooled([[r + 10.0 for r in reference]], reference)
+    x = module.pooled([[r + 10.0 for r in reference]], [reference])
     assert (x.value, x.low, x.high) == pytest.approx((10.0, 10.0, 10.0))
+
+
+def test_a_difference_to_searches_that_disagree_is_uncertain():
+    reference = [50.0] * 4
+    others = [[50.0 + shift] * 4 for shift in (-30.0, -10.0, 10.0, 30.0)]
+    x = module.pooled([reference], others)
+    assert x.value == pytest.approx(0.0, abs=1e-9)
+    assert x.low < -15.0 and x.high > 15.0
 
 
 @pytest.fixture
@@ -92,7 +100,11 @@ def report():
         "machine": {"cores": 2, "processor": "a processor"},
         "searches": searches,
         "evaluations": {
-            "Pendulum, Flax's initialisation": {**table, "tuned": "ppo-0.5"},
+            "Pendulum, Flax's initialisation": {
+                **table,
+                "tuned": "ppo-0.5",
+                "sweep": {"ppo": -900.0, "ppo-0.5": -400.0},
+            },
             "Hopper, spring physics": table,
         },
     }
@@ -104,8 +116,8 @@ def test_the_page_says_costs_returns_and_differences(report, tmp_path):
     # (-850 of PPO, -200 of the pooled bandit's objectives.)
     assert "| ppo | −850 [" in page
     assert "| LPO (bandit) | −200 [" in page
-    assert "| +650 [" in page
-    assert "The tuned clip, chosen on other agents, is ppo-0.5." in page
+    assert "| ppo | +650 [" in page and "| LPO (environment) | +100 [" in page
+    assert "The tuned clip is ppo-0.5: on other agents ppo −900, ppo-0.5 −400." in page
     path = plotting.save(module.draw(report), tmp_path / "figure.png")
     assert path.stat().st_size > 20_000
 
