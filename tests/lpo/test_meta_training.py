@@ -233,6 +233,7 @@ def test_every_task_gives_its_own_entries_of_fitness(config):
     }
 
 
+@pytest.mark.slow
 def test_tasks_of_other_shapes_learn_one_objective(config):
     # Three observations and a torque, four observations and two actions; ranks, since a pendulum
     # earns thousands below zero and a pole one a step.
