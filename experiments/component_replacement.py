@@ -7,7 +7,7 @@ reward, its Q-function as the reward) on two distributions of states (the bandit
 """
 
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -222,10 +222,5 @@ EXPERIMENT = Experiment(
 )
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """The command."""
-    return run(EXPERIMENT, argv)
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(run(EXPERIMENT))

@@ -208,10 +208,5 @@ EXPERIMENT = Experiment(
 )
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """The command."""
-    return run(EXPERIMENT, argv)
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(run(EXPERIMENT))

@@ -80,7 +80,7 @@ def check_run(config: MetaTrainingConfig) -> list[float]:
 WORST_PENDULUM_RETURN = -16.3 * 200
 
 
-@pytest.mark.parametrize("fitness", ["return", "area"])
+@pytest.mark.parametrize("fitness", ["return", pytest.param("area", marks=pytest.mark.slow)])
 def test_fitness_in_the_bandit_is_the_reward_of_one_step(config, fitness):
     values = check_run(replace(config, fitness=fitness))
     assert np.abs(values).max() < 100

@@ -145,6 +145,7 @@ def test_physics_are_for_brax_alone(trained):
     assert list(comparisons) == scores.environments == ["hopper", "CartPole-v1"]
 
 
+@pytest.mark.slow
 def test_a_suite_is_kept_as_it_comes_and_completed(trained, tmp_path, capsys):
     out = tmp_path / "suite"
     arguments = {"suite": "classic", "objectives": ("ppo", "dpo"), "seeds": 3, "out": out}

@@ -427,7 +427,8 @@ def test_a_curriculum_must_end_within_the_environments_limit():
 
 
 # The command line's test discovers a T every time.
-@pytest.mark.parametrize("parameterization", [pytest.param("T", marks=pytest.mark.slow), "TI"])
+@pytest.mark.slow
+@pytest.mark.parametrize("parameterization", ["T", "TI"])
 def test_a_synthetic_mdp_is_discovered_and_opens_as_an_environment(parameterization, tmp_path):
     config = replace(CONFIG, parameterization=parameterization, max_steps=5)
     problem, outcome = discover(config, quiet=True)
