@@ -12,6 +12,11 @@ from pathlib import Path
 from typing import Any
 
 
+def _short(name: str) -> str:
+    """What a comparison calls an objective: a file by its stem, for a path means nothing elsewhere."""
+    return Path(name).stem if name.endswith(".npz") else name
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -45,10 +50,12 @@ def main() -> int:
             "steps": curves[0]["steps"][-1],
             "episodes": curves[0]["episodes"],
             "mode_actions": curves[0]["mode_actions"],
-            "final_iqm": {c["objective"]: c["final_iqm"] for c in curves},
-            "area_iqm": {c["objective"]: c["area_iqm"] for c in curves},
+            "final_iqm": {_short(c["objective"]): c["final_iqm"] for c in curves},
+            "area_iqm": {_short(c["objective"]): c["area_iqm"] for c in curves},
             "reference": comparison["reference"],
-            "paired_differences": comparison["paired_differences"],
+            "paired_differences": {
+                _short(name): x for name, x in comparison["paired_differences"].items()
+            },
         }
     metadata["results"] = results
     metadata["seeds"] = {**metadata["seeds"], "reporting": reporting_seeds}

@@ -103,6 +103,7 @@ def test_only_a_temporal_drift_changes_with_progress():
     assert {name for name, changed in changes.items() if changed} == {
         *(f"learned-{base}-temporal" for base in BASES),
         "formula-none",
+        "ta-lpo",
     }
 
 
