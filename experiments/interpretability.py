@@ -6,24 +6,17 @@
 """
 
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from experiments.page import Experiment, Save, table, text
+from experiments.page import CLASSIC_CONTROL, Experiment, Save, packed, table, text, unpacked
 from experiments.page import main as run
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-ENVIRONMENTS = (
-    "Acrobot-v1",
-    "CartPole-v1",
-    "MountainCar-v0",
-    "MountainCarContinuous-v0",
-    "Pendulum-v1",
-)
 POINTS = 60  # of the grid of best actions, in either direction
 # An entry that causes less than this share of the reward's variance is one that it hardly depends on.
 HARDLY = 0.1
@@ -31,7 +24,7 @@ HARDLY = 0.1
 
 def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None:
     """Everything of an environment at a time."""
-    for name in ENVIRONMENTS:
+    for name in CLASSIC_CONTROL:
         if name not in report.setdefault("environments", {}):
             report["environments"][name] = _examine(name, plan)
             save()
@@ -70,23 +63,14 @@ def _examine(name: str, plan: Mapping[str, Any]) -> dict[str, Any]:
         "limits": [list(x) for x in plane.limits],
         "num_actions": parts["num_actions"],
         "bounds": parts["bounds"],
-        "actions": [_row(row) for row in actions.reshape(POINTS, POINTS)],
-        "episode": [_row(point) for point in plane.project(parts["episode"])],
+        "actions": packed(actions.reshape(POINTS, POINTS)),
+        "episode": packed(plane.project(parts["episode"])),
     }
-
-
-def _row(values: Any) -> str:
-    # One line of the JSON; the numbers of a grid on a line each would make it unreadable.
-    return " ".join(f"{x:.4g}" for x in values)
-
-
-def _rows(lines: Sequence[str]) -> np.ndarray:
-    return np.array([[float(x) for x in line.split()] for line in lines])
 
 
 def nothing_done(entry: Mapping[str, Any]) -> float:
     """The share of the plane where the best action of a mountain car is next to none."""
-    actions = _rows(entry["actions"])
+    actions = unpacked(entry["actions"])
     if entry["num_actions"]:
         return float(np.mean(actions == 1))  # of push left, nothing, push right
     return float(np.mean(np.abs(actions) < 0.1))
@@ -165,19 +149,19 @@ def draw(report: Mapping[str, Any]) -> "Figure":
 
     with plotting.figure_style():
         figure = Figure(figsize=(15.0, 6.0))
-        panels: Any = figure.subplots(2, len(ENVIRONMENTS), height_ratios=[1.6, 1.0])
+        panels: Any = figure.subplots(2, len(CLASSIC_CONTROL), height_ratios=[1.6, 1.0])
         for column, (name, found) in enumerate(report["environments"].items()):
             top, bottom = panels[:, column]
             limits: Any = tuple(map(tuple, found["limits"]))
             # Already in the plane, both the actions and the episode.
             plane = Plane(tuple(found["labels"]), limits, lambda x: x, lambda x: x)
             drawn = figures.action_grid(
-                top, plane, _rows(found["actions"]), found["num_actions"], found["bounds"]
+                top, plane, unpacked(found["actions"]), found["num_actions"], found["bounds"]
             )
             bar = figure.colorbar(drawn, ax=top, location="bottom", aspect=30)
             if found["num_actions"]:
                 bar.set_ticks(range(found["num_actions"]))
-            figures.draw_trajectory(top, plane, _rows(found["episode"]))
+            figures.draw_trajectory(top, plane, unpacked(found["episode"]))
             top.set_title(name, fontsize=10)
             shares = [x["value"] for x in found["importance"].values()]
             figures.importance_bars(bottom, list(found["importance"]), shares)

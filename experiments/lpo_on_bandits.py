@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from experiments.page import text
 from lpo.cli import configure_jax
 
 if TYPE_CHECKING:
@@ -192,13 +193,13 @@ def markdown(report: Mapping[str, Any]) -> str:
         lines += [
             "| objective | final return, IQM [95 %] | area under the curve |",
             "| --- | --- | --- |",
-            *(f"| {o} | {_text(pooled(finals[o]))} | {_text(pooled(areas[o]))} |" for o in finals),
+            *(f"| {o} | {text(pooled(finals[o]))} | {text(pooled(areas[o]))} |" for o in finals),
             "",
             f"| {BANDIT} against | final return | area under the curve |",
             "| --- | --- | --- |",
             *(
-                f"| {o} | {_text(pooled(finals[BANDIT], finals[o]), sign=True)} "
-                f"| {_text(pooled(areas[BANDIT], areas[o]), sign=True)} |"
+                f"| {o} | {text(pooled(finals[BANDIT], finals[o]), sign=True)} "
+                f"| {text(pooled(areas[BANDIT], areas[o]), sign=True)} |"
                 for o in finals
                 if o != BANDIT
             ),
@@ -218,11 +219,6 @@ def markdown(report: Mapping[str, Any]) -> str:
         "",
     ]
     return "\n".join(lines)
-
-
-def _text(x: "Estimate", sign: bool = False) -> str:
-    text = f"{x.value:+.0f}" if sign else f"{x.value:.0f}"
-    return f"{text} [{x.low:.0f}, {x.high:.0f}]".replace("-", "\u2212")
 
 
 def draw(report: Mapping[str, Any]) -> "Figure":

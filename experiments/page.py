@@ -1,6 +1,6 @@
 """What the paper's experiments share: presets, a report that is continued, and a page of one form.
 
-An experiment is a module with an `EXPERIMENT` and a `main`. Its report is a JSON object that says
+An experiment is a module with an `EXPERIMENT`, which `main` runs. Its report is a JSON object that says
 what was measured, with which preset and versions, and how long it took; page and figure are made
 from it alone. What a report holds already is not measured again, so that the same command continues
 an interrupted one.
@@ -15,15 +15,25 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from lpo.cli import configure_jax
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+    from numpy.typing import NDArray
 
     from scb.statistics import Estimate
 
 DATA = Path("docs/data")
 DOCS = Path("docs")
+CLASSIC_CONTROL = (
+    "Acrobot-v1",
+    "CartPole-v1",
+    "MountainCar-v0",
+    "MountainCarContinuous-v0",
+    "Pendulum-v1",
+)
 Save = Callable[[], None]
 
 
@@ -86,6 +96,16 @@ def page(experiment: Experiment, report: Mapping[str, Any]) -> str:
         "",
     ]
     return "\n".join(lines)
+
+
+def packed(rows: Any) -> list[str]:
+    """[N, M] numbers as a line of JSON a row; one number a line would make a report unreadable."""
+    return [" ".join(f"{x:.4g}" for x in row) for row in rows]
+
+
+def unpacked(lines: Sequence[str]) -> "NDArray[np.floating]":
+    """What `packed` packed, to four digits."""
+    return np.array([[float(x) for x in line.split()] for line in lines])
 
 
 def text(estimate: "Estimate | Mapping[str, Any]", places: int = 0, sign: bool = False) -> str:

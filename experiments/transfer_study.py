@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from experiments.page import text
 from lpo.cli import configure_jax
 
 if TYPE_CHECKING:
@@ -110,11 +111,6 @@ def summary(report: Mapping[str, Any]) -> list[dict[str, Any]]:
     return rows
 
 
-def _text(estimate: Any) -> str:
-    text = f"{estimate.value:.0f} [{estimate.low:.0f}, {estimate.high:.0f}]"
-    return text.replace("-", "\u2212")
-
-
 def markdown(report: Mapping[str, Any]) -> str:
     """The page with the table."""
     evaluations = [e["name"] for e in report["evaluations"]]
@@ -139,7 +135,7 @@ def markdown(report: Mapping[str, Any]) -> str:
     for row in summary(report):
         cells = []
         for evaluation in evaluations:
-            cell = _text(row[evaluation]) if evaluation in row else ""
+            cell = text(row[evaluation]) if evaluation in row else ""
             difference = row.get(f"{evaluation}, difference")
             if difference is not None and (difference.low > 0 or difference.high < 0):
                 sign = "+" if difference.value > 0 else "\u2212"

@@ -14,19 +14,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from experiments.page import Experiment, Save, table, text
+from experiments.page import CLASSIC_CONTROL, Experiment, Save, packed, table, text, unpacked
 from experiments.page import main as run
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-ENVIRONMENTS = (
-    "Acrobot-v1",
-    "CartPole-v1",
-    "MountainCar-v0",
-    "MountainCarContinuous-v0",
-    "Pendulum-v1",
-)
 HOPPER = "hopper (spring)"
 FRAMES = 6  # of the film strip
 PICTURES = 125  # of a GIF at most: five seconds
@@ -35,7 +28,7 @@ VIEWER = Path("runs/visualize/hopper.html")
 
 def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None:
     """An environment at a time: train, choose, record."""
-    for name in (*ENVIRONMENTS, HOPPER):
+    for name in (*CLASSIC_CONTROL, HOPPER):
         if name not in report.setdefault("environments", {}):
             report["environments"][name] = _show(name, plan)
             save()
@@ -85,13 +78,13 @@ def _show(name: str, plan: Mapping[str, Any]) -> dict[str, Any]:
         "shown": round(float(trajectories.returns()[0]), 1),
         "steps": len(observations),
         "every": plan["every"],
-        "film": [" ".join(f"{x:.4g}" for x in o) for o in observations[:: plan["every"]]],
+        "film": packed(observations[:: plan["every"]]),
     }
 
 
 def film(entry: Mapping[str, Any]) -> np.ndarray:
     """[T, O] observations of an episode, every few steps."""
-    return np.array([[float(x) for x in line.split()] for line in entry["film"]])
+    return unpacked(entry["film"])
 
 
 def animate(report: Mapping[str, Any], docs: Path) -> None:

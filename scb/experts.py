@@ -17,7 +17,7 @@ from flax import linen as nn
 from gymnax.environments import environment, spaces
 
 from scb.agents import networks
-from scb.agents.agent import clip_to_space, scale_to_space
+from scb.agents.agent import Agent, clip_to_space, scale_to_space
 from scb.agents.normalization import RunningStatistics, normalize, update_statistics
 from scb.agents.settings import Setting
 from scb.curriculum import CurriculumConfig, horizon, with_limit
@@ -59,6 +59,30 @@ def judged(
     return Expert(policy, float(np.mean(episodes)), steps)
 
 
+def best_agent(
+    agent: Agent,
+    hyperparameters: Any,
+    env_params: Any,
+    key: jax.Array,
+    num_agents: int,
+    num_episodes: int,
+) -> tuple[Any, float]:
+    """(the state of the best of several agents trained alike, its mean return), by episodes of mode actions."""
+
+    @jax.jit
+    def train(key: jax.Array) -> tuple[Any, jax.Array]:
+        key_train, key_evaluate = jax.random.split(key)
+        state = agent.train(key_train, hyperparameters, env_params)
+        episodes = agent.evaluate(
+            state, key_evaluate, num_episodes, env_params=env_params, mode=True
+        )
+        return state, episodes.returns.mean()
+
+    states, returns = jax.vmap(train)(jax.random.split(key, num_agents))
+    best = int(jnp.argmax(returns))
+    return jax.tree.map(lambda x: x[best], states), float(returns[best])
+
+
 def train_expert(
     env: environment.Environment[Any, Any],
     env_params: Any,
@@ -68,24 +92,14 @@ def train_expert(
 ) -> Expert:
     """The best of `num_experts` agents trained on the environment itself, by 20 episodes of mode actions."""
     agent = setting.agent(env)
-
-    @jax.jit
-    def train(key: jax.Array) -> tuple[Any, jax.Array]:
-        key_train, key_evaluate = jax.random.split(key)
-        state = agent.train(key_train, setting.hyperparameters, env_params)
-        episodes = agent.evaluate(state, key_evaluate, EPISODES, env_params=env_params, mode=True)
-        return state, episodes.returns.mean()
-
-    states, returns = jax.vmap(train)(jax.random.split(key, num_experts))
-    best = int(jnp.argmax(returns))
-    state = jax.tree.map(lambda x: x[best], states)
+    state, best = best_agent(agent, setting.hyperparameters, env_params, key, num_experts, EPISODES)
 
     def policy(observation: jax.Array) -> jax.Array:
         return agent.act(state, observation, key, env_params, mode=True)
 
     steps = setting.num_environment_steps * num_experts
     evaluation = num_experts * EPISODES * int(env_params.max_steps_in_episode)
-    return Expert(policy, float(returns[best]), steps + evaluation)
+    return Expert(policy, best, steps + evaluation)
 
 
 @dataclass(frozen=True)

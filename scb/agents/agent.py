@@ -164,10 +164,16 @@ def clip_to_space(action: jax.Array, space: spaces.Box | spaces.Discrete) -> jax
     return jnp.clip(jnp.reshape(action, space.shape), space.low, space.high)
 
 
-def scale_to_space(squashed: jax.Array, space: spaces.Box) -> jax.Array:
-    """[..., A] in [-1, 1] -> [..., A] between the bounds of the flattened action."""
+def flat_bounds(space: spaces.Box) -> tuple[jax.Array, jax.Array]:
+    """[A], [A] the lower and upper bounds of the flattened space."""
     low, high = (
         jnp.ravel(jnp.broadcast_to(jnp.asarray(bound, jnp.float32), space.shape))
         for bound in (space.low, space.high)
     )
+    return low, high
+
+
+def scale_to_space(squashed: jax.Array, space: spaces.Box) -> jax.Array:
+    """[..., A] in [-1, 1] -> [..., A] between the bounds of the flattened action."""
+    low, high = flat_bounds(space)
     return low + (squashed + 1.0) * 0.5 * (high - low)

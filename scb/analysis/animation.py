@@ -13,6 +13,7 @@ from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 
 from scb import plotting
+from scb.analysis.states import record_episode
 from scb.environments.brax import BraxEnvironment
 from scb.errors import UserError
 
@@ -142,31 +143,14 @@ def save_brax_html(
     """
     from brax.io import html
 
-    env_params = env.default_params
-    key_reset, key_steps = jax.random.split(key)
-
-    @jax.jit
-    def episode(key_reset: jax.Array, key_steps: jax.Array) -> Any:
-        observation, state = env.reset_env(key_reset, env_params)
-
-        def step(carry: Any, key: jax.Array) -> Any:
-            observation, state, active = carry
-            key_act, key_step = jax.random.split(key)
-            shown = state.brax_state.pipeline_state
-            action = policy(observation, key_act)
-            observation, state, reward, terminated, _ = env.step_env(
-                key_step, state, action, env_params
-            )
-            return (observation, state, active & ~terminated), (shown, reward, active)
-
-        carry = (observation, state, jax.numpy.bool_(True))
-        return jax.lax.scan(step, carry, jax.random.split(key_steps, num_steps))[1]
-
-    shown, rewards, active = episode(key_reset, key_steps)
-    length = int(np.sum(active))
+    record, standing = jax.jit(
+        lambda key: record_episode(env, env.default_params, policy, key, num_steps)
+    )(key)
+    length = int(np.sum(record.active))
+    shown = standing.brax_state.pipeline_state
     states = [jax.tree.map(lambda x, i=i: x[i], shown) for i in range(length)]
     system = env.brax_env.sys.tree_replace({"opt.timestep": env.brax_env.dt})
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(html.render(system, states, colab=False))
-    return path, float(np.sum(np.asarray(rewards)[:length]))
+    return path, float(np.sum(np.asarray(record.rewards)[:length]))

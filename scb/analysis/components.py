@@ -22,6 +22,7 @@ from scb.agents.sac import SAC
 from scb.agents.settings import environment_setting
 from scb.environments.synthetic import BanditParams, BanditState, SyntheticBandit
 from scb.evaluation import Policy, evaluate
+from scb.experts import best_agent
 
 Reward = Callable[[jax.Array, jax.Array], jax.Array]  # ([O] observation, action) -> []
 
@@ -101,21 +102,10 @@ def train_sac_expert(
     agent = setting.agent(env)
     assert isinstance(agent, SAC)
 
-    @jax.jit
-    @jax.vmap
-    def train(key: jax.Array) -> tuple[Any, jax.Array]:
-        key_train, key_evaluate = jax.random.split(key)
-        state = agent.train(key_train, setting.hyperparameters, env_params)
-        episodes = agent.evaluate(
-            state, key_evaluate, num_episodes, env_params=env_params, mode=True
-        )
-        return state, episodes.returns.mean()
-
-    states, returns = train(jax.random.split(key, num_agents))
-    best = int(jnp.argmax(returns))
-    return SACExpert(
-        agent, jax.tree.map(lambda x: x[best], states), env_params, float(returns[best])
+    state, mean_return = best_agent(
+        agent, setting.hyperparameters, env_params, key, num_agents, num_episodes
     )
+    return SACExpert(agent, state, env_params, mean_return)
 
 
 def action_reward(expert: SACExpert, space: spaces.Box | spaces.Discrete) -> Reward:

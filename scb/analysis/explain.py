@@ -9,6 +9,7 @@ import numpy as np
 from gymnax.environments import environment, spaces
 from rich.console import Console
 
+from scb.agents.agent import flat_bounds
 from scb.analysis.importance import reward_variance
 from scb.analysis.optimal_actions import optimal_actions, optimal_policy
 from scb.analysis.planes import observation_names, plane_for
@@ -50,21 +51,21 @@ def explain(
     importance = np.asarray(reward_variance(bandit, jnp.asarray(contexts), key_vary))
     names = observation_names(environment_name, bandit.observation_size)
     trajectories = follow(env, env_params, optimal_policy(bandit), key_episode, episodes)
-    earned = estimate(trajectories.returns())
+    returns = trajectories.returns()
+    earned = estimate(returns)
     best = jax.jit(jax.vmap(optimal_actions(bandit)))
     discrete = isinstance(space, spaces.Discrete)
-    first, last = (
-        (0, 0)
-        if discrete
-        else (_flat(space.low, space.shape)[0], _flat(space.high, space.shape)[0])
-    )
+    bounds = None
+    if not isinstance(space, spaces.Discrete):
+        low, high = flat_bounds(space)
+        bounds = (float(low[0]), float(high[0]))
 
     def drawn(observations: np.ndarray) -> np.ndarray:
         actions = np.asarray(best(jnp.asarray(observations)))
         return actions.reshape(len(observations), -1)[:, 0]
 
     visited = trajectories.states()
-    returns = trajectories.returns()
+    shown = visited[:: max(1, len(visited) // STATES)]
     usual = int(np.argsort(returns)[len(returns) // 2])  # the episode to draw: of median return
     numbers = {
         "bandit": bandit.name,
@@ -79,28 +80,24 @@ def explain(
     if bandit.observation_size < 2:
         return numbers, {}
     several = not discrete and bandit.num_actions > 1
-    everything = np.concatenate([contexts, visited[:: max(1, len(visited) // STATES)]])
-    observed = env.observation_space(env_params)
-    box = (_flat(observed.low, observed.shape), _flat(observed.high, observed.shape))
+    everything = np.concatenate([contexts, shown])
+    low, high = flat_bounds(env.observation_space(env_params))
+    box = (np.asarray(low), np.asarray(high))
     parts = {
         "name": bandit.name,
         "summary": f"its optimal policy earns {earned} in {environment_name}",
         "plane": plane_for(environment_name, everything, importance.tolist(), box),
         "best": drawn,
         "num_actions": int(space.n) if discrete else None,
-        "bounds": None if discrete else (float(first), float(last)),
+        "bounds": bounds,
         "episode": trajectories.observations[usual][trajectories.active[usual]],
         "contexts": contexts,
-        "visited": visited[:: max(1, len(visited) // STATES)],
+        "visited": shown,
         "names": names,
         "importance": importance.tolist(),
         "action": "action" + (" (first dimension)" if several else ""),
     }
     return numbers, parts
-
-
-def _flat(bound: Any, shape: tuple[int, ...]) -> np.ndarray:
-    return np.ravel(np.broadcast_to(np.asarray(bound), shape))
 
 
 def explain_command(

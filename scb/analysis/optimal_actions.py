@@ -14,7 +14,7 @@ import numpy as np
 import optax
 from gymnax.environments import spaces
 
-from scb.agents.agent import clip_to_space
+from scb.agents.agent import clip_to_space, flat_bounds
 from scb.environments.synthetic import BanditParams, SyntheticBandit
 from scb.errors import UserError, unknown_name
 from scb.evaluation import Policy
@@ -33,8 +33,8 @@ def optimal_actions(
     Args:
       bandit: whose noiseless reward is maximised.
       params: its parameters; its own where None.
-      method: for continuous actions. "gradient" climbs from 16 evenly spread actions and keeps the
-        best; "grid" tries 101 values in each dimension. Discrete actions are all tried.
+      method: for continuous actions. "gradient" climbs from the centre and 15 random actions and keeps
+        the best; "grid" tries 101 values in each dimension. Discrete actions are all tried.
 
     Returns:
       [O] context -> action within the bounds, of the action space's shape. To be jitted and vmapped
@@ -69,18 +69,9 @@ def optimal_policy(
     return lambda observation, key: best(jnp.ravel(observation))
 
 
-def _bounds(space: spaces.Box) -> tuple[np.ndarray, np.ndarray]:
-    """[A], [A] of the flattened action."""
-    low, high = (
-        np.ravel(np.broadcast_to(np.asarray(x, np.float32), space.shape))
-        for x in (space.low, space.high)
-    )
-    return low, high
-
-
 def _grid(space: spaces.Box) -> jax.Array:
     """[N, ...] every combination of evenly spaced values."""
-    low, high = _bounds(space)
+    low, high = (np.asarray(x) for x in flat_bounds(space))
     number = GRID_POINTS**low.size
     if number > LARGEST_GRID:
         raise UserError(
@@ -94,11 +85,11 @@ def _grid(space: spaces.Box) -> jax.Array:
 def _ascent(
     bandit: SyntheticBandit, params: BanditParams, space: spaces.Box
 ) -> Callable[[jax.Array], jax.Array]:
-    low, high = (jnp.asarray(x) for x in _bounds(space))
-    # The centre, and a Halton-like spread that is the same in every context.
-    spread = jax.random.uniform(jax.random.key(0), (STARTS - 1, low.size))
-    starts = low + (high - low) * jnp.concatenate([jnp.full((1, low.size), 0.5), spread])
-    # In units of the action's range, so that one step size suits every environment.
+    low, high = flat_bounds(space)
+    # In units of the action's range, so that one step size suits every environment: the centre, and
+    # random actions that are the same in every context.
+    random = jax.random.uniform(jax.random.key(0), (STARTS - 1, low.size))
+    starts = jnp.concatenate([jnp.full((1, low.size), 0.5), random])
     optimizer = optax.adam(optax.cosine_decay_schedule(0.1, STEPS))
 
     def reward(unit: jax.Array, context: jax.Array) -> jax.Array:
@@ -115,10 +106,8 @@ def _ascent(
         (unit, _), _ = jax.lax.scan(step, (start, optimizer.init(start)), None, STEPS)
         return unit, reward(unit, context)
 
-    units = (starts - low) / (high - low)
-
     def best(context: jax.Array) -> jax.Array:
-        ends, rewards = jax.vmap(climb, in_axes=(0, None))(units, context)
+        ends, rewards = jax.vmap(climb, in_axes=(0, None))(starts, context)
         action = low + (high - low) * ends[jnp.argmax(rewards)]
         return clip_to_space(action, space)
 

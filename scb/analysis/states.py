@@ -64,28 +64,34 @@ def follow(
       num_steps: T, after which an episode is cut; None for the environment's own limit.
     """
     steps = int(env_params.max_steps_in_episode) if num_steps is None else num_steps
-
-    def episode(key: jax.Array) -> Any:
-        key_reset, key_steps = jax.random.split(key)
-        observation, state = env.reset_env(key_reset, env_params)
-
-        def step(carry: Any, key: jax.Array) -> Any:
-            observation, state, active = carry
-            key_act, key_step = jax.random.split(key)
-            action = policy(observation, key_act)
-            after, state, reward, terminated, _ = env.step_env(key_step, state, action, env_params)
-            ended = terminated | env.is_truncated(state, env_params)
-            record = (jnp.ravel(observation), action, jnp.reshape(reward, ()), active)
-            return (after, state, active & ~ended), record
-
-        start = (observation, state, jnp.bool_(True))
-        return jax.lax.scan(step, start, jax.random.split(key_steps, steps))[1]
-
-    records = jax.jit(jax.vmap(episode))(jax.random.split(key, num_episodes))
+    records = jax.jit(jax.vmap(lambda key: record_episode(env, env_params, policy, key, steps)[0]))(
+        jax.random.split(key, num_episodes)
+    )
     return Trajectories(*(np.asarray(x) for x in records))
 
 
-def pick(states: np.ndarray, number: int, seed: int = 0) -> np.ndarray:
-    """[number, O] of [N, O] states, without replacement where there are enough."""
-    rng = np.random.default_rng(seed)
-    return states[rng.choice(len(states), number, replace=len(states) < number)]
+def record_episode(
+    env: environment.Environment[Any, Any],
+    env_params: Any,
+    policy: Callable[[jax.Array, jax.Array], jax.Array],
+    key: jax.Array,
+    num_steps: int,
+) -> tuple[Trajectories, Any]:
+    """One episode of a policy, traceable: every step of it without the axis E, and the [T] states it stood in."""
+    key_reset, key_steps = jax.random.split(key)
+    observation, state = env.reset_env(key_reset, env_params)
+
+    def step(carry: Any, key: jax.Array) -> Any:
+        observation, before, active = carry
+        key_act, key_step = jax.random.split(key)
+        action = policy(observation, key_act)
+        after, state, reward, terminated, _ = env.step_env(key_step, before, action, env_params)
+        ended = terminated | env.is_truncated(state, env_params)
+        record = Trajectories(jnp.ravel(observation), action, jnp.reshape(reward, ()), active)  # type: ignore[arg-type]
+        return (after, state, active & ~ended), (record, before)
+
+    start = (observation, state, jnp.bool_(True))
+    records: tuple[Trajectories, Any] = jax.lax.scan(
+        step, start, jax.random.split(key_steps, num_steps)
+    )[1]
+    return records

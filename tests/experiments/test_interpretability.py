@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 
 from experiments import interpretability
+from experiments.page import CLASSIC_CONTROL, unpacked
 
 COMMITTED = Path(__file__).parents[2] / "docs" / "data" / "interpretability.json"
 
 
 def test_one_environment_is_examined(monkeypatch):
-    monkeypatch.setattr(interpretability, "ENVIRONMENTS", ("MountainCar-v0",))
+    monkeypatch.setattr(interpretability, "CLASSIC_CONTROL", ("MountainCar-v0",))
     report, saved = {}, []
     plan = {"episodes": 4, "repetitions": 2, "seed": 3}
     interpretability.measure(plan, report, lambda: saved.append(1))
@@ -20,11 +21,11 @@ def test_one_environment_is_examined(monkeypatch):
     assert found["importance"]["velocity"]["value"] > 3 * found["importance"]["position"]["value"]
     # Nothing is ever better than pushing; and a car that rolls to the right is pushed there.
     assert interpretability.nothing_done(found) == 0.0
-    actions = interpretability._rows(found["actions"])
+    actions = unpacked(found["actions"])
     assert actions.shape == (60, 60)
     assert (actions[-1] == 2).all() and (actions[0] == 0).all()
     # The episode starts in the valley and ends at the goal.
-    episode = interpretability._rows(found["episode"])
+    episode = unpacked(found["episode"])
     assert -0.6 <= episode[0, 0] <= -0.4 and episode[-1, 0] > 0.4
     # What is there is not examined again.
     interpretability.measure(plan, report, lambda: saved.append(2))
@@ -50,7 +51,7 @@ def test_the_verdict_follows_the_figures(report):
 def test_the_figure_has_a_map_and_bars_of_each_environment(report):
     figure = interpretability.draw(report)
     titles = [axes.get_title(loc="left") for axes in figure.axes]
-    assert set(interpretability.ENVIRONMENTS) <= set(titles)
+    assert set(CLASSIC_CONTROL) <= set(titles)
     rows = sum(len(x["importance"]) for x in report["environments"].values())
     assert sum(len(axes.patches) for axes in figure.axes) >= rows
     assert len(interpretability.body(report)) > rows

@@ -6,6 +6,7 @@ import pytest
 from PIL import Image
 
 from experiments import visualize
+from experiments.page import CLASSIC_CONTROL
 
 COMMITTED = Path(__file__).parents[2] / "docs" / "data" / "visualize.json"
 
@@ -17,7 +18,7 @@ def report():
 
 def test_the_strip_shows_an_episode_from_its_start_to_its_end(report):
     figure = visualize.draw(report)
-    assert len(figure.axes) == len(visualize.ENVIRONMENTS) * visualize.FRAMES
+    assert len(figure.axes) == len(CLASSIC_CONTROL) * visualize.FRAMES
     shown = visualize.film(report["environments"]["MountainCar-v0"])
     assert -0.6 <= shown[0, 0] <= -0.4 < 0.3 < shown[-1, 0]
 

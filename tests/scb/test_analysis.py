@@ -12,7 +12,7 @@ from scb.analysis import figures
 from scb.analysis.importance import reward_variance
 from scb.analysis.optimal_actions import optimal_actions, optimal_policy
 from scb.analysis.planes import observation_names, plane_for
-from scb.analysis.states import bandit_states, follow, pick
+from scb.analysis.states import bandit_states, follow
 from scb.environments.synthetic import BanditConfig, SyntheticBandit
 from scb.environments.zoo import open_bandit
 from scb.errors import UserError
@@ -114,12 +114,6 @@ def test_follow_earns_what_evaluate_earns():
     assert followed.states().shape == (lengths.sum(), 4)
     # A pole's first observation is within 0.05 of zero, as the environment says.
     assert np.abs(followed.observations[:, 0]).max() <= 0.05
-
-
-def test_pick_repeats_only_where_it_must():
-    states = np.arange(10.0)[:, None]
-    assert len(np.unique(pick(states, 10))) == 10
-    assert pick(states, 25).shape == (25, 1)
 
 
 def test_pendulum_is_drawn_over_its_angle():
