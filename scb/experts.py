@@ -13,16 +13,15 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from flax import linen as nn
-from gymnax.environments import environment, spaces
+from gymnax.environments import environment
 
-from scb.agents import networks
-from scb.agents.agent import Agent, clip_to_space, scale_to_space
+from scb.agents.agent import Agent
 from scb.agents.normalization import RunningStatistics, normalize, update_statistics
 from scb.agents.settings import Setting
 from scb.curriculum import CurriculumConfig, horizon, with_limit
 from scb.evaluation import evaluate
 from scb.evolution import EnvironmentSteps, EvolutionConfig, evolve
+from scb.neuroevolution import network_action, policy_network
 
 EPISODES = 20  # by which an expert is judged
 
@@ -61,18 +60,19 @@ def judged(
 
 def best_agent(
     agent: Agent,
-    hyperparameters: Any,
+    setting: Setting,
     env_params: Any,
     key: jax.Array,
     num_agents: int,
     num_episodes: int,
 ) -> tuple[Any, float]:
     """(the state of the best of several agents trained alike, its mean return), by episodes of mode actions."""
+    training_params = setting.training_params(env_params)
 
     @jax.jit
     def train(key: jax.Array) -> tuple[Any, jax.Array]:
         key_train, key_evaluate = jax.random.split(key)
-        state = agent.train(key_train, hyperparameters, env_params)
+        state = agent.train(key_train, setting.hyperparameters, training_params)
         episodes = agent.evaluate(
             state, key_evaluate, num_episodes, env_params=env_params, mode=True
         )
@@ -92,7 +92,7 @@ def train_expert(
 ) -> Expert:
     """The best of `num_experts` agents trained on the environment itself, by 20 episodes of mode actions."""
     agent = setting.agent(env)
-    state, best = best_agent(agent, setting.hyperparameters, env_params, key, num_experts, EPISODES)
+    state, best = best_agent(agent, setting, env_params, key, num_experts, EPISODES)
 
     def policy(observation: jax.Array) -> jax.Array:
         return agent.act(state, observation, key, env_params, mode=True)
@@ -140,20 +140,13 @@ class _PolicySearch:
             env_params.max_steps_in_episode if curriculum is None else curriculum.longest
         )
         self.space = env.action_space(env_params)
-        size = (config.hidden_size,)
-        self.network: nn.Module = (
-            networks.QNetwork(self.space.n, size, "tanh")
-            if isinstance(self.space, spaces.Discrete)
-            else networks.DeterministicPolicy(int(np.prod(self.space.shape)), size, "tanh")
-        )
+        self.network = policy_network(self.space, (config.hidden_size,), "tanh")
         self.statistics = _random_statistics(env, env_params)
 
     def policy(self, weights: Any) -> Callable[[jax.Array], jax.Array]:
         def act(observation: jax.Array) -> jax.Array:
             outputs: Any = self.network.apply(weights, normalize(self.statistics, observation))
-            if isinstance(self.space, spaces.Discrete):
-                return jnp.argmax(outputs, axis=-1)
-            return clip_to_space(scale_to_space(outputs, self.space), self.space)
+            return network_action(outputs, self.space)
 
         return act
 

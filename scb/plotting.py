@@ -5,7 +5,7 @@ can be made in a library, a server or a test alike. Colours are those of Okabe a
 stay apart for colour-blind readers.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +17,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from scb.statistics import Estimate
+from scb.statistics import Estimate, estimate
 
 BLACK, ORANGE, SKY_BLUE, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"
 BLUE, VERMILLION, PURPLE = "#0072B2", "#D55E00", "#CC79A7"
@@ -71,6 +71,38 @@ def estimate_row(
         color=color,
         capsize=3,
     )
+
+
+def search_curve(
+    axes: Axes,
+    curves: Sequence[Mapping[str, Any]],
+    label: str,
+    color: str,
+    linestyle: Any = "-",
+) -> None:
+    """The mean of several searches over their generations, with its interval over searches.
+
+    Args:
+      curves: of each search {"generation": [G], "fitness": [G] with None where there is no number}. A generation
+        without any number is a gap in the line; the interval needs two searches.
+    """
+    if not curves:
+        return
+    generations = np.asarray(curves[0]["generation"])
+    fitness = np.array([c["fitness"] for c in curves], float)
+    found = [
+        None if np.isnan(column).all() else estimate(column[~np.isnan(column)], statistic=np.mean)
+        for column in fitness.T
+    ]
+    ends = [
+        (np.nan,) * 3
+        if e is None
+        else (e.value, *(e.value if end is None else end for end in (e.low, e.high)))
+        for e in found
+    ]
+    middle, low, high = np.transpose(ends)
+    axes.plot(generations, middle, color=color, linestyle=linestyle, label=label)
+    axes.fill_between(generations, low, high, color=color, alpha=0.15, linewidth=0)
 
 
 @contextmanager

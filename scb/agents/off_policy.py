@@ -29,6 +29,9 @@ class OffPolicyConfig:
       num_envs: environments that step side by side between gradient steps.
       buffer_size, prefill: transitions that the replay buffer holds, and random ones that it starts
         with.
+      prefill_hold: steps for which each of those random actions is held, so that they lead somewhere
+        (Dabney et al., 2021, "Temporally-extended epsilon-greedy exploration"); without effect in
+        one-step environments.
       batch_size, gradient_steps: transitions of a gradient step, and gradient steps after each step
         of the environments.
       total_steps: environment steps of the whole training, the prefill included, rounded up.
@@ -39,6 +42,7 @@ class OffPolicyConfig:
     num_envs: int = 1
     buffer_size: int = 2000
     prefill: int = 1000
+    prefill_hold: int = 1
     batch_size: int = 100
     gradient_steps: int = 1
     total_steps: int = 10_000
@@ -51,6 +55,7 @@ class OffPolicyConfig:
             "num_envs",
             "buffer_size",
             "prefill",
+            "prefill_hold",
             "batch_size",
             "gradient_steps",
             "total_steps",
@@ -179,12 +184,20 @@ class OffPolicyAgent(Agent):
                 None, config.prefill, random_actions, key_prefill, env_params
             )
         else:
+            steps = config.prefill // config.num_envs
+            held = jnp.arange(steps) // config.prefill_hold
 
-            def step(standing: Any, key: jax.Array) -> tuple[Any, Transition]:
-                return self._step(standing, config.num_envs, random_actions, key, env_params)
+            def step(standing: Any, inputs: tuple[jax.Array, jax.Array]) -> tuple[Any, Transition]:
+                key, choice = inputs
 
-            keys = jax.random.split(key_prefill, config.prefill // config.num_envs)
-            standing, transitions = jax.lax.scan(step, standing, keys)
+                def hold(observation: jax.Array, _: jax.Array) -> jax.Array:
+                    return random_actions(observation, jax.random.fold_in(key_prefill, choice))
+
+                actions = random_actions if config.prefill_hold == 1 else hold
+                return self._step(standing, config.num_envs, actions, key, env_params)
+
+            keys = jax.random.split(key_prefill, steps)
+            standing, transitions = jax.lax.scan(step, standing, (keys, held))
             transitions = jax.tree.map(
                 lambda x: jnp.reshape(x, (config.prefill, *x.shape[2:])), transitions
             )

@@ -102,9 +102,7 @@ def train_sac_expert(
     agent = setting.agent(env)
     assert isinstance(agent, SAC)
 
-    state, mean_return = best_agent(
-        agent, setting.hyperparameters, env_params, key, num_agents, num_episodes
-    )
+    state, mean_return = best_agent(agent, setting, env_params, key, num_agents, num_episodes)
     return SACExpert(agent, state, env_params, mean_return)
 
 

@@ -1,0 +1,237 @@
+"""Hopper's bandit with and without a curriculum of the evaluation episodes' length.
+
+    python -m experiments.brax_curriculum
+
+Searches from random weights that differ in the curriculum's shape alone; run folders are under
+runs/brax_curriculum and are resumed.
+"""
+
+import sys
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from experiments.page import Experiment, Save, table, text
+from experiments.page import main as run
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from scb.curriculum import CurriculumConfig
+    from scb.discovery import DiscoveryConfig
+    from scb.statistics import Estimate
+
+ENVIRONMENT = "hopper"
+NONE = "none"
+
+
+def curriculum_of(shape: str, generations: int) -> "CurriculumConfig | None":
+    """The paper's curriculum for Brax, scaled to a search of this length, in another shape."""
+    from dataclasses import replace
+
+    from scb.curriculum import paper_curriculum
+
+    if shape == NONE:
+        return None
+    curriculum = paper_curriculum(ENVIRONMENT, generations)
+    assert curriculum is not None
+    return replace(curriculum, shape=shape)
+
+
+def config_of(shape: str, seed: int, plan: Mapping[str, Any]) -> "DiscoveryConfig":
+    """The search with this curriculum: the paper's recipe, at the plan's size."""
+    from scb.discovery import DiscoveryConfig
+    from scb.evolution import EvolutionConfig
+
+    return DiscoveryConfig(
+        ENVIRONMENT,
+        backend=plan["backend"],
+        algorithms=tuple(plan["algorithms"]),
+        mode=plan["mode"],
+        agents_per_candidate=1,
+        evaluation_episodes=plan["episodes"],
+        curriculum=curriculum_of(shape, plan["generations"]),
+        init="random",
+        evolution=EvolutionConfig(
+            strategy="SNES",
+            population_size=plan["population_size"],
+            num_generations=plan["generations"],
+            sigma=0.05,
+            mean_evaluations=plan["mean_evaluations"],
+            evaluate_mean_every=plan["evaluate_mean_every"],
+            seed=seed,
+        ),
+    )
+
+
+def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None:
+    """A search at a time, first seeds first."""
+    from experiments.searches import curve, search
+
+    report["plan"] = dict(plan)
+    found = report.setdefault("curves", {shape: {} for shape in plan["seeds"]})
+    for seed in range(max(plan["seeds"].values())):
+        for shape, number in plan["seeds"].items():
+            if seed >= number or str(seed) in found[shape]:
+                continue
+            _, outcome = search(config_of(shape, seed, plan), f"{plan['runs']}/{shape}-{seed}")
+            found[shape][str(seed)] = {
+                **curve(outcome.metrics),
+                "seconds": round(outcome.seconds, 1),
+            }
+            save()
+
+
+def finals(report: Mapping[str, Any]) -> dict[str, "Estimate"]:
+    """{shape: the last judgement, over searches}."""
+    from scb.statistics import estimate
+
+    found = {}
+    for shape, curves in report["curves"].items():
+        last = [c["fitness"][-1] for c in curves.values() if c["fitness"][-1] is not None]
+        if last:
+            found[shape] = estimate(last)
+    return found
+
+
+def verdict(report: Mapping[str, Any]) -> str:
+    """Every curriculum against every search without one."""
+    found = finals(report)
+    without = [c["fitness"][-1] for c in report["curves"][NONE].values()]
+    best = max(x for x in without if x is not None)
+    above = [shape for shape, x in found.items() if shape != NONE and x.value > best]
+    shapes = [shape for shape in found if shape != NONE]
+    said = (
+        "every curriculum ends above the best of them"
+        if len(above) == len(shapes)
+        else "no curriculum ends above the best of them"
+        if not above
+        else f"{' and '.join(above)} {'ends' if len(above) == 1 else 'end'} above the best of them, "
+        f"{', '.join(x for x in shapes if x not in above)} not"
+    )
+    generations = report["plan"]["generations"]
+    return (
+        f"after {generations} generations (the paper's searches take 2000) the agents earn {text(found[NONE])} without "
+        f"a curriculum, over {found[NONE].n} searches; with one: "
+        + ", ".join(f"{shape} {text(found[shape])}" for shape in shapes)
+        + f". Of the searches without one the best ends at {best:.0f}: {said}."
+    )
+
+
+def body(report: Mapping[str, Any]) -> list[str]:
+    """How it was searched, and the final judgements."""
+    plan = report["plan"]
+    algorithms = ", ".join(x.upper() for x in plan["algorithms"]) or "all of the paper's algorithms"
+    rows = [
+        [
+            shape,
+            str(found.n),
+            text(found),
+            f"{np.mean([c['seconds'] for c in report['curves'][shape].values()]) / 60:.1f}",
+        ]
+        for shape, found in finals(report).items()
+    ]
+    return [
+        f"Hopper in `{plan['backend']}` physics. SNES from random weights with standard deviation 0.05, "
+        f"{plan['generations']} generations of {plan['population_size']} candidates, inner loop {algorithms} with the "
+        f"paper's fixed hyperparameters, {plan['episodes']} evaluation episodes. The paper's curriculum (100 to 1000 "
+        "steps between the first and the ninth tenth of the search) in several shapes; the mean of the search "
+        f"distribution is judged over whole episodes by {plan['mean_evaluations']} agents, whatever the curriculum. "
+        "Interquartile means, 95 % intervals over searches where there are several.",
+        "",
+        *table(["curriculum", "searches", "return at the end", "minutes a search"], rows),
+    ]
+
+
+def draw(report: Mapping[str, Any]) -> "Figure":
+    """Left the curricula, right what the search distribution's mean is worth."""
+    from matplotlib.figure import Figure
+
+    from scb import plotting
+    from scb.curriculum import horizon
+
+    looks = (
+        (plotting.BLACK, "-"),
+        (plotting.BLUE, "--"),
+        (plotting.ORANGE, "-."),
+        (plotting.GREEN, ":"),
+        (plotting.PURPLE, (0, (3, 1, 1, 1))),
+        (plotting.VERMILLION, (0, (5, 1))),
+    )
+    generations = report["plan"]["generations"]
+    with plotting.figure_style():
+        figure = Figure(figsize=(plotting.WIDTH, 3.8))
+        left, right = figure.subplots(1, 2)
+        for (shape, curves), (color, style) in zip(report["curves"].items(), looks, strict=False):
+            curriculum = curriculum_of(shape, generations)
+            times = np.arange(generations + 1)
+            lengths: Any = (
+                np.full(times.size, 1000)
+                if curriculum is None
+                else np.asarray(horizon(curriculum)(times))
+            )
+            left.plot(times, lengths, color=color, linestyle=style, label=shape)
+            number = len(curves)
+            label = f"{shape} ({number} {'search' if number == 1 else 'searches'})"
+            plotting.search_curve(right, list(curves.values()), label, color, style)
+        left.set_title("Evaluation episodes' length")
+        left.set_ylabel("steps")
+        right.set_title("Meta-training on Hopper")
+        right.set_ylabel("return of agents")
+        for axes in (left, right):
+            axes.set_xlabel("generation")
+        right.legend(fontsize=8)
+    return figure
+
+
+EXPERIMENT = Experiment(
+    name="brax_curriculum",
+    title="Hopper's bandit with and without a curriculum",
+    paper="figure 4",
+    claim="without a curriculum the search on Hopper converges quickly to a local optimum; with one it goes on to "
+    "better returns, whatever the curriculum's shape.",
+    presets={
+        "quick": {
+            "runs": "runs/brax_curriculum/quick",
+            "backend": "spring",
+            "algorithms": ["ppo"],
+            "mode": "all",
+            "population_size": 16,
+            "generations": 60,
+            "episodes": 4,
+            "mean_evaluations": 8,
+            "evaluate_mean_every": 5,
+            "seeds": {NONE: 3, "linear": 1, "exponential": 1, "step": 1},
+        },
+        "paper": {
+            "runs": "runs/brax_curriculum/paper",
+            "backend": "generalized",
+            "algorithms": [],
+            "mode": "sequential",
+            "population_size": 256,
+            "generations": 2000,
+            "episodes": 16,
+            "mean_evaluations": 64,
+            "evaluate_mean_every": 20,
+            "seeds": {
+                NONE: 9,
+                "linear": 1,
+                "quadratic": 1,
+                "cosine": 1,
+                "exponential": 1,
+                "step": 1,
+            },
+        },
+    },
+    minutes={"quick": "20", "paper": "weeks; for a GPU"},
+    measure=measure,
+    verdict=verdict,
+    body=body,
+    draw=draw,
+    needs="run folders under runs/brax_curriculum",
+)
+
+
+if __name__ == "__main__":
+    sys.exit(run(EXPERIMENT))

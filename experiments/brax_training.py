@@ -1,0 +1,435 @@
+"""Training in a Brax environment's bandit against training in the environment itself.
+
+    python -m experiments.brax_training
+
+Learning curves of agents in bandits (ours and the published ones, each said) and of agents with the
+paper's expert hyperparameters in the environments, the final returns, and the steps that the latter
+need to match the former. Published bandits are read from ../shared/published_scbs where that is, or
+from the folder in the variable SCB_PUBLISHED.
+"""
+
+import os
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from experiments.page import Experiment, Save, table, text
+from experiments.page import main as run
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+OURS, PUBLISHED = "ours", "published"
+REPORTING_SEED = 10_000
+# Final returns in Liesen et al. (2024), table of Brax results: {environment: {algorithm: (environment, bandit)}}.
+PAPER: dict[str, dict[str, tuple[float, float]]] = {
+    "hopper": {
+        "ppo": (2521.9, 853.5),
+        "sac": (3119.4, 2738.8),
+        "ddpg": (1536.0, 3012.4),
+        "td3": (3325.8, 2985.3),
+    },
+    "walker2d": {
+        "ppo": (2039.6, 858.3),
+        "sac": (4140.1, 1323.1),
+        "ddpg": (698.3, 1304.3),
+        "td3": (4605.8, 1321.8),
+    },
+    "swimmer": {
+        "ppo": (83.6, 348.5),
+        "sac": (124.8, 361.6),
+        "ddpg": (348.5, 365.1),
+        "td3": (232.2, 365.4),
+    },
+    "halfcheetah": {
+        "ppo": (3487.1, 1657.4),
+        "sac": (7735.5, 5810.4),
+        "ddpg": (3263.3, 6162.4),
+        "td3": (13213.5, 6555.8),
+    },
+    "humanoidstandup": {
+        "ppo": (17243.5, 13356.1),
+        "sac": (23808.1, 21105.2),
+        "ddpg": (24944.8, 21039.0),
+        "td3": (28376.2, 20372.0),
+    },
+}
+
+
+def published_folder() -> Path | None:
+    """Where the published bandits' arrays are; None where they are not."""
+    folder = Path(os.environ.get("SCB_PUBLISHED", "../shared/published_scbs"))
+    return folder if folder.is_dir() else None
+
+
+def task(kind: str, environment: str, backend: str) -> str:
+    """The name of a bandit in the report."""
+    return f"{environment} ({backend}), {kind}"
+
+
+def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None:
+    """A learning curve at a time: those in bandits, then those in environments."""
+    from scb.errors import UserError
+
+    report["plan"] = dict(plan)
+    bandits = report.setdefault("bandits", {})
+    environments = report.setdefault("environments", {})
+    for kind, environment, backend in plan["bandits"]:
+        entry = bandits.setdefault(task(kind, environment, backend), {})
+        if kind == PUBLISHED and published_folder() is None:
+            raise UserError(
+                "the published bandits are not there: set SCB_PUBLISHED to the folder with their arrays "
+                "(hopper.npz, ...)."
+            )
+        for algorithm in plan["bandit_algorithms"]:
+            if algorithm not in entry:
+                entry[algorithm] = _in_bandit(kind, environment, backend, algorithm, plan)
+                save()
+    for _, environment, backend in plan["bandits"]:
+        entry = environments.setdefault(f"{environment} ({backend})", {})
+        for algorithm in plan["environment_algorithms"]:
+            if algorithm not in entry:
+                entry[algorithm] = _in_environment(environment, backend, algorithm, plan)
+                save()
+
+
+def _in_bandit(
+    kind: str, environment: str, backend: str, algorithm: str, plan: Mapping[str, Any]
+) -> dict[str, Any]:
+    import scb
+    from scb.agents.hyperparameters import inner_loop
+    from scb.environments.zoo import open_bandit
+    from scb.importer import PUBLISHED_BANDITS, published_bandit
+
+    env, env_params = scb.make(environment, backend=backend)
+    if kind == OURS:
+        bandit = open_bandit(f"Synthetic-{environment}")
+    else:
+        (name,) = (n for n, home in PUBLISHED_BANDITS.items() if home == environment)
+        folder = published_folder()
+        assert folder is not None
+        bandit = published_bandit(folder / f"{name}.npz")
+    inner = inner_loop(algorithm, environment, env.action_space(env_params))
+    return _curves(
+        inner.agent(bandit),
+        inner.hyperparameters,
+        bandit.default_params,
+        env,
+        env_params,
+        plan["bandit_agents"],
+        plan,
+    )
+
+
+def _in_environment(
+    environment: str, backend: str, algorithm: str, plan: Mapping[str, Any]
+) -> dict[str, Any]:
+    from dataclasses import replace
+
+    import scb
+    from scb.agents.settings import environment_setting
+
+    env, env_params = scb.make(environment, backend=backend)
+    setting = environment_setting(environment, algorithm)
+    setting = replace(
+        setting, config=replace(setting.config, total_steps=plan["environment_steps"])
+    )
+    return _curves(
+        setting.agent(env),
+        setting.hyperparameters,
+        env_params,
+        env,
+        env_params,
+        plan["environment_agents"],
+        plan,
+    )
+
+
+def _curves(
+    agent: Any,
+    hyperparameters: Any,
+    trained_in: Any,
+    env: Any,
+    env_params: Any,
+    number: int,
+    plan: Mapping[str, Any],
+) -> dict[str, Any]:
+    """{"steps": [P + 1], "returns": [N, P + 1], "seconds"}: `number` agents, most likely actions."""
+    import time
+    from dataclasses import replace
+
+    import jax
+
+    every, iterations = evaluation_steps(agent.config.num_iterations, plan["points"])
+    before, each = _steps(agent.config)
+    # Evaluations are evenly spaced, for which a few iterations at the end may be left out.
+    agent = replace(agent, config=replace(agent.config, total_steps=before + iterations * each))
+
+    def evaluation(state: Any, key: Any) -> Any:
+        episodes = agent.evaluate(state, key, plan["episodes"], env, env_params, mode=True)
+        return episodes.returns.mean()
+
+    @jax.jit
+    @jax.vmap
+    def train(key: Any) -> Any:
+        return agent.train_with_evaluations(key, hyperparameters, trained_in, evaluation, every)[1]
+
+    start = time.monotonic()
+    returns = np.asarray(train(jax.random.split(jax.random.key(REPORTING_SEED), number)))
+    return {
+        "steps": (before + np.arange(0, iterations + 1, every) * each).tolist(),
+        "returns": np.round(returns, 1).tolist(),
+        "seconds": round(time.monotonic() - start, 1),
+    }
+
+
+def _steps(config: Any) -> tuple[int, int]:
+    """Environment steps before an agent's first iteration, and of each iteration."""
+    from scb.agents.ppo import PPOConfig
+
+    if isinstance(config, PPOConfig):
+        return 0, config.batch_size
+    return config.prefill, config.num_envs
+
+
+def evaluation_steps(iterations: int, points: int) -> tuple[int, int]:
+    """(iterations between evaluations, iterations in all): at most `points` evaluations after the first."""
+    every = max(1, -(-iterations // points))
+    return every, iterations // every * every
+
+
+def finals(curves: Mapping[str, Any]) -> np.ndarray:
+    """[N] returns at the end."""
+    return np.asarray(curves["returns"])[:, -1]
+
+
+def steps_to_match(curves: Mapping[str, Any], level: float) -> list[int | None]:
+    """For each agent the steps of its first evaluation that reaches the level; None where it never does."""
+    reached = np.asarray(curves["returns"]) >= level
+    return [int(curves["steps"][int(np.argmax(row))]) if row.any() else None for row in reached]
+
+
+def _environment_of(name: str) -> str:
+    return name.rsplit(", ", 1)[0]
+
+
+def matches(report: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """For each bandit and algorithm that was trained in the environment too: who reaches the bandit's level, when."""
+    from scb.statistics import iqm
+
+    rows = []
+    for name, algorithms in report["bandits"].items():
+        for algorithm, curves in report["environments"][_environment_of(name)].items():
+            level = float(iqm(finals(algorithms[algorithm])))
+            steps = steps_to_match(curves, level)
+            known = [x for x in steps if x is not None]
+            rows.append(
+                {
+                    "bandit": name,
+                    "algorithm": algorithm,
+                    "level": level,
+                    "bandit_steps": algorithms[algorithm]["steps"][-1],
+                    "reached": len(known),
+                    "agents": len(steps),
+                    "steps": float(np.median(known)) if known else None,
+                    "trained": curves["steps"][-1],
+                }
+            )
+    return rows
+
+
+def verdict(report: Mapping[str, Any]) -> str:
+    """How many times as many steps the environment takes."""
+    parts = []
+    for row in matches(report):
+        named = f"{row['bandit']}, {row['algorithm'].upper()}"
+        if row["steps"] is None:
+            factor = row["trained"] / row["bandit_steps"]
+            parts.append(
+                f"{named}: none of {row['agents']} agents reaches the bandit's {row['level']:.0f} within "
+                f"{row['trained']} steps of the environment, {factor:.0f} times as many"
+            )
+        else:
+            factor = row["steps"] / row["bandit_steps"]
+            parts.append(
+                f"{named}: {row['reached']} of {row['agents']} agents reach the bandit's {row['level']:.0f}, after "
+                f"{row['steps']:.0f} steps in the median, {factor:.0f} times as many"
+            )
+    return "; ".join(parts).replace("-", "\u2212") + "."
+
+
+def body(report: Mapping[str, Any]) -> list[str]:
+    """How it was measured, final returns beside the paper's, steps to match."""
+    from scb.statistics import estimate
+
+    plan = report["plan"]
+    rows = []
+    for name, algorithms in report["bandits"].items():
+        environment = name.split(" ")[0]
+        own = report["environments"][_environment_of(name)]
+        for algorithm, curves in algorithms.items():
+            paper = PAPER.get(environment, {}).get(algorithm)
+            rows.append(
+                [
+                    name,
+                    algorithm.upper(),
+                    text(estimate(finals(curves))),
+                    text(estimate(finals(own[algorithm]))) if algorithm in own else "",
+                    "" if paper is None else f"{paper[1]:.0f}",
+                    "" if paper is None else f"{paper[0]:.0f}",
+                    f"{curves['seconds'] / len(curves['returns']):.1f}",
+                    f"{own[algorithm]['seconds'] / len(own[algorithm]['returns']):.0f}"
+                    if algorithm in own
+                    else "",
+                ]
+            )
+    matched = [
+        [
+            row["bandit"],
+            row["algorithm"].upper(),
+            f"{row['level']:.0f}",
+            f"{row['reached']} of {row['agents']}",
+            "" if row["steps"] is None else f"{row['steps']:.0f}",
+            "" if row["steps"] is None else f"{row['steps'] / row['bandit_steps']:.0f}",
+        ]
+        for row in matches(report)
+    ]
+    return [
+        f"In bandits: {plan['bandit_agents']} agents of each algorithm with the paper's fixed inner-loop "
+        f"hyperparameters, 10 000 steps. In environments: {plan['environment_agents']} agents of "
+        f"{', '.join(x.upper() for x in plan['environment_algorithms'])} with the paper's expert hyperparameters, "
+        f"about {plan['environment_steps']} steps (the paper: 5 242 880). {plan['episodes']} episodes of most likely "
+        "actions at each point; reporting seed 10 000; interquartile means with 95 % intervals. *Ours* was found "
+        "here, on `spring` physics; *published* bandits are those that the paper's authors released, under our "
+        "agents. The paper's figures are for `generalized`. Seconds are wall-clock of an agent with its evaluations "
+        "and the compilation, shared over the agents.",
+        "",
+        *table(
+            [
+                "bandit",
+                "algorithm",
+                "in the bandit",
+                "in the environment",
+                "paper, bandit",
+                "paper, environment",
+                "seconds, bandit",
+                "seconds, environment",
+            ],
+            rows,
+        ),
+        "",
+        "Steps in the environment until an agent's evaluation reaches what the bandit's agents earn:",
+        "",
+        *table(
+            [
+                "bandit",
+                "algorithm",
+                "level",
+                "agents that reach it",
+                "steps (median)",
+                "times the bandit's",
+            ],
+            matched,
+        ),
+    ]
+
+
+def draw(report: Mapping[str, Any]) -> "Figure":
+    """A row a bandit, a column an algorithm; steps on a logarithmic axis."""
+    from matplotlib.figure import Figure
+
+    from scb import plotting
+    from scb.statistics import estimate
+
+    algorithms = list(next(iter(report["bandits"].values())))
+    with plotting.figure_style():
+        figure = Figure(figsize=(3.1 * len(algorithms), 2.9 * len(report["bandits"]) + 0.4))
+        panels: Any = figure.subplots(
+            len(report["bandits"]), len(algorithms), squeeze=False, sharey="row"
+        )
+        for row, (name, curves) in zip(panels, report["bandits"].items(), strict=True):
+            own = report["environments"][_environment_of(name)]
+            for axes, algorithm in zip(row, algorithms, strict=True):
+                for found, color, style in (
+                    (curves[algorithm], plotting.BLUE, "-"),
+                    (own.get(algorithm), plotting.VERMILLION, "--"),
+                ):
+                    if found is None:
+                        continue
+                    estimates = [estimate(x) for x in np.transpose(found["returns"])]
+                    # A logarithmic axis has no zero: the untrained agent is left out.
+                    steps = np.maximum(found["steps"], 1)
+                    middle = np.array([e.value for e in estimates])
+                    low = np.array([e.value if e.low is None else e.low for e in estimates])
+                    high = np.array([e.value if e.high is None else e.high for e in estimates])
+                    shown = np.asarray(found["steps"]) > 0
+                    axes.plot(steps[shown], middle[shown], color=color, linestyle=style)
+                    axes.fill_between(
+                        steps[shown], low[shown], high[shown], color=color, alpha=0.2, linewidth=0
+                    )
+                paper = PAPER.get(name.split(" ")[0], {}).get(algorithm)
+                if algorithm not in own and paper is not None:
+                    axes.axhline(paper[0], color=plotting.GREY, linestyle=":")
+                axes.set_xscale("log")
+                axes.set_title(f"{name}\n{algorithm.upper()}", fontsize=9)
+                axes.set_xlabel("training steps")
+            row[0].set_ylabel("return in the environment")
+        handles: list[Any] = [
+            panels[0, 0].plot([], [], color=color, linestyle=style)[0]
+            for color, style in (
+                (plotting.BLUE, "-"),
+                (plotting.VERMILLION, "--"),
+                (plotting.GREY, ":"),
+            )
+        ]
+        labels = ["trained in the bandit", "trained in the environment", "the paper, environment"]
+        plotting.legend_below(figure, (handles, labels), columns=3)
+        plotting.figure_title(figure, "Interquartile mean over agents with its 95 % interval")
+    return figure
+
+
+EXPERIMENT = Experiment(
+    name="brax_training",
+    title="Training in a Brax bandit and in the environment itself",
+    paper="figures 6, 10 and 11 and the table of Brax results",
+    claim="agents take 10 000 steps in a bandit to learn locomotion for which training in the environment takes "
+    "millions: it is roughly two orders of magnitude slower.",
+    presets={
+        "quick": {
+            "bandits": [[OURS, "hopper", "spring"], [PUBLISHED, "hopper", "generalized"]],
+            "bandit_algorithms": ["ppo", "sac", "ddpg", "td3"],
+            "bandit_agents": 8,
+            "environment_algorithms": ["ppo"],
+            "environment_agents": 4,
+            "environment_steps": 500_000,
+            "episodes": 5,
+            "points": 10,
+        },
+        "paper": {
+            "bandits": [
+                [OURS, "hopper", "spring"],
+                *([PUBLISHED, name, "generalized"] for name in PAPER),
+            ],
+            "bandit_algorithms": ["ppo", "sac", "ddpg", "td3"],
+            "bandit_agents": 20,
+            "environment_algorithms": ["ppo", "sac", "ddpg", "td3"],
+            "environment_agents": 5,
+            "environment_steps": 5 * 2**20,
+            "episodes": 50,
+            "points": 20,
+        },
+    },
+    minutes={"quick": "20", "paper": "days; for a GPU"},
+    measure=measure,
+    verdict=verdict,
+    body=body,
+    draw=draw,
+    needs="the published bandits, beside the checkout or in SCB_PUBLISHED",
+)
+
+
+if __name__ == "__main__":
+    sys.exit(run(EXPERIMENT))

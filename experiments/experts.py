@@ -1,0 +1,191 @@
+"""SAC experts on classic control: the paper's table, with agents of this library.
+
+python -m experiments.experts
+"""
+
+import sys
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from experiments.page import CLASSIC_CONTROL, Experiment, Save, table, text
+from experiments.page import main as run
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from scb.analysis.components import SACExpert
+
+# Liesen et al. (2024), table of SAC experts: interquartile mean and 95 % interval of 200 evaluations.
+PAPER = {
+    "Acrobot-v1": (-76.7, -78.9, -74.7),
+    "CartPole-v1": (500.0, 500.0, 500.0),
+    "MountainCar-v0": (-117.7, -119.2, -115.3),
+    "MountainCarContinuous-v0": (94.9, 94.8, 95.0),
+    "Pendulum-v1": (-137.4, -151.5, -127.5),
+}
+EXPERT_SEED, JUDGE_SEED = 40_000, 10_000
+
+
+def train(environment: str, number: int, episodes: int) -> "tuple[SACExpert, Any, Any]":
+    """(the best of `number` agents on `episodes` episodes, the environment, its parameters)."""
+    import jax
+
+    import scb
+    from scb.analysis.components import train_sac_expert
+
+    env, env_params = scb.make(environment)
+    key = jax.random.key(EXPERT_SEED)
+    return train_sac_expert(environment, env, env_params, key, number, episodes), env, env_params
+
+
+def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None:
+    """An environment at a time."""
+    import time
+
+    import jax
+
+    from scb.agents.settings import environment_setting
+    from scb.evaluation import evaluate
+
+    report["plan"] = dict(plan)
+    found = report.setdefault("environments", {})
+    for environment in plan["environments"]:
+        if environment in found:
+            continue
+        start = time.monotonic()
+        expert, env, env_params = train(environment, plan["agents"], plan["selection_episodes"])
+        seconds = time.monotonic() - start
+        returns = jax.jit(
+            lambda key, expert=expert, env=env, env_params=env_params: (
+                evaluate(env, env_params, expert.policy(), key, plan["evaluations"]).returns
+            )
+        )(jax.random.key(JUDGE_SEED))
+        setting = environment_setting(environment, "sac")
+        found[environment] = {
+            "returns": np.round(np.asarray(returns), 2).tolist(),
+            "selection": round(expert.mean_return, 2),
+            "steps": setting.num_environment_steps,
+            "episode_limit": setting.episode_limit,
+            "setting": setting.source,
+            "seconds": round(seconds, 1),
+        }
+        save()
+
+
+def verdict(report: Mapping[str, Any]) -> str:
+    """Each environment's figure, and where it lies below the paper's interval."""
+    from scb.statistics import estimate
+
+    found = {name: estimate(x["returns"]) for name, x in report["environments"].items()}
+    below = [
+        name
+        for name, x in found.items()
+        if (x.value if x.high is None else x.high) < PAPER[name][1]
+    ]
+    listed = ", ".join(f"{name} {text(x, 1)}" for name, x in found.items())
+    return f"{listed}; " + (
+        f"below the paper's interval in {' and '.join(below)}, on its level or above elsewhere."
+        if below
+        else "on the paper's level or above it everywhere."
+    )
+
+
+def body(report: Mapping[str, Any]) -> list[str]:
+    """How they were trained, and the table."""
+    from scb.statistics import estimate
+
+    plan = report["plan"]
+    rows = []
+    for name, entry in report["environments"].items():
+        value, low, high = PAPER[name]
+        rows.append(
+            [
+                name,
+                text(estimate(entry["returns"]), 1),
+                text({"value": value, "low": low, "high": high}, 1),
+                str(entry["steps"]),
+                "" if entry["episode_limit"] is None else str(entry["episode_limit"]),
+                f"{entry['seconds']:.0f}",
+                entry["setting"],
+            ]
+        )
+    return [
+        f"The best of {plan['agents']} SAC agents by {plan['selection_episodes']} episodes, then judged on "
+        f"{plan['evaluations']} others: most likely actions, interquartile mean over episodes with its 95 % interval. "
+        "Trained on the environment itself, the number of steps that the table says for each agent. *Limit* is that of "
+        "the episodes in training where it is not the environment's own; judged are the environment's own episodes. "
+        "Settings were found on other seeds.",
+        "",
+        *table(
+            [
+                "environment",
+                "here",
+                "the paper",
+                "steps",
+                "limit",
+                "seconds, all agents",
+                "setting",
+            ],
+            rows,
+        ),
+    ]
+
+
+def draw(report: Mapping[str, Any]) -> "Figure":
+    """A panel an environment: ours with each evaluation a dot, and the paper's interval."""
+    from matplotlib.figure import Figure
+
+    from scb import plotting
+    from scb.statistics import Estimate, estimate
+
+    with plotting.figure_style():
+        figure = Figure(figsize=(plotting.WIDTH, 1.1 * len(report["environments"]) + 0.6))
+        panels = figure.subplots(len(report["environments"]), 1, squeeze=False)[:, 0]
+        for axes, (name, entry) in zip(panels, report["environments"].items(), strict=True):
+            returns = np.asarray(entry["returns"])
+            plotting.estimate_row(axes, 0.0, returns, estimate(returns), plotting.BLUE)
+            value, low, high = PAPER[name]
+            paper = Estimate(value, low, high, 200)
+            plotting.estimate_row(axes, 1.0, np.empty(0), paper, plotting.VERMILLION)
+            axes.set_yticks([0.0, 1.0], ["here", "the paper"])
+            axes.set_ylim(1.6, -0.6)
+            axes.set_title(name, fontsize=10)
+        panels[-1].set_xlabel("return of an episode")
+        plotting.figure_title(
+            figure, "SAC experts: interquartile mean with its 95 % interval, each evaluation a dot"
+        )
+    return figure
+
+
+EXPERIMENT = Experiment(
+    name="experts",
+    title="SAC experts on classic control",
+    paper="table 1, appendix on replacing components",
+    claim="a SAC agent trained on the environment is near-optimal in all of classic control: Acrobot \u221276.7, "
+    "CartPole 500, MountainCar \u2212117.7, its continuous sibling 94.9, Pendulum \u2212137.4.",
+    presets={
+        "quick": {
+            "environments": list(CLASSIC_CONTROL),
+            "agents": 4,
+            "selection_episodes": 50,
+            "evaluations": 200,
+        },
+        "paper": {
+            "environments": list(CLASSIC_CONTROL),
+            "agents": 10,
+            "selection_episodes": 200,
+            "evaluations": 200,
+        },
+    },
+    minutes={"quick": "6", "paper": "12"},
+    measure=measure,
+    verdict=verdict,
+    body=body,
+    draw=draw,
+)
+
+
+if __name__ == "__main__":
+    sys.exit(run(EXPERIMENT))

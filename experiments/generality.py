@@ -1,0 +1,426 @@
+"""Does a bandit train agents that its search never saw: drawn hyperparameters, other networks, no gradients?
+
+    python -m experiments.generality
+
+Every agent is trained for the inner loop's 10 000 steps in the zoo's bandit, in bandits of one
+recipe with drawn and with fixed hyperparameters of the inner agents, and in the environment itself.
+The searches of that recipe are run folders under runs/generality and are resumed.
+"""
+
+import sys
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from experiments.page import CLASSIC_CONTROL, Experiment, Save, table, text
+from experiments.page import main as run
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from scb.agents.hyperparameters import InnerLoop
+    from scb.discovery import DiscoveryConfig
+    from scb.statistics import Estimate
+
+ZOO, DRAWN, FIXED, ENVIRONMENT = SOURCES = (
+    "bandit of the zoo",
+    "search, drawn hyperparameters",
+    "search, fixed hyperparameters",
+    "the environment itself",
+)
+TOGETHER = "all algorithms"
+WIDE, SWISH = "1 x 512 network", "swish"
+EVOLVED, OPTIMAL = "neuroevolution", "CB-optimal policy"
+# Not used in any search: what the paper calls out of distribution.
+UNSEEN = (WIDE, SWISH, EVOLVED, OPTIMAL)
+REPORTING_SEED = 10_000
+
+
+def config_of(environment: str, source: str, plan: Mapping[str, Any]) -> "DiscoveryConfig":
+    """The search whose inner agents' hyperparameters are drawn, or fixed; nothing else differs."""
+    from scb.discovery import DiscoveryConfig
+    from scb.evolution import EvolutionConfig
+    from scb.warm_start import WarmStartConfig
+
+    return DiscoveryConfig(
+        environment,
+        algorithms=tuple(plan["algorithms"]),
+        sampled_hyperparameters=source == DRAWN,
+        agents_per_candidate=plan["agents_per_candidate"],
+        evaluation_episodes=plan["evaluation_episodes"],
+        init=plan["init"],
+        warm_start=WarmStartConfig(**plan["warm_start"]),
+        evolution=EvolutionConfig(
+            strategy="SNES",
+            population_size=plan["population_size"],
+            num_generations=plan["generations"],
+            sigma=plan["sigma"],
+            combine="ranks",
+            mean_evaluations=plan["mean_evaluations"],
+            seed=plan["seed"],
+        ),
+    )
+
+
+def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None:
+    """One kind of agent from one source at a time."""
+    import scb
+    from lpo.suite import random_return
+
+    report["plan"] = dict(plan)
+    found, random = report.setdefault("environments", {}), report.setdefault("random", {})
+    for environment in plan["environments"]:
+        if environment not in random:
+            random[environment] = round(random_return(*scb.make(environment)), 2)
+        entry = found.setdefault(environment, {source: {} for source in SOURCES})
+        for source in SOURCES:
+            trainer: _Trainer | None = None
+            for agent in agents_of(environment):
+                if agent in entry[source] or (agent == OPTIMAL and source == ENVIRONMENT):
+                    continue
+                trainer = trainer or _Trainer(environment, source, plan)
+                entry[source][agent] = np.round(trainer.returns(agent), 2).tolist()
+                save()
+
+
+def algorithms_of(environment: str) -> tuple[str, ...]:
+    """The paper's inner-loop algorithms."""
+    import scb
+    from scb.agents.hyperparameters import algorithms_for
+
+    env, env_params = scb.make(environment)
+    return algorithms_for(env.action_space(env_params))
+
+
+def agents_of(environment: str) -> list[str]:
+    """Every kind of agent that is trained: the algorithms, each with other networks too, and those without any."""
+    algorithms = algorithms_of(environment)
+    others = [f"{name}, {kind}" for kind in (WIDE, SWISH) for name in algorithms]
+    return [*algorithms, *others, EVOLVED, OPTIMAL]
+
+
+class _Trainer:
+    """What trains agents in one source and judges them in the environment."""
+
+    def __init__(self, environment: str, source: str, plan: Mapping[str, Any]) -> None:
+        import scb
+        from experiments.searches import search
+        from scb.environments.zoo import open_bandit
+
+        self.environment, self.plan = environment, plan
+        self.env, self.env_params = scb.make(environment)
+        self.space = self.env.action_space(self.env_params)
+        self.trained_in: Any = self.env
+        self.trained_in_params: Any = self.env_params
+        if source == ZOO:
+            self.trained_in = open_bandit(f"Synthetic-{environment}")
+            self.trained_in_params = self.trained_in.default_params
+        elif source != ENVIRONMENT:
+            kind = "drawn" if source == DRAWN else "fixed"
+            problem, outcome = search(
+                config_of(environment, source, plan), f"{plan['runs']}/{environment}-{kind}"
+            )
+            self.trained_in = problem.bandit
+            self.trained_in_params = problem.bandit.params(outcome.best_mean)
+
+    def returns(self, agent: str) -> np.ndarray:
+        """[N] mean returns of agents of one kind, most likely actions."""
+        import jax
+
+        from scb.agents.hyperparameters import inner_loop
+
+        key = jax.random.key(REPORTING_SEED)
+        if agent == OPTIMAL:
+            return self._optimal(key)
+        if agent == EVOLVED:
+            return self._evolved(key)
+        algorithm, _, network = agent.partition(", ")
+        return self._trained(
+            with_network(inner_loop(algorithm, self.environment, self.space), network), key
+        )
+
+    def _trained(self, inner: "InnerLoop", key: Any) -> np.ndarray:
+        import jax
+
+        agent, episodes = inner.agent(self.trained_in), self.plan["episodes"]
+        key_draw, key_agents = jax.random.split(key)
+        number = self.plan["agents"]
+
+        def judged(hyperparameters: Any, key: Any, params: Any) -> Any:
+            key_train, key_judge = jax.random.split(key)
+            state = agent.train(key_train, hyperparameters, params)
+            return agent.evaluate(
+                state, key_judge, episodes, self.env, self.env_params, mode=True
+            ).returns.mean()
+
+        judge = jax.jit(jax.vmap(judged, in_axes=(0, 0, None)))
+        keys = jax.random.split(key_agents, number)
+        return np.asarray(judge(inner.sample(key_draw, number), keys, self.trained_in_params))
+
+    def _evolved(self, key: Any) -> np.ndarray:
+        from scb.neuroevolution import NeuroevolutionConfig, evolve_policy
+
+        config = NeuroevolutionConfig(**self.plan["neuroevolution"])
+        if self.trained_in is self.env:
+            config = NeuroevolutionConfig(**self.plan["neuroevolution_environment"])
+        return self._judged_policies(
+            lambda key: evolve_policy(self.trained_in, self.trained_in_params, key, config), key
+        )
+
+    def _optimal(self, key: Any) -> np.ndarray:
+        from scb.analysis.optimal_actions import optimal_policy
+
+        policy = optimal_policy(self.trained_in, self.trained_in_params)
+        return self._judged_policies(lambda key: policy, key)
+
+    def _judged_policies(self, make: Callable[[Any], Any], key: Any) -> np.ndarray:
+        import jax
+
+        from scb.evaluation import evaluate
+
+        @jax.jit
+        @jax.vmap
+        def judged(key: Any) -> Any:
+            key_make, key_judge = jax.random.split(key)
+            policy, episodes = make(key_make), self.plan["episodes"]
+            return evaluate(self.env, self.env_params, policy, key_judge, episodes).returns.mean()
+
+        return np.asarray(judged(jax.random.split(key, self.plan["agents"])))
+
+
+def with_network(inner: "InnerLoop", network: str) -> "InnerLoop":
+    """The same algorithm with one of the networks that no search saw, or with its own."""
+    from dataclasses import replace
+
+    changes: dict[str, dict[str, Any]] = {
+        "": {},
+        WIDE: {"hidden_sizes": (512,)},
+        SWISH: {"activation": "swish"},
+    }
+    return replace(inner, config=replace(inner.config, **changes[network]))
+
+
+def columns(entry: Mapping[str, list[float]]) -> dict[str, np.ndarray]:
+    """{column of the figure: [N] returns}: algorithms, all of them together, and agents that no search saw."""
+    trained = {name: np.asarray(x) for name, x in entry.items()}
+    algorithms = [name for name in trained if "," not in name and name not in UNSEEN]
+    found = {name: trained[name] for name in algorithms}
+    found[TOGETHER] = np.concatenate(list(found.values()))
+    for network in (WIDE, SWISH):
+        found[network] = np.concatenate([trained[f"{name}, {network}"] for name in algorithms])
+    return found | {name: trained[name] for name in (EVOLVED, OPTIMAL) if name in trained}
+
+
+def scores(report: Mapping[str, Any], column: str) -> dict[str, "Estimate"]:
+    """{source: normalised score over all environments} of one kind of agent; 0 random, 1 the paper's expert."""
+    from lpo.suite import REFERENCES
+    from scb.statistics import estimate, normalized_score
+
+    found = {}
+    for source in SOURCES:
+        values = [
+            normalized_score(
+                columns(entry[source])[column], report["random"][name], REFERENCES[name]
+            )
+            for name, entry in report["environments"].items()
+            if column in columns(entry[source])
+        ]
+        if values:
+            found[source] = estimate(np.concatenate(values))
+    return found
+
+
+def verdict(report: Mapping[str, Any]) -> str:
+    """Robustness to drawn hyperparameters, what drawing them in the search brings, and agents that no search saw."""
+    together = scores(report, TOGETHER)
+    parts = [
+        "Normalised scores over all environments (0 a random policy, 1 the paper's expert), agents with drawn "
+        "hyperparameters: "
+        + ", ".join(f"{source} {text(found, 2)}" for source, found in together.items())
+        + ": "
+        + (
+            "bandits are more robust to hyperparameters than the environment"
+            if _above(together[ZOO], together[ENVIRONMENT])
+            else "bandits are not clearly more robust than the environment"
+        )
+        + ", and drawing them in the search "
+        + (
+            "helps"
+            if _above(together[DRAWN], together[FIXED])
+            else "makes no clear difference here"
+        )
+        + "."
+    ]
+    unseen = {name: scores(report, name)[ZOO] for name in UNSEEN}
+    worse = [name for name, x in unseen.items() if _above(together[ZOO], x)]
+    parts.append(
+        "Agents that no search saw, in the zoo's bandits: "
+        + ", ".join(f"{name} {text(x, 2)}" for name, x in unseen.items())
+        + (
+            "; none is clearly worse than the agents of the search."
+            if not worse
+            else f"; {' and '.join(worse)} {'is' if len(worse) == 1 else 'are'} worse than the agents of the search."
+        )
+    )
+    return " ".join(parts)
+
+
+def _above(a: "Estimate", b: "Estimate") -> bool:
+    """Whether a's interval lies above b's."""
+    return a.low is not None and b.high is not None and a.low > b.high
+
+
+def body(report: Mapping[str, Any]) -> list[str]:
+    """How it was measured, and a table for each environment."""
+    from scb.statistics import estimate
+
+    plan = report["plan"]
+    own, theirs = plan["neuroevolution"], plan["neuroevolution_environment"]
+    lines = [
+        f"{plan['agents']} agents of each algorithm with hyperparameters drawn from the paper's lists, 10 000 steps, "
+        f"{plan['episodes']} episodes of most likely actions; reporting seed 10 000. *{TOGETHER}*, *{WIDE}* and "
+        f"*{SWISH}* are over the agents of all algorithms. Neuroevolution is SNES on a policy network: in bandits "
+        f"{own['num_generations']} generations of {own['population_size']} candidates on {own['episodes']} contexts, "
+        f"in environments {theirs['num_generations']} generations of {theirs['population_size']} on "
+        f"{theirs['episodes']} episodes. The two searches take {plan['generations']} generations of "
+        f"{plan['population_size']} candidates from one "
+        f"{'fit to an expert' if plan['init'] == 'expert' else 'random start'}, and differ only in whether the inner "
+        "agents' hyperparameters are drawn or the paper's underlined ones. Interquartile means with 95 % intervals."
+    ]
+    for name, entry in report["environments"].items():
+        by_source = {source: columns(entry[source]) for source in SOURCES}
+        rows = [
+            [
+                column,
+                *(
+                    text(estimate(found[column]), 1) if column in found else ""
+                    for found in by_source.values()
+                ),
+            ]
+            for column in by_source[ZOO]
+        ]
+        lines += ["", f"## {name}", "", *table(["agents", *SOURCES], rows)]
+    return lines
+
+
+def draw(report: Mapping[str, Any]) -> "Figure":
+    """A panel an environment; left of the dashed line what the searches saw."""
+    from matplotlib.figure import Figure
+
+    from scb import plotting
+    from scb.statistics import estimate
+
+    looks = (
+        (plotting.BLUE, "o"),
+        (plotting.SKY_BLUE, "s"),
+        (plotting.GREEN, "^"),
+        (plotting.VERMILLION, "D"),
+    )
+    names = list(report["environments"])
+    with plotting.figure_style():
+        figure = Figure(figsize=(12.0, 3.1 * -(-len(names) // 2)))
+        panels = figure.subplots(-(-len(names) // 2), 2, squeeze=False).ravel()
+        for axes in panels[len(names) :]:
+            axes.axis("off")
+        for axes, name in zip(panels, names, strict=False):
+            entry = report["environments"][name]
+            shown = list(columns(entry[ZOO]))
+            for i, (source, (color, marker)) in enumerate(zip(SOURCES, looks, strict=True)):
+                for column, values in columns(entry[source]).items():
+                    found = estimate(values)
+                    x = shown.index(column) + 0.17 * (i - 1.5)
+                    low = found.value if found.low is None else found.low
+                    high = found.value if found.high is None else found.high
+                    axes.errorbar(
+                        x,
+                        found.value,
+                        [[found.value - low], [high - found.value]],
+                        fmt=marker,
+                        color=color,
+                        capsize=2,
+                        markersize=4,
+                    )
+            axes.axvline(
+                shown.index(TOGETHER) + 0.5, color=plotting.BLACK, linestyle="--", linewidth=1
+            )
+            axes.set_xticks(
+                range(len(shown)),
+                [x.upper() if len(x) < 5 else x.replace(" ", "\n", 1) for x in shown],
+                fontsize=8,
+            )
+            axes.set_ylabel("return")
+            axes.set_title(name)
+        handles: list[Any] = [
+            panels[0].plot([], [], marker, color=color)[0] for color, marker in looks
+        ]
+        plotting.legend_below(figure, (handles, list(SOURCES)), columns=4)
+        plotting.figure_title(
+            figure,
+            "Trained in ..., judged in the environment; right of the line: unseen by any search",
+        )
+    return figure
+
+
+_SHARED: dict[str, Any] = {
+    "environments": list(CLASSIC_CONTROL),
+    "seed": 0,
+    "neuroevolution": {"population_size": 64, "num_generations": 200, "episodes": 64, "sigma": 0.1},
+    "neuroevolution_environment": {
+        "population_size": 64,
+        "num_generations": 10,
+        "episodes": 1,
+        "sigma": 0.1,
+    },
+}
+
+EXPERIMENT = Experiment(
+    name="generality",
+    title="A bandit trains agents that its search never saw",
+    paper="figure 3 and the appendix on generality",
+    claim="bandits are much more robust to an agent's hyperparameters than their environments are, more so where the "
+    "search drew them; and they train agents that no search saw: other networks, other activations, neuroevolution; "
+    "the CB-optimal policy does well in the environment.",
+    presets={
+        "quick": {
+            **_SHARED,
+            "runs": "runs/generality/quick",
+            "algorithms": ["ppo"],
+            "init": "expert",
+            "warm_start": {},
+            "population_size": 16,
+            "generations": 30,
+            "sigma": 0.02,
+            "agents_per_candidate": 4,
+            "evaluation_episodes": 8,
+            "mean_evaluations": 32,
+            "agents": 8,
+            "episodes": 50,
+        },
+        "paper": {
+            **_SHARED,
+            "runs": "runs/generality/paper",
+            "algorithms": [],
+            "init": "random",
+            "warm_start": {},
+            "population_size": 128,
+            "generations": 300,
+            "sigma": 0.05,
+            "agents_per_candidate": 1,
+            "evaluation_episodes": 50,
+            "mean_evaluations": 64,
+            "agents": 20,
+            "episodes": 50,
+        },
+    },
+    minutes={"quick": "45", "paper": "days; for a GPU"},
+    measure=measure,
+    verdict=verdict,
+    body=body,
+    draw=draw,
+    needs="run folders under runs/generality",
+)
+
+
+if __name__ == "__main__":
+    sys.exit(run(EXPERIMENT))

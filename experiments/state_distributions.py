@@ -1,0 +1,249 @@
+"""The states of an expert in its environment, and those that a bandit shows, over the best actions.
+
+    python -m experiments.state_distributions
+
+The experts are those of `experiments.experts`, trained again.
+"""
+
+import sys
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from experiments.page import CLASSIC_CONTROL, Experiment, Save, packed, table, unpacked
+from experiments.page import main as run
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+POINTS = 50  # of the grid of best actions, in either direction
+CELLS = 20  # of the grid whose share of visited cells is the coverage
+STATES = 2000
+SEED = 41_000
+BANDIT_COVERAGE, EXPERT_COVERAGE = "bandit's coverage", "expert's coverage"
+BANDIT_ROUGHNESS, EXPERT_ROUGHNESS = "bandit's roughness", "expert's roughness"
+
+
+def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None:
+    """An environment at a time."""
+    report["plan"] = dict(plan)
+    found = report.setdefault("environments", {})
+    for environment in plan["environments"]:
+        if environment not in found:
+            found[environment] = _examine(environment, plan)
+            save()
+
+
+def _examine(environment: str, plan: Mapping[str, Any]) -> dict[str, Any]:
+    import jax
+    import jax.numpy as jnp
+    from gymnax.environments import spaces
+
+    from experiments import experts
+    from scb.agents.agent import flat_bounds
+    from scb.analysis.optimal_actions import optimal_actions
+    from scb.analysis.planes import plane_for
+    from scb.analysis.states import bandit_states, follow
+    from scb.environments.zoo import bandit_metadata, open_bandit
+
+    key_states, key_episodes, key_pick = jax.random.split(jax.random.key(SEED), 3)
+    expert, env, env_params = experts.train(environment, plan["agents"], plan["selection_episodes"])
+    bandit = open_bandit(f"Synthetic-{environment}")
+    space = env.action_space(env_params)
+    contexts = bandit_states(bandit, key_states, STATES)
+    visited = follow(env, env_params, expert.policy(), key_episodes, plan["episodes"]).states()
+    picked = np.asarray(jax.random.choice(key_pick, len(visited), (STATES,)))
+    visited = visited[picked]
+    low, high = flat_bounds(env.observation_space(env_params))
+    plane = plane_for(
+        environment,
+        np.concatenate([contexts, visited]),
+        None if visited.shape[1] <= 3 else np.asarray(plan["entries"][environment], float).tolist(),
+        (np.asarray(low), np.asarray(high)),
+    )
+    _, _, nodes = plane.grid(POINTS)
+    discrete = isinstance(space, spaces.Discrete)
+
+    def first(actions: Any) -> np.ndarray:
+        return np.asarray(actions).reshape(POINTS * POINTS, -1)[:, 0].reshape(POINTS, POINTS)
+
+    best = jax.jit(jax.vmap(optimal_actions(bandit)))
+    return {
+        "sha256": bandit_metadata(bandit.name)["sha256"],
+        "expert": round(expert.mean_return, 2),
+        "labels": list(plane.labels),
+        "limits": [list(x) for x in plane.limits],
+        "num_actions": int(space.n) if isinstance(space, spaces.Discrete) else None,
+        "bounds": None if discrete else [float(x[0]) for x in flat_bounds(space)],
+        "contexts": packed(plane.project(contexts)),
+        "visited": packed(plane.project(visited)),
+        "bandit_actions": packed(first(best(jnp.asarray(nodes)))),
+        "expert_actions": packed(first(expert_actions(expert, space, nodes))),
+    }
+
+
+def expert_actions(expert: Any, space: Any, observations: np.ndarray) -> np.ndarray:
+    """[N, ...] the action with the largest Q-value of the expert; of 41 evenly spaced ones where continuous."""
+    import jax
+    import jax.numpy as jnp
+    from gymnax.environments import spaces
+
+    from scb.agents.agent import flat_bounds
+
+    if isinstance(space, spaces.Discrete):
+        candidates = jnp.arange(space.n)
+    else:
+        low, high = flat_bounds(space)
+        candidates = jnp.linspace(low, high, 41).reshape(41, *space.shape)
+
+    @jax.jit
+    @jax.vmap
+    def best(observation: Any) -> Any:
+        values = jax.vmap(lambda action: expert.q_value(observation, action))(candidates)
+        return candidates[jnp.argmax(values)]
+
+    return np.asarray(best(jnp.asarray(observations)))
+
+
+def coverage(points: np.ndarray, limits: Any) -> float:
+    """The share of a plane's 20 x 20 cells that the points visit."""
+    counts, _, _ = np.histogram2d(points[:, 0], points[:, 1], CELLS, [list(x) for x in limits])
+    return float(np.mean(counts > 0))
+
+
+def roughness(actions: np.ndarray, num_actions: int | None, bounds: Any) -> float:
+    """How much the best action changes from a cell of the grid to the next: the mean over neighbours.
+
+    Discrete actions: the share of neighbours that differ; continuous: their distance, in units of the range.
+    """
+    changes = [np.diff(actions, axis=axis).ravel() for axis in (0, 1)]
+    steps = np.abs(np.concatenate(changes))
+    return float(np.mean(steps > 0 if num_actions else steps / (bounds[1] - bounds[0])))
+
+
+def summary(entry: Mapping[str, Any]) -> dict[str, float]:
+    """Coverage of both distributions and roughness of both best actions."""
+    shape = (entry["num_actions"], entry["bounds"])
+    return {
+        BANDIT_COVERAGE: coverage(unpacked(entry["contexts"]), entry["limits"]),
+        EXPERT_COVERAGE: coverage(unpacked(entry["visited"]), entry["limits"]),
+        BANDIT_ROUGHNESS: roughness(unpacked(entry["bandit_actions"]), *shape),
+        EXPERT_ROUGHNESS: roughness(unpacked(entry["expert_actions"]), *shape),
+    }
+
+
+def verdict(report: Mapping[str, Any]) -> str:
+    """Whose states cover more of the plane, and whose best actions change less over it."""
+    found = {name: summary(x) for name, x in report["environments"].items()}
+    wider = [n for n, x in found.items() if x[BANDIT_COVERAGE] > x[EXPERT_COVERAGE]]
+    smoother = [n for n, x in found.items() if x[BANDIT_ROUGHNESS] < x[EXPERT_ROUGHNESS]]
+    covered = ", ".join(
+        f"{n} {x[BANDIT_COVERAGE]:.0%} against {x[EXPERT_COVERAGE]:.0%}" for n, x in found.items()
+    )
+    return (
+        f"the bandit's contexts cover more of the plane than the expert's states in {len(wider)} of {len(found)} "
+        f"environments ({covered}); its best actions change less over the plane than the expert's in "
+        f"{len(smoother)} of {len(found)}" + (f" ({', '.join(smoother)})." if smoother else ".")
+    )
+
+
+def body(report: Mapping[str, Any]) -> list[str]:
+    """How they were drawn, and the numbers."""
+    rows = [
+        [
+            name,
+            f"{entry['expert']:.1f}".replace("-", "\u2212"),
+            *(f"{x:.0%}" for x in summary(entry).values()),
+        ]
+        for name, entry in report["environments"].items()
+    ]
+    return [
+        f"{STATES} states each. Top: visited by the best of {report['plan']['agents']} SAC agents (most likely "
+        "actions), over the action with the largest Q-value of that agent. Bottom: contexts of the zoo's bandit, over "
+        "the action with its largest reward. Where an observation has more than three entries, two of them span the "
+        "plane and the others are at their median. Coverage is the share of 20 \u00d7 20 cells that hold a "
+        "state; roughness is how often the best action differs between neighbours of a 50 \u00d7 50 grid (continuous "
+        "actions: their mean distance, as a share of the action's range).",
+        "",
+        *table(
+            [
+                "environment",
+                "expert's return",
+                *next(iter(map(summary, report["environments"].values()))),
+            ],
+            rows,
+        ),
+    ]
+
+
+def draw(report: Mapping[str, Any]) -> "Figure":
+    """A column an environment: the expert above, the bandit below."""
+    from matplotlib.figure import Figure
+
+    from scb import plotting
+    from scb.analysis import figures
+    from scb.analysis.planes import Plane
+
+    with plotting.figure_style():
+        figure = Figure(figsize=(3.0 * len(report["environments"]), 6.2))
+        panels: Any = figure.subplots(2, len(report["environments"]), squeeze=False)
+        for column, (name, entry) in enumerate(report["environments"].items()):
+            limits: Any = tuple(map(tuple, entry["limits"]))
+            plane = Plane(tuple(entry["labels"]), limits, lambda x: x, lambda x: x)
+            for axes, states, actions, whose in (
+                (panels[0, column], "visited", "expert_actions", "expert"),
+                (panels[1, column], "contexts", "bandit_actions", "bandit"),
+            ):
+                drawn = figures.action_grid(
+                    axes, plane, unpacked(entry[actions]), entry["num_actions"], entry["bounds"]
+                )
+                points = unpacked(entry[states])
+                axes.plot(*points.T, ".", markersize=1.5, color=plotting.BLACK, alpha=0.5)
+                axes.set_title(f"{name}\n{whose}", fontsize=9)
+            bar = figure.colorbar(drawn, ax=panels[1, column], location="bottom", aspect=30)
+            bar.set_label("best action", fontsize=8)
+            if entry["num_actions"]:
+                bar.set_ticks(range(entry["num_actions"]))
+        plotting.figure_title(
+            figure,
+            f"{STATES} states of an expert in the environment and of the bandit, over the best actions",
+        )
+    return figure
+
+
+# Which entries of the larger observations span the plane: the largest two numbers are taken.
+_ENTRIES = {"Acrobot-v1": [0, 0, 0, 0, 1, 1], "CartPole-v1": [0, 0, 1, 1]}
+
+EXPERIMENT = Experiment(
+    name="state_distributions",
+    title="A bandit's contexts cover more than an expert's states",
+    paper="figure 8, appendix on replacing components",
+    claim="the synthetic initial states sample a significantly larger part of the state space than what the expert "
+    "visits, and the bandit's best actions are smoother than those of the expert's Q-function in several environments.",
+    presets={
+        "quick": {
+            "environments": list(CLASSIC_CONTROL),
+            "agents": 4,
+            "selection_episodes": 50,
+            "episodes": 64,
+            "entries": _ENTRIES,
+        },
+        "paper": {
+            "environments": list(CLASSIC_CONTROL),
+            "agents": 10,
+            "selection_episodes": 200,
+            "episodes": 256,
+            "entries": _ENTRIES,
+        },
+    },
+    minutes={"quick": "7", "paper": "13"},
+    measure=measure,
+    verdict=verdict,
+    body=body,
+    draw=draw,
+)
+
+
+if __name__ == "__main__":
+    sys.exit(run(EXPERIMENT))
