@@ -65,9 +65,14 @@ def published_folder() -> Path | None:
     return folder if folder.is_dir() else None
 
 
-def task(kind: str, environment: str, backend: str) -> str:
+def place(environment: str, backend: str | None) -> str:
+    """The name of an environment in the report."""
+    return environment if backend is None else f"{environment} ({backend})"
+
+
+def task(kind: str, environment: str, backend: str | None) -> str:
     """The name of a bandit in the report."""
-    return f"{environment} ({backend}), {kind}"
+    return f"{place(environment, backend)}, {kind}"
 
 
 def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None:
@@ -89,7 +94,7 @@ def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None
                 entry[algorithm] = _in_bandit(kind, environment, backend, algorithm, plan)
                 save()
     for _, environment, backend in plan["bandits"]:
-        entry = environments.setdefault(f"{environment} ({backend})", {})
+        entry = environments.setdefault(place(environment, backend), {})
         for algorithm in plan["environment_algorithms"]:
             if algorithm not in entry:
                 entry[algorithm] = _in_environment(environment, backend, algorithm, plan)
@@ -97,14 +102,13 @@ def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None
 
 
 def _in_bandit(
-    kind: str, environment: str, backend: str, algorithm: str, plan: Mapping[str, Any]
+    kind: str, environment: str, backend: str | None, algorithm: str, plan: Mapping[str, Any]
 ) -> dict[str, Any]:
-    import scb
     from scb.agents.hyperparameters import inner_loop
     from scb.environments.zoo import open_bandit
     from scb.importer import PUBLISHED_BANDITS, published_bandit
 
-    env, env_params = scb.make(environment, backend=backend)
+    env, env_params = _make(environment, backend)
     if kind == OURS:
         bandit = open_bandit(f"Synthetic-{environment}")
     else:
@@ -125,14 +129,13 @@ def _in_bandit(
 
 
 def _in_environment(
-    environment: str, backend: str, algorithm: str, plan: Mapping[str, Any]
+    environment: str, backend: str | None, algorithm: str, plan: Mapping[str, Any]
 ) -> dict[str, Any]:
     from dataclasses import replace
 
-    import scb
     from scb.agents.settings import environment_setting
 
-    env, env_params = scb.make(environment, backend=backend)
+    env, env_params = _make(environment, backend)
     setting = environment_setting(environment, algorithm)
     setting = replace(
         setting, config=replace(setting.config, total_steps=plan["environment_steps"])
@@ -146,6 +149,12 @@ def _in_environment(
         plan["environment_agents"],
         plan,
     )
+
+
+def _make(environment: str, backend: str | None) -> tuple[Any, Any]:
+    import scb
+
+    return scb.make(environment, **({} if backend is None else {"backend": backend}))
 
 
 def _curves(

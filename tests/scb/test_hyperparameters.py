@@ -25,7 +25,8 @@ from scb.agents.hyperparameters import (
 from scb.agents.ppo import PPOConfig, PPOHyperparameters
 from scb.agents.settings import environment_setting, environment_settings
 from scb.agents.td3 import TD3Config, TD3Hyperparameters
-from scb.environments.registry import environment_names
+from scb.environments.brax import BRAX_NAMES
+from scb.environments.registry import environment_names, make
 from scb.errors import UserError
 from tests.scb.probes import ContinuousCorridor, Corridor
 
@@ -253,6 +254,19 @@ def test_settings_are_for_environments_that_exist_and_have_numbers_in_their_rang
         assert setting.source
 
 
+def test_only_mountain_cars_training_has_longer_episodes_than_the_environment():
+    limits = {
+        (name, algorithm): setting.episode_limit
+        for algorithm in ALGORITHMS
+        for name, setting in environment_settings(algorithm).items()
+    }
+    assert {k: v for k, v in limits.items() if v is not None} == {("MountainCar-v0", "sac"): 1000}
+    _, params = make("MountainCar-v0")
+    longer = environment_setting("MountainCar-v0", "sac").training_params(params)
+    assert longer.max_steps_in_episode == 1000 and params.max_steps_in_episode == 200
+    assert environment_setting("Acrobot-v1", "sac").training_params(params) is params
+
+
 def test_an_unknown_algorithm_has_no_settings():
     with pytest.raises(UserError, match="unknown algorithm 'tdd': did you mean td3"):
         environment_setting("CartPole-v1", "tdd")
@@ -406,8 +420,8 @@ def test_the_brax_experts_are_the_papers_tables(algorithm):
     heading, *rows = table(f"tab:{algorithm}_expert_brax")
     names = [title.lower() for title in heading[1:]]
     settings = environment_settings(algorithm)
-    # Pendulum has a setting of PPO's from elsewhere.
-    assert set(names) == set(settings) - {"Pendulum-v1"} and len(names) == 5
+    # Classic control has settings from elsewhere.
+    assert set(names) == set(settings) & set(BRAX_NAMES) and len(names) == 5
     for column, name in enumerate(names, 1):
         for row in rows:
             assert len(row) == 6, row

@@ -390,6 +390,18 @@ def test_the_prefill_is_uniformly_random(name):
         assert stats.kstest(actions[:, 0], stats.uniform(-1.0, 3.0).cdf).pvalue > 1e-4
 
 
+@pytest.mark.parametrize("make", [Corridor, ContinuousCorridor])
+def test_random_actions_of_the_prefill_can_be_held(make):
+    # 2 environments, 200 steps each: 10 blocks of 20 equal actions, the blocks drawn independently.
+    env = make()
+    agent = SAC(env, SACConfig(**SMALL | {"prefill_hold": 20}))
+    state = jax.jit(agent.init)(jax.random.key(3), SACHyperparameters(), env.default_params)
+    actions = np.asarray(state.buffer.transitions.action)[:400].reshape(10, 20, 2)
+    assert (actions == actions[:, :1]).all()
+    assert len(np.unique(actions[:, 0].round(6), axis=0)) > 3
+    assert (actions[:, 0, 0] != actions[:, 0, 1]).any()
+
+
 def test_epsilon_falls_linearly_over_its_fraction_of_the_training():
     # From 1 to 0.2 over half the training: 0.6 after a quarter. Half of the random actions of two
     # are the greedy one: 0.5, 0.3 and 0.1 are not. The error of a share of 4000 is 0.008.
@@ -859,6 +871,7 @@ def test_every_environment_can_be_trained_in(environment):
         ({"num_envs": 0}, "num_envs is 0: it must be at least 1"),
         ({"buffer_size": 0}, "buffer_size is 0: it must be at least 1"),
         ({"prefill": 0}, "prefill is 0: it must be at least 1"),
+        ({"prefill_hold": 0}, "prefill_hold is 0: it must be at least 1"),
         ({"batch_size": -1}, "batch_size is -1: it must be at least 1"),
         ({"gradient_steps": 0}, "gradient_steps is 0: it must be at least 1"),
         ({"total_steps": 0}, "total_steps is 0: it must be at least 1"),

@@ -1,0 +1,106 @@
+import copy
+
+import pytest
+
+from experiments import ablations
+from experiments.ablations import LATENTS, NONE, SHAPES, name_of
+
+TINY = {
+    "algorithms": ["ppo"],
+    "episodes": 2,
+    "mean_evaluations": 2,
+    "evaluate_mean_every": 1,
+    "environments": {
+        "MountainCar-v0": {
+            "generations": 1,
+            "population_size": 2,
+            "agents_per_candidate": 1,
+            "seeds": 1,
+        }
+    },
+}
+
+
+def report(**finals):
+    """A report in which every search ends as said here, by environment and search, and else at -150."""
+    environments = {}
+    for environment in ablations.ENVIRONMENTS:
+        environments[environment] = {
+            search: {
+                str(seed): {
+                    "generation": [0, 1],
+                    "fitness": [-200.0, finals.get(search, -150.0 + seed)],
+                    "failed": [0.0, 0.25],
+                    "seconds": 60.0,
+                }
+                for seed in range(2)
+            }
+            for search in ablations.searches(environment)
+        }
+    return {"environments": environments, "plan": ablations.EXPERIMENT.presets["quick"]}
+
+
+def test_every_search_of_the_papers_rows_is_there_once():
+    searches = ablations.searches("MountainCar-v0")
+    # T, TI, I, IC; three other latents; four other shapes.
+    assert len(searches) == len(set(searches)) == 4 + (len(LATENTS) - 1) + (len(SHAPES) - 1)
+    assert len(ablations.searches("Pendulum-v1")) == 3 + len(LATENTS) - 1
+
+
+def test_a_search_is_the_papers_recipe_with_one_thing_changed():
+    plan = ablations.EXPERIMENT.presets["paper"]
+    config = ablations.config_of("MountainCar-v0", name_of("I", "uniform", "step"), 3, plan)
+    assert config.bandit.latent == "uniform" and config.curriculum.shape == "step"
+    assert (config.curriculum.initial, config.curriculum.final) == (1000, 200)
+    assert (config.curriculum.begin, config.curriculum.transition) == (200, 600)
+    assert config.init == "random" and config.evolution.seed == 3
+    assert (config.evolution.population_size, config.evolution.num_generations) == (128, 1000)
+    assert (
+        ablations.config_of("Pendulum-v1", name_of("T", "normal", NONE), 0, plan).curriculum is None
+    )
+
+
+def test_transitions_alone_do_not_reach_the_goal_of_mountain_car(tmp_path, monkeypatch):
+    monkeypatch.setattr(ablations, "ENVIRONMENTS", ("MountainCar-v0",))
+    wanted = [name_of("T", "normal", NONE)]
+    monkeypatch.setattr(ablations, "searches", lambda environment: wanted)
+    found, saved = {}, []
+    plan = {**TINY, "runs": str(tmp_path)}
+    ablations.measure(plan, found, lambda: saved.append(1))
+    curves = found["environments"]["MountainCar-v0"]
+    assert list(curves) == wanted and len(saved) == 1
+    assert curves[wanted[0]]["0"]["fitness"] == [-200.0, -200.0]
+    ablations.measure(plan, found, lambda: saved.append(1))
+    assert len(saved) == 1  # what is there is not searched again
+
+
+def test_the_verdict_follows_the_figures():
+    said = ablations.verdict(report(**{name_of("T", "normal", NONE): -200.0}))
+    assert "T never reaches the goal" in said and "not clearly better" in said
+    assert "learned initial states are better" in said
+    failed = report(
+        **{name_of("T", "normal", NONE): None, name_of("I", "categorical", NONE): -500.0}
+    )
+    assert "T all failed" in ablations.verdict(failed)
+    categorical = {
+        name_of("I", latent, curriculum): -190.0
+        for latent in ("categorical", "softmax_categorical")
+        for curriculum in (NONE, "linear")
+    }
+    assert "the continuous ones are better" in ablations.verdict(report(**categorical))
+
+
+def test_the_page_and_the_figure_show_every_search():
+    found = report()
+    rows = sum(len(x) for e in ablations.ENVIRONMENTS for x in ablations.rows(e).values())
+    assert sum(line.startswith("| ") for line in ablations.body(found)) == rows + 2
+    axes = ablations.draw(found).axes
+    assert sum(len(a.lines) for a in axes) == rows
+    gap = copy.deepcopy(found)
+    gap["environments"]["Pendulum-v1"][name_of("T", "normal", NONE)] = {}
+    assert sum(len(a.lines) for a in ablations.draw(gap).axes) == rows - 1
+
+
+@pytest.mark.parametrize("preset", ["quick", "paper"])
+def test_presets_cover_both_environments(preset):
+    assert set(ablations.EXPERIMENT.presets[preset]["environments"]) == set(ablations.ENVIRONMENTS)

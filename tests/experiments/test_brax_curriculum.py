@@ -1,0 +1,79 @@
+import numpy as np
+
+from experiments import brax_curriculum as experiment
+from experiments.brax_curriculum import NONE
+
+
+def report(**finals):
+    plan = {**experiment.EXPERIMENT.presets["quick"], "seeds": {NONE: 2, "linear": 1, "step": 1}}
+    curves = {
+        shape: {
+            str(seed): {
+                "generation": [0, 60],
+                "fitness": [10.0, finals.get(shape, 200.0) + 10.0 * seed],
+                "failed": [0.0, 0.0],
+                "seconds": 60.0,
+            }
+            for seed in range(number)
+        }
+        for shape, number in plan["seeds"].items()
+    }
+    return {"plan": plan, "curves": curves}
+
+
+def test_a_curriculum_is_the_papers_in_another_shape():
+    curriculum = experiment.curriculum_of("cosine", 2000)
+    assert curriculum.shape == "cosine" and (curriculum.initial, curriculum.final) == (100, 1000)
+    assert (curriculum.begin, curriculum.transition) == (200, 1600)
+    assert experiment.curriculum_of("step", 60).begin == 6
+    assert experiment.curriculum_of(NONE, 60) is None
+    config = experiment.config_of("linear", 2, experiment.EXPERIMENT.presets["paper"])
+    assert (
+        config.mode == "sequential" and config.backend == "generalized" and config.init == "random"
+    )
+
+
+def test_the_verdict_follows_the_figures():
+    assert "every curriculum ends above the best" in experiment.verdict(
+        report(linear=300.0, step=250.0)
+    )
+    assert "no curriculum ends above the best" in experiment.verdict(
+        report(linear=100.0, step=150.0)
+    )
+    said = experiment.verdict(report(linear=300.0, step=150.0))
+    assert "linear ends above the best of them, step not" in said
+    assert "205 [200, 210] without" in said and "the best ends at 210" in said
+
+
+def test_the_page_and_the_figure_show_every_curriculum():
+    found = report()
+    assert sum(line.startswith("| ") for line in experiment.body(found)) == 3 + 2
+    left, right = experiment.draw(found).axes
+    assert len(left.lines) == len(right.lines) == 3
+    lengths = {line.get_label(): line.get_ydata() for line in left.lines}
+    assert lengths["linear"][0] == 100 and lengths["linear"][-1] == 1000
+    np.testing.assert_array_equal(lengths[NONE], 1000)
+
+
+def test_a_search_with_a_curriculum_is_judged_over_whole_episodes(tmp_path, monkeypatch):
+    # MountainCar has a curriculum too, and is far cheaper than Hopper.
+    monkeypatch.setattr(experiment, "ENVIRONMENT", "MountainCar-v0")
+    plan = {
+        "runs": str(tmp_path),
+        "backend": None,
+        "algorithms": ["ppo"],
+        "mode": "all",
+        "population_size": 2,
+        "generations": 1,
+        "episodes": 2,
+        "mean_evaluations": 2,
+        "evaluate_mean_every": 1,
+        "seeds": {"linear": 1},
+    }
+    found, saved = {}, []
+    experiment.measure(plan, found, lambda: saved.append(1))
+    assert len(saved) == 1
+    # The curriculum starts with episodes of 1000 steps; MountainCar's own have 200.
+    assert found["curves"]["linear"]["0"]["fitness"] == [-200.0, -200.0]
+    experiment.measure(plan, found, lambda: saved.append(1))
+    assert len(saved) == 1

@@ -1,0 +1,87 @@
+import numpy as np
+import pytest
+
+from experiments import brax_training as experiment
+from experiments.brax_training import OURS, PUBLISHED, task
+
+NAMES = (task(OURS, "hopper", "spring"), task(PUBLISHED, "hopper", "generalized"))
+
+
+def curves(steps, *agents):
+    return {"steps": steps, "returns": [list(x) for x in agents], "seconds": 30.0}
+
+
+@pytest.fixture
+def report():
+    in_bandit = curves([0, 5000, 10_000], [0.0, 100.0, 200.0], [0.0, 150.0, 200.0])
+    fast = curves([0, 400_000, 800_000], [0.0, 250.0, 300.0], [0.0, 100.0, 260.0])
+    slow = curves([0, 400_000, 800_000], [0.0, 10.0, 90.0], [0.0, 20.0, 80.0])
+    plan = {**experiment.EXPERIMENT.presets["quick"], "bandit_algorithms": ["ppo", "sac"]}
+    return {
+        "plan": plan,
+        "bandits": {name: {"ppo": in_bandit, "sac": in_bandit} for name in NAMES},
+        "environments": {"hopper (spring)": {"ppo": fast}, "hopper (generalized)": {"ppo": slow}},
+    }
+
+
+def test_evaluations_are_evenly_spaced():
+    assert experiment.evaluation_steps(20, 10) == (2, 20)
+    assert experiment.evaluation_steps(9000, 10) == (900, 9000)
+    every, total = experiment.evaluation_steps(489, 10)
+    assert total % every == 0 and total // every <= 10 and total > 0.9 * 489
+    assert experiment.evaluation_steps(3, 10) == (1, 3)
+
+
+def test_steps_to_match_are_of_the_first_evaluation_that_reaches_the_level():
+    found = curves([0, 10, 20], [0.0, 5.0, 9.0], [0.0, 9.0, 2.0], [0.0, 1.0, 2.0])
+    assert experiment.steps_to_match(found, 8.0) == [20, 10, None]
+
+
+def test_the_verdict_follows_the_figures(report):
+    said = experiment.verdict(report)
+    assert (
+        "2 of 2 agents reach the bandit's 200, after 600000 steps in the median, 60 times" in said
+    )
+    assert "none of 2 agents reaches the bandit's 200 within 800000 steps" in said
+
+
+def test_the_page_and_the_figure_show_bandits_environments_and_the_paper(report):
+    lines = experiment.body(report)
+    assert any("| 854 | 2522 |" in line for line in lines)  # the paper's PPO on Hopper
+    figure = experiment.draw(report)
+    assert len(figure.axes) == 4
+    ppo, sac = figure.axes[:2]
+    # Bandit, environment and the legend's three; with SAC the paper's level instead of the environment.
+    assert len(ppo.lines) == 5 and len(sac.lines) == 2
+    np.testing.assert_array_equal(ppo.lines[0].get_xdata(), [5000, 10_000])
+
+
+def test_agents_are_followed_in_a_bandit_and_in_an_environment():
+    # Pendulum stands in for Brax, whose physics compile for long.
+    plan = {
+        "bandits": [[OURS, "Pendulum-v1", None]],
+        "bandit_algorithms": ["ppo"],
+        "bandit_agents": 2,
+        "environment_algorithms": ["ppo"],
+        "environment_agents": 2,
+        "environment_steps": 20_000,
+        "episodes": 2,
+        "points": 2,
+    }
+    found, saved = {}, []
+    experiment.measure(plan, found, lambda: saved.append(1))
+    in_bandit = found["bandits"][task(OURS, "Pendulum-v1", None)]["ppo"]
+    own = found["environments"]["Pendulum-v1"]["ppo"]
+    assert in_bandit["steps"] == [0, 5000, 10_000] and own["steps"] == [0, 10_000, 20_000]
+    assert np.mean(in_bandit["returns"], axis=0)[-1] > np.mean(own["returns"], axis=0)[-1]
+    experiment.measure(plan, found, lambda: saved.append(1))
+    assert len(saved) == 2
+
+
+def test_without_the_published_bandits_it_says_what_to_do(monkeypatch, tmp_path):
+    from scb.errors import UserError
+
+    monkeypatch.setenv("SCB_PUBLISHED", str(tmp_path / "nowhere"))
+    plan = {"bandits": [[PUBLISHED, "hopper", "generalized"]], "bandit_algorithms": ["ppo"]}
+    with pytest.raises(UserError, match="set SCB_PUBLISHED"):
+        experiment.measure(plan, {}, lambda: None)

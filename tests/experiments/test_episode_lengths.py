@@ -1,0 +1,98 @@
+from types import SimpleNamespace
+
+import jax
+import numpy as np
+import pytest
+
+from experiments import episode_lengths as experiment
+from experiments import searches
+from experiments.episode_lengths import BINS, OWN
+from scb.discovery import BanditDiscovery
+
+TINY = {
+    "seed": 0,
+    "limits": [OWN, "1"],
+    "algorithms": ["ppo"],
+    "judged_by": ["ppo"],
+    "population_size": 2,
+    "agents_per_candidate": 1,
+    "evaluation_episodes": 1,
+    "mean_evaluations": 2,
+    "generations": {"MountainCar-v0": 1},
+    "agents": 2,
+    "episodes": 3,
+}
+
+
+def report(one=-120.0, own=-150.0, single=9):
+    """Two environments with these returns and this many of ten episodes of one step."""
+    entry = {
+        "random": -200.0,
+        "limit": 200,
+        "returns": {OWN: {"ppo": [own, own]}, "1": {"ppo": [one, one]}},
+        "lengths": {"ppo": {**dict.fromkeys(BINS, 0), "1": single, "more": 10 - single}},
+    }
+    environments = {"MountainCar-v0": entry, "CartPole-v1": {**entry, "random": 20.0}}
+    plan = {**TINY, "generations": dict.fromkeys(environments, 1)}
+    return {"environments": environments, "plan": plan}
+
+
+def test_lengths_are_counted_once_each():
+    counts = experiment.binned(np.array([[1, 1, 2], [5, 50, 51]]))
+    assert counts == {"1": 2, "2": 1, "3 to 5": 1, "6 to 10": 0, "11 to 50": 1, "more": 1}
+
+
+def test_the_verdict_follows_the_figures():
+    said = experiment.verdict(report())
+    assert "MountainCar-v0 90%" in said and "more than 80% in 2 of 2" in said
+    assert "better in 2" in said and "one step costs nothing" in said
+    said = experiment.verdict(report(one=-190.0, single=3))
+    assert "in 0 of 2" in said and "worse in 2" in said and "not always as good" in said
+
+
+def test_the_page_and_the_figure_show_every_limit():
+    found = report()
+    assert sum(line.startswith("| ") for line in experiment.body(found)) == 2 * (2 + 2)
+    left, right = experiment.draw(found).axes
+    assert len(left.patches) == 2 * len(BINS)
+    assert [t.get_text() for t in right.get_xticklabels()] == TINY["limits"]
+
+
+def unsearched(config, folder):
+    """A search of no generations: the random weights that it would start from."""
+    problem = BanditDiscovery(config)
+    return problem, SimpleNamespace(mean=problem.bandit.init_weights(jax.random.key(0)))
+
+
+def test_a_limit_of_one_step_is_kept_and_many_are_counted(monkeypatch):
+    monkeypatch.setattr(experiment, "CLASSIC_CONTROL", ("MountainCar-v0",))
+    monkeypatch.setattr(searches, "search", unsearched)
+    found, saved = {}, []
+    plan = {**TINY, "runs": "nowhere"}
+    experiment.measure(plan, found, lambda: saved.append(1))
+    entry = found["environments"]["MountainCar-v0"]
+    assert len(saved) == 2 and entry["limit"] == 200 and entry["random"] == -200.0
+    assert sum(entry["lengths"]["ppo"].values()) == 2 * 3
+    assert all(
+        -200.0 <= x <= -80.0 for limit in TINY["limits"] for x in entry["returns"][limit]["ppo"]
+    )
+    experiment.measure(plan, found, lambda: saved.append(1))
+    assert len(saved) == 2
+
+
+@pytest.mark.slow
+def test_an_mdp_is_searched_before_it_is_judged(tmp_path, monkeypatch):
+    monkeypatch.setattr(experiment, "CLASSIC_CONTROL", ("MountainCar-v0",))
+    found = {}
+    experiment.measure({**TINY, "runs": str(tmp_path)}, found, lambda: None)
+    assert {x.name for x in tmp_path.iterdir()} == {"MountainCar-v0-max", "MountainCar-v0-1"}
+    assert len(found["environments"]["MountainCar-v0"]["returns"]["1"]["ppo"]) == 2
+
+
+@pytest.mark.parametrize("preset", ["quick", "paper"])
+def test_presets_have_the_environments_own_limit_and_a_single_step(preset):
+    plan = experiment.EXPERIMENT.presets[preset]
+    assert {OWN, "1"} <= set(plan["limits"])
+    assert set(plan["generations"]) == set(experiment.CLASSIC_CONTROL)
+    config = experiment.config_of("Pendulum-v1", "10", plan)
+    assert config.parameterization == "TI" and config.max_steps == 10

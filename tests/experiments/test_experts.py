@@ -1,0 +1,72 @@
+import copy
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from experiments import experts
+from experiments.page import CLASSIC_CONTROL
+from scb.agents.settings import environment_setting
+from scb.analysis import components
+
+COMMITTED = Path(__file__).parents[2] / "docs" / "data" / "experts.json"
+
+
+@pytest.fixture
+def report():
+    return json.loads(COMMITTED.read_text())
+
+
+def short(name, algorithm):
+    """An environment's setting with a few hundred steps."""
+    setting = environment_setting(name, algorithm)
+    config = replace(
+        setting.config, total_steps=600, prefill=400, buffer_size=1000, num_envs=4, gradient_steps=1
+    )
+    return replace(setting, config=config)
+
+
+def test_an_expert_is_trained_and_judged_on_as_many_episodes_as_asked(monkeypatch):
+    monkeypatch.setattr(components, "environment_setting", short)
+    plan = {
+        "environments": ["CartPole-v1"],
+        "agents": 2,
+        "selection_episodes": 2,
+        "evaluations": 6,
+    }
+    found, saved = {}, []
+    experts.measure(plan, found, lambda: saved.append(1))
+    returns = found["environments"]["CartPole-v1"]["returns"]
+    assert len(returns) == 6 and all(1.0 <= x <= 500.0 for x in returns)
+    experts.measure(plan, found, lambda: saved.append(1))
+    assert saved == [1]
+
+
+def test_the_committed_experts_are_near_optimal(report):
+    from scb.statistics import iqm
+
+    assert list(report["environments"]) == list(CLASSIC_CONTROL)
+    best = {name: float(iqm(x["returns"])) for name, x in report["environments"].items()}
+    assert best["CartPole-v1"] == 500.0
+    assert best["MountainCar-v0"] > -120.0 and best["MountainCarContinuous-v0"] > 94.0
+    assert best["Acrobot-v1"] > -80.0 and best["Pendulum-v1"] > -155.0
+    assert all(len(x["returns"]) == 200 for x in report["environments"].values())
+
+
+def test_the_verdict_names_what_is_below_the_paper(report):
+    changed = copy.deepcopy(report)
+    for entry, (value, _, _) in zip(
+        changed["environments"].values(), experts.PAPER.values(), strict=True
+    ):
+        entry["returns"] = [value] * 10
+    assert "on the paper's level or above it everywhere" in experts.verdict(changed)
+    changed["environments"]["Pendulum-v1"]["returns"] = [-300.0] * 10
+    assert "below the paper's interval in Pendulum-v1, on" in experts.verdict(changed)
+
+
+def test_the_page_and_the_figure_show_ours_beside_the_papers(report):
+    lines = experts.body(report)
+    assert any("\u2212117.7 [\u2212119.2, \u2212115.3]" in line for line in lines)
+    figure = experts.draw(report)
+    assert [axes.get_title(loc="left") for axes in figure.axes] == list(CLASSIC_CONTROL)

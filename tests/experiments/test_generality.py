@@ -1,0 +1,159 @@
+import copy
+
+import numpy as np
+import pytest
+
+from experiments import generality
+from experiments.generality import (
+    DRAWN,
+    ENVIRONMENT,
+    EVOLVED,
+    FIXED,
+    OPTIMAL,
+    SOURCES,
+    SWISH,
+    TOGETHER,
+    WIDE,
+    ZOO,
+)
+
+TINY = {
+    "environments": ["CartPole-v1"],
+    "seed": 0,
+    "algorithms": ["ppo"],
+    "init": "random",
+    "warm_start": {},
+    "population_size": 2,
+    "generations": 1,
+    "sigma": 0.02,
+    "agents_per_candidate": 1,
+    "evaluation_episodes": 1,
+    "mean_evaluations": 2,
+    "agents": 2,
+    "episodes": 2,
+    "neuroevolution": {"population_size": 8, "num_generations": 20, "episodes": 32, "sigma": 0.1},
+    "neuroevolution_environment": {"population_size": 4, "num_generations": 1, "episodes": 1},
+}
+
+
+def report(**returns):
+    """CartPole in which agents from each source earn what is said here, else 400."""
+    entry = {
+        source: {
+            agent: [float(returns.get(source.split()[-1], 400.0))] * 4
+            for agent in (
+                "ppo",
+                "sac",
+                f"ppo, {WIDE}",
+                f"sac, {WIDE}",
+                f"ppo, {SWISH}",
+                f"sac, {SWISH}",
+            )
+        }
+        for source in SOURCES
+    }
+    for source in SOURCES:
+        entry[source][EVOLVED] = [380.0, 420.0, 400.0, 400.0]
+        if source != ENVIRONMENT:
+            entry[source][OPTIMAL] = [500.0] * 4
+    plan = generality.EXPERIMENT.presets["quick"]
+    return {"plan": plan, "random": {"CartPole-v1": 20.0}, "environments": {"CartPole-v1": entry}}
+
+
+def test_columns_pool_the_algorithms():
+    entry = {
+        "ppo": [1.0, 2.0],
+        "sac": [3.0, 4.0],
+        f"ppo, {WIDE}": [5.0],
+        f"sac, {WIDE}": [6.0],
+        f"ppo, {SWISH}": [7.0],
+        f"sac, {SWISH}": [8.0],
+        EVOLVED: [9.0],
+    }
+    found = generality.columns(entry)
+    assert list(found) == ["ppo", "sac", TOGETHER, WIDE, SWISH, EVOLVED]
+    np.testing.assert_array_equal(found[TOGETHER], [1.0, 2.0, 3.0, 4.0])
+    np.testing.assert_array_equal(found[WIDE], [5.0, 6.0])
+
+
+def test_the_two_searches_differ_in_drawn_hyperparameters_alone():
+    plan = generality.EXPERIMENT.presets["quick"]
+    drawn, fixed = (generality.config_of("Pendulum-v1", x, plan) for x in (DRAWN, FIXED))
+    assert drawn.sampled_hyperparameters and not fixed.sampled_hyperparameters
+    from dataclasses import replace
+
+    assert replace(fixed, sampled_hyperparameters=True) == drawn
+
+
+def test_every_algorithm_meets_every_network():
+    agents = generality.agents_of("Pendulum-v1")
+    assert len(agents) == 4 * 3 + 2 and f"td3, {SWISH}" in agents
+
+
+def test_the_verdict_follows_the_figures():
+    said = generality.verdict(report(itself=50.0))
+    assert "more robust to hyperparameters than the environment" in said
+    assert "drawing them in the search makes no clear difference" in said
+    assert "none is clearly worse" in said
+    changed = copy.deepcopy(report())
+    for source, value in ((DRAWN, 450.0), (FIXED, 300.0)):
+        for agent in ("ppo", "sac"):
+            changed["environments"]["CartPole-v1"][source][agent] = [value] * 4
+    changed["environments"]["CartPole-v1"][ZOO][EVOLVED] = [100.0] * 4
+    said = generality.verdict(changed)
+    assert "drawing them in the search helps" in said and "not clearly more robust" in said
+    assert f"{EVOLVED} is worse than the agents of the search" in said
+
+
+def test_the_page_and_the_figure_show_every_kind_of_agent():
+    found = report()
+    assert sum(line.startswith("| ") for line in generality.body(found)) == 7 + 2
+    axes = generality.draw(found).axes[0]
+    assert [t.get_text().replace("\n", " ") for t in axes.get_xticklabels()] == [
+        "PPO",
+        "SAC",
+        TOGETHER,
+        WIDE,
+        SWISH,
+        EVOLVED,
+        OPTIMAL,
+    ]
+
+
+def test_agents_from_a_bandit_and_from_the_environment(tmp_path, monkeypatch):
+    monkeypatch.setattr(generality, "SOURCES", (ZOO, ENVIRONMENT))
+    kinds = {"ppo", f"ppo, {WIDE}", EVOLVED, OPTIMAL}
+    monkeypatch.setattr(
+        generality, "agents_of", lambda name: ["ppo", f"ppo, {WIDE}", EVOLVED, OPTIMAL]
+    )
+    found, saved = {}, []
+    plan = {**TINY, "runs": str(tmp_path)}
+    generality.measure(plan, found, lambda: saved.append(1))
+    entry = found["environments"]["CartPole-v1"]
+    assert set(entry[ZOO]) == kinds
+    assert set(entry[ENVIRONMENT]) == kinds - {OPTIMAL}
+    # The zoo's bandit solves CartPole for all of them, in 10 000 steps or in none at all.
+    assert entry[ZOO][OPTIMAL] == [500.0, 500.0]
+    assert min(entry[ZOO]["ppo"]) > 100.0 and max(entry[ZOO][EVOLVED]) > 100.0
+    assert 10.0 < found["random"]["CartPole-v1"] < 40.0
+    number = len(saved)
+    generality.measure(plan, found, lambda: saved.append(1))
+    assert len(saved) == number == 2 * 4 - 1
+
+
+@pytest.mark.slow
+def test_agents_from_a_search(tmp_path, monkeypatch):
+    monkeypatch.setattr(generality, "SOURCES", (DRAWN, FIXED))
+    monkeypatch.setattr(generality, "agents_of", lambda name: ["sac", f"sac, {SWISH}"])
+    found = {}
+    generality.measure({**TINY, "runs": str(tmp_path)}, found, lambda: None)
+    entry = found["environments"]["CartPole-v1"]
+    # One generation from random weights teaches next to nothing, and both searches start alike.
+    assert all(8.0 <= x <= 500.0 for source in entry.values() for y in source.values() for x in y)
+
+
+@pytest.mark.parametrize("preset", ["quick", "paper"])
+def test_presets_make_configurations(preset):
+    plan = generality.EXPERIMENT.presets[preset]
+    assert plan["environments"] == list(generality.CLASSIC_CONTROL)
+    generality.config_of("Pendulum-v1", DRAWN, plan)

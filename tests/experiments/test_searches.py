@@ -1,0 +1,59 @@
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+from experiments import searches
+from scb import plotting
+from scb.discovery import DiscoveryConfig
+from scb.evolution import EvolutionConfig
+
+CONFIG = DiscoveryConfig(
+    "CartPole-v1",
+    agents_per_candidate=1,
+    evaluation_episodes=1,
+    init="random",
+    evolution=EvolutionConfig(
+        population_size=2, num_generations=2, mean_evaluations=2, evaluate_mean_every=1
+    ),
+)
+
+
+def test_a_search_that_has_ended_is_read_and_not_run_again(tmp_path):
+    _, first = searches.search(CONFIG, tmp_path / "run")
+    _, again = searches.search(CONFIG, tmp_path / "run")
+    assert again.metrics == first.metrics and again.seconds == first.seconds
+    np.testing.assert_array_equal(
+        again.mean["reward"]["Dense_0"]["kernel"], first.mean["reward"]["Dense_0"]["kernel"]
+    )
+    found = searches.curve(first.metrics)
+    assert found["generation"] == [0, 1, 2]
+    assert found["fitness"][-1] == pytest.approx(
+        first.metrics[-1]["final_mean/fitness_iqm"], abs=0.01
+    )
+    assert found["failed"] == [0.0, 0.0, 0.0]
+
+
+def test_a_judgement_without_a_number_is_a_gap_and_failures_are_averaged():
+    metrics = [
+        {"generation": 0, "failed": 2, "mean/fitness": -7.0, "mean/fitness_iqm": -6.0},
+        {"generation": 1, "failed": 4},
+        {"generation": 2, "failed": 0, "mean/fitness": float("nan")},
+        {"generation": 3, "failed": 1, "final_mean/fitness": -3.0, "final_mean/fitness_iqm": -2.0},
+    ]
+    assert searches.curve(metrics) == {
+        "generation": [0, 2, 4],
+        "fitness": [-6.0, None, -2.0],
+        "failed": [0.0, 3.0, 0.5],
+    }
+
+
+def test_a_line_is_the_mean_over_searches_and_leaves_gaps():
+    axes = Figure().subplots()
+    curves = [
+        {"generation": [0, 1, 2], "fitness": [1.0, None, 3.0]},
+        {"generation": [0, 1, 2], "fitness": [3.0, None, 3.0]},
+    ]
+    plotting.search_curve(axes, curves, "two", plotting.BLUE)
+    np.testing.assert_array_equal(axes.lines[0].get_ydata(), [2.0, np.nan, 3.0])
+    plotting.search_curve(axes, [], "none", plotting.BLUE)
+    assert len(axes.lines) == 1

@@ -1,0 +1,81 @@
+import numpy as np
+import pytest
+
+from experiments import state_distributions as experiment
+from experiments.page import packed, unpacked
+from scb.analysis import components
+from tests.experiments.test_experts import short
+
+LIMITS = [[0.0, 1.0], [0.0, 1.0]]
+
+
+def entry(contexts, visited, bandit_actions, expert_actions, num_actions=2):
+    return {
+        "expert": -120.0,
+        "labels": ["position", "velocity"],
+        "limits": LIMITS,
+        "num_actions": num_actions,
+        "bounds": None if num_actions else [-2.0, 2.0],
+        "contexts": packed(contexts),
+        "visited": packed(visited),
+        "bandit_actions": packed(bandit_actions),
+        "expert_actions": packed(expert_actions),
+    }
+
+
+@pytest.fixture
+def report():
+    everywhere = np.random.default_rng(0).uniform(size=(4000, 2))
+    nowhere = np.full((4000, 2), 0.5)
+    smooth, rough = np.zeros((6, 6)), np.indices((6, 6)).sum(0) % 2
+    return {
+        "plan": experiment.EXPERIMENT.presets["quick"],
+        "environments": {
+            "MountainCar-v0": entry(everywhere, nowhere, smooth, rough),
+            "Pendulum-v1": entry(nowhere, everywhere, 2.0 * rough, smooth, None),
+        },
+    }
+
+
+def test_coverage_and_roughness_are_shares():
+    corners = np.array([[0.01, 0.01], [0.02, 0.03], [0.99, 0.99]])
+    assert experiment.coverage(corners, LIMITS) == 2 / 400
+    checkered = np.indices((6, 6)).sum(0) % 2
+    assert experiment.roughness(checkered, 2, None) == 1.0
+    assert experiment.roughness(checkered, None, (0.0, 4.0)) == 0.25
+    assert experiment.roughness(np.zeros((6, 6)), 2, None) == 0.0
+
+
+def test_the_verdict_follows_the_figures(report):
+    said = experiment.verdict(report)
+    assert "in 1 of 2 environments (MountainCar-v0 100% against 0%" in said
+    assert "in 1 of 2 (MountainCar-v0)" in said
+
+
+def test_the_page_and_the_figure_show_both_distributions(report):
+    assert sum(line.startswith("| ") for line in experiment.body(report)) == 2 + 2
+    titles = [axes.get_title(loc="left") for axes in experiment.draw(report).axes]
+    assert {"MountainCar-v0\nexpert", "Pendulum-v1\nbandit"} <= set(titles)
+
+
+def test_states_and_best_actions_of_one_environment(monkeypatch):
+    monkeypatch.setattr(components, "environment_setting", short)
+    plan = {
+        "environments": ["MountainCar-v0"],
+        "agents": 2,
+        "selection_episodes": 2,
+        "episodes": 2,
+        "entries": {},
+    }
+    found, saved = {}, []
+    experiment.measure(plan, found, lambda: saved.append(1))
+    examined = found["environments"]["MountainCar-v0"]
+    contexts, visited = unpacked(examined["contexts"]), unpacked(examined["visited"])
+    assert contexts.shape == visited.shape == (2000, 2)
+    # An agent of a few hundred steps stays in the valley; the bandit shows far more.
+    assert np.ptp(contexts[:, 0]) > 2 * np.ptp(visited[:, 0])
+    actions = unpacked(examined["bandit_actions"])
+    assert actions.shape == (50, 50) and set(np.unique(actions)) <= {0.0, 1.0, 2.0}
+    assert set(np.unique(unpacked(examined["expert_actions"]))) <= {0.0, 1.0, 2.0}
+    experiment.measure(plan, found, lambda: saved.append(1))
+    assert saved == [1]
