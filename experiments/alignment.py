@@ -7,7 +7,8 @@ and in regimes of the Pendulum bandit that differ from the default in one thing 
 contexts, iterations, epochs, minibatches, learning rate). The same with a small last layer of the
 policy, on both sides. Then the confirmation, on seeds and environments that chose nothing: the same
 regimes' correlation with the outcome on other environments, each with its own bandit. `--adversaries
-FILES` adds objectives that evolution found. Stages that --out holds already are kept.
+FILES` adds objectives that evolution found. Regimes that --out holds already are kept, so the same
+command continues an interrupted one.
 """
 
 import argparse
@@ -98,7 +99,9 @@ def main() -> int:
     from lpo.alignment import Regime, known_drifts, measure_alignment
     from lpo.objectives import load_objective, zoo_names
     from scb import plotting
+    from scb.runs import write_json
 
+    arguments.out.parent.mkdir(parents=True, exist_ok=True)
     learned = [load_objective(name) for name in [*zoo_names(), *arguments.adversaries]]
     report: dict[str, Any] = {
         "command": " ".join(["python -m experiments.alignment", *sys.argv[1:]]),
@@ -115,19 +118,23 @@ def main() -> int:
         seed: int,
         scale: float | None = None,
     ) -> None:
-        if name not in report["stages"]:
-            seeds = range(seed, seed + arguments.agents)
-            measured = measure_alignment(
+        stored = report["stages"].get(name, {})
+        if len(stored.get("regimes", [])) < len(regimes):
+
+            def keep(measured: dict[str, Any]) -> None:
+                report["stages"][name] = {"role": role, **measured}
+                write_json(arguments.out, report)
+
+            measure_alignment(
                 regimes,
                 known_drifts() + learned,
                 environment,
-                list(seeds),
+                list(range(seed, seed + arguments.agents)),
                 policy_output_scale=scale,
                 tell=lambda line: print(line, flush=True),
+                done={k: v for k, v in stored.items() if k != "role"},
+                keep=keep,
             )
-            report["stages"][name] = {"role": role, **measured}
-            arguments.out.parent.mkdir(parents=True, exist_ok=True)
-            arguments.out.write_text(json.dumps(report, indent=1) + "\n")
         path = arguments.page.parent / "figures" / f"alignment_{name}.png"
         path.parent.mkdir(parents=True, exist_ok=True)
         plotting.save(figures.alignment_heatmap(report["stages"][name]), path)

@@ -6,21 +6,24 @@ each trains agents on the environment and in every regime of a bandit, and Spear
 between the two is the regime's alignment.
 """
 
+import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import lru_cache
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lpo.drift import ClipDrift, DPODrift, NoDrift
+from lpo.drift import ClipDrift, DPODrift, Drift, NoDrift
 from lpo.generalization import (
+    by_objective,
     check_names,
     check_seeds,
     compare,
     families,
-    over_objectives,
+    objectives_and_seeds,
     training_setting,
 )
 from lpo.meta_training import MetaTrainingConfig, TaskTraining, inner_loop
@@ -31,6 +34,7 @@ from scb.artefacts import machine_description, package_versions
 from scb.environments.registry import make
 from scb.environments.zoo import home_of
 from scb.errors import UserError
+from scb.evolution import map_population
 from scb.runs import Stopwatch
 from scb.statistics import iqm, spearman
 
@@ -95,6 +99,10 @@ class Regime:
         given = {name: getattr(self, name) for name in ("learning_rate", "policy_output_scale")}
         return replace(own, **{name: x for name, x in given.items() if x is not None})
 
+    def static(self) -> "Regime":
+        """The regime without what is traced: those that are equal here share a program."""
+        return replace(self, reward_noise=0.0, learning_rate=None, policy_output_scale=None)
+
     def __str__(self) -> str:
         """What differs from the default."""
         default = Regime()
@@ -143,30 +151,45 @@ def regime_fitness(
     check_seeds(seeds)
     found = {}
     for family in families(objectives):
-        results = over_objectives(_trained_in(regime, family[0]), family, seeds)
-        for objective, of_it in zip(family, np.asarray(results, np.float64), strict=True):
+        task = regime.task(family[0])
+        parameters, every_seed = objectives_and_seeds(family, seeds)
+        program = _program(regime.static(), family[0].drift, len(every_seed))
+        results = program(
+            parameters, every_seed, regime.hyperparameters(), task.env_params, task.training_params
+        )
+        of_family = by_objective(np.asarray(results, np.float64), len(family))
+        for objective, of_it in zip(family, of_family, strict=True):
             found[objective.name] = dict(zip(FITNESSES, of_it.T, strict=True))
     return found
 
 
-def _trained_in(regime: Regime, objective: Objective) -> Callable[[Any, jax.Array], jax.Array]:
-    """(parameters of the objective's drift, seed) -> [F] fitnesses."""
-    task = regime.task(objective)
+@lru_cache(maxsize=64)
+def _program(regime: Regime, drift: Drift, size: int) -> Callable[..., Any]:
+    """([N] drift parameters, [N] seeds, hyperparameters, bandit's params, the same with noise) -> [N, F] fitnesses.
+
+    Compiled once for all regimes that differ in traced numbers only: noise, learning rate, initialisation.
+    """
+    task = regime.task(Objective("any", drift, None))
     home, home_params = make(task.home)
-    hyperparameters = regime.hyperparameters()
 
-    def returns(state: Any, key: jax.Array, mode: bool) -> jax.Array:
-        episodes = task.agent.evaluate(
-            state, key, task.evaluation_episodes, task.env, task.env_params, mode=mode
-        )
-        return episodes.returns.mean()
+    def train(
+        parameters: Any,
+        seed: jax.Array,
+        hyperparameters: PPOHyperparameters,
+        env_params: Any,
+        training_params: Any,
+    ) -> jax.Array:
+        def returns(state: Any, key: jax.Array, mode: bool) -> jax.Array:
+            episodes = task.agent.evaluate(
+                state, key, task.evaluation_episodes, task.env, env_params, mode=mode
+            )
+            return episodes.returns.mean()
 
-    def train(parameters: Any, seed: jax.Array) -> jax.Array:
         key_train, key_sampled, key_home = jax.random.split(jax.random.key(seed), 3)
         state, curve = task.agent.train_with_evaluations(
             key_train,
             replace(hyperparameters, drift=parameters),
-            task.training_params,
+            training_params,
             lambda state, key: returns(state, key, mode=True),
             every=task.area_every,
         )
@@ -180,7 +203,7 @@ def _trained_in(regime: Regime, objective: Objective) -> Callable[[Any, jax.Arra
             ]
         )
 
-    return train
+    return map_population(train, size, (0, 0, None, None, None))
 
 
 @dataclass(frozen=True)
@@ -246,6 +269,8 @@ def measure_alignment(
     backend: str | None = None,
     policy_output_scale: float | None = None,
     tell: Callable[[str], None] = print,
+    done: Mapping[str, Any] | None = None,
+    keep: Callable[[dict[str, Any]], None] = lambda report: None,
 ) -> dict[str, Any]:
     """The alignment of every regime's fitnesses with an environment's outcome, ready for JSON.
 
@@ -255,19 +280,48 @@ def measure_alignment(
       environment, steps, backend, policy_output_scale: where and how the outcome is measured.
       seeds: of the agents in the environment and in the regimes.
       tell: takes a line when a regime has been measured.
+      done: what `keep` was given before, whose regimes are not measured again.
+      keep: is given the report so far after every regime.
+
+    Raises:
+      UserError: `done` is of other objectives.
     """
-    outcome = outcomes(environment, objectives, seeds, steps, backend, policy_output_scale)
-    ranked = {name: float(iqm(returns)) for name, returns in outcome.items()}
-    tell(f"{environment}: " + ", ".join(f"{n} {x:.0f}" for n, x in ranked.items()))
-    rows = []
+    report: dict[str, Any] = dict(done or {})
+    if not report:
+        found = outcomes(environment, objectives, seeds, steps, backend, policy_output_scale)
+        report = {
+            "environment": environment,
+            "steps": steps,
+            "backend": backend,
+            "policy_output_scale": policy_output_scale,
+            "agents": len(seeds),
+            "first_seed": min(seeds),
+            "outcome_iqm": {name: float(iqm(returns)) for name, returns in found.items()},
+            "outcome": {name: np.round(returns, 2).tolist() for name, returns in found.items()},
+            "regimes": [],
+            "versions": package_versions(),
+            "machine": machine_description(),
+        }
+        keep(report)
+    if set(report["outcome"]) != {objective.name for objective in objectives}:
+        raise UserError(
+            f"{environment} was measured with other objectives ({', '.join(report['outcome'])}): choose another --out."
+        )
+    outcome = {name: np.asarray(returns) for name, returns in report["outcome"].items()}
+    tell(f"{environment}: " + ", ".join(f"{n} {x:.0f}" for n, x in report["outcome_iqm"].items()))
+    known = {
+        json.dumps({name: row[name] for name in asdict(Regime())}) for row in report["regimes"]
+    }
     for regime in regimes:
+        if json.dumps(asdict(regime)) in known:
+            continue
         watch = Stopwatch()
         fitness = regime_fitness(regime, objectives, seeds)
         correlations = {
             name: asdict(alignment({o: x[name] for o, x in fitness.items()}, outcome))
             for name in FITNESSES
         }
-        rows.append(
+        report["regimes"].append(
             {
                 "name": str(regime),
                 **asdict(regime),
@@ -279,22 +333,12 @@ def measure_alignment(
                 "seconds": round(watch.lap(), 1),
             }
         )
+        keep(report)
         tell(
             f"{regime}: "
             + "; ".join(f"{name} {correlation_text(c)}" for name, c in correlations.items())
         )
-    return {
-        "environment": environment,
-        "steps": steps,
-        "backend": backend,
-        "policy_output_scale": policy_output_scale,
-        "agents": len(seeds),
-        "first_seed": min(seeds),
-        "outcome_iqm": ranked,
-        "regimes": rows,
-        "versions": package_versions(),
-        "machine": machine_description(),
-    }
+    return report
 
 
 def correlation_text(correlation: Mapping[str, float | None]) -> str:

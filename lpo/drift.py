@@ -7,6 +7,7 @@ members of one contract, so that a training loop cannot tell them apart.
 """
 
 import math
+from collections.abc import Hashable
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol, TypeAlias, runtime_checkable
 
@@ -38,8 +39,8 @@ TEMPORAL_FEATURES = (*FEATURES, *(f"n/N {feature}" for feature in FEATURES))
 
 
 @runtime_checkable
-class Drift(Protocol):
-    """A family of drifts: a static part, and parameters that are traced, so a population of them vmaps."""
+class Drift(Hashable, Protocol):
+    """A family of drifts: a static, hashable part, and parameters that are traced, so a population of them vmaps."""
 
     def init(self, key: jax.Array) -> Any:
         """Parameters: a pytree of float arrays."""

@@ -189,14 +189,25 @@ def over_objectives(
     Returns:
       The pytree, every leaf [objectives, seeds, ...].
     """
-    number, size = len(objectives), len(objectives) * len(seeds)
+    parameters, every_seed = objectives_and_seeds(objectives, seeds)
+    results = map_population(function, len(every_seed), (0, 0))(parameters, every_seed)
+    return by_objective(results, len(objectives))
+
+
+def objectives_and_seeds(
+    objectives: Sequence[Objective], seeds: Sequence[int]
+) -> tuple[Any, np.ndarray]:
+    """([N] drift parameters, [N] seeds) of every objective of a family with every seed, objectives outermost."""
     parameters = jax.tree.map(
         lambda *leaves: jnp.repeat(jnp.stack(leaves), len(seeds), axis=0),
         *(objective.parameters for objective in objectives),
     )
-    every_seed = np.tile(np.asarray(seeds, np.uint32), number)
-    results = map_population(function, size, (0, 0))(parameters, every_seed)
-    return jax.tree.map(lambda x: np.reshape(x, (number, len(seeds), *x.shape[1:])), results)
+    return parameters, np.tile(np.asarray(seeds, np.uint32), len(objectives))
+
+
+def by_objective(results: Any, number: int) -> Any:
+    """[N, ...] results of `objectives_and_seeds` -> [number, seeds, ...]."""
+    return jax.tree.map(lambda x: np.reshape(x, (number, -1, *x.shape[1:])), results)
 
 
 def _family_curves(

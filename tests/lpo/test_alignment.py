@@ -20,6 +20,7 @@ from lpo.alignment import (
 from lpo.generalization import training_setting
 from scb import plotting
 from scb.errors import UserError
+from scb.evolution import map_population
 
 TINY = Regime(reward_noise=0.0, contexts=10, iterations=4, epochs=1, minibatches=1)
 
@@ -128,6 +129,24 @@ def test_agents_of_a_regime_are_judged_in_every_way():
     np.testing.assert_allclose(again["transfer"], fitness["transfer"][[2, 1]], rtol=1e-4)
 
 
+def test_regimes_that_differ_in_traced_numbers_share_a_program_and_nothing_else(monkeypatch):
+    ppo, made = known_drifts()[2], []
+    module._program.cache_clear()
+    monkeypatch.setattr(
+        module,
+        "map_population",
+        lambda function, size, axes: made.append(1) or map_population(function, size, axes),
+    )
+    plain, noisy, fast = (
+        regime_fitness(regime, [ppo], [1, 2])[ppo.name]["return, mode actions"]
+        for regime in (TINY, replace(TINY, reward_noise=9.0), replace(TINY, learning_rate=0.02))
+    )
+    assert len(made) == 1
+    assert (plain != noisy).all() and (plain != fast).all() and (noisy != fast).all()
+    regime_fitness(replace(TINY, iterations=2), [ppo], [1, 2])
+    assert len(made) == 2
+
+
 def test_the_report_holds_every_regime_and_is_drawn(monkeypatch, tmp_path):
     fixed = returns(**{"ppo-0.2": 1.0, "none": 2.0, "dpo (2, 0.6)": 3.0})
     family = [objective for objective in known_drifts() if objective.name in fixed]
@@ -147,5 +166,20 @@ def test_the_report_holds_every_regime_and_is_drawn(monkeypatch, tmp_path):
     aligned, flat = (row["alignment"]["transfer"]["spearman"] for row in report["regimes"])
     assert (aligned, flat) == (1.0, None)
     assert len(told) == 3
+    # An interrupted measurement goes on where it was.
+    monkeypatch.setattr(module, "outcomes", None)
+    kept: list[int] = []
+    longer = measure_alignment(
+        [*regimes, Regime(reward_noise=2.0)],
+        family,
+        "Pendulum-v1",
+        [7, 8],
+        tell=told.append,
+        done=report,
+        keep=lambda found: kept.append(len(found["regimes"])),
+    )
+    assert kept == [3] and longer["regimes"][:2] == report["regimes"][:2]
+    with pytest.raises(UserError, match="measured with other objectives"):
+        measure_alignment(regimes, family[:2], "Pendulum-v1", [7, 8], done=report)
     path = plotting.save(figures.alignment_heatmap(report), tmp_path / "alignment.png")
     assert path.stat().st_size > 5000
