@@ -88,7 +88,9 @@ def main() -> int:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--agents", type=int, default=16, help="agents of each objective")
-    parser.add_argument("--adversaries", nargs="*", default=[], help="learned objectives' files")
+    parser.add_argument(
+        "--adversaries", type=Path, nargs="*", default=[], help="learned objectives' files"
+    )
     parser.add_argument("--skip-confirmation", action="store_true")
     parser.add_argument("--out", type=Path, default=Path("docs/data/alignment.json"))
     parser.add_argument("--page", type=Path, default=Path("docs/alignment.md"))
@@ -102,7 +104,9 @@ def main() -> int:
     from scb.runs import write_json
 
     arguments.out.parent.mkdir(parents=True, exist_ok=True)
-    learned = [load_objective(name) for name in [*zoo_names(), *arguments.adversaries]]
+    learned = [load_objective(name) for name in zoo_names()]
+    # Every run's file is called objective.npz: an adversary has the name that its file was given.
+    learned += [replace(load_objective(path), name=path.stem) for path in arguments.adversaries]
     report: dict[str, Any] = {
         "command": " ".join(["python -m experiments.alignment", *sys.argv[1:]]),
         "stages": {},
