@@ -22,7 +22,7 @@ def modules() -> list[str]:
     """Names of the modules that are commands."""
     folder = Path(__file__).parent
     names = (m.name for m in pkgutil.iter_modules([str(folder)]))
-    return [n for n in names if n not in ("__main__", "page", "rejax_peer")]
+    return [n for n in names if n not in ("__main__", "page", "rejax_peer", "searches")]
 
 
 def found() -> dict[str, Experiment]:
@@ -36,7 +36,9 @@ def listing() -> str:
     experiments = found()
     lines = ["The paper's experiments (python -m experiments.NAME --preset quick|paper):", ""]
     for name, experiment in experiments.items():
-        minutes = ", ".join(f"{p} {m} min" for p, m in experiment.minutes.items())
+        minutes = ", ".join(
+            f"{p} {m} min" if m.isdigit() else f"{p} {m}" for p, m in experiment.minutes.items()
+        )
         lines += [
             f"  {name}: {experiment.title}",
             f"    {experiment.paper}; {minutes} on two cores; needs {experiment.needs or 'nothing more'}",
@@ -57,6 +59,9 @@ def overview(experiments: Sequence[Experiment], data: Path) -> str:
         if not path.exists():
             continue
         report = page.read(path)
+        if not page.complete(report):
+            lines += [f"## {experiment.title}", "", "Measured in part only.", ""]
+            continue
         lines += [
             f"## [{experiment.title}]({experiment.name}.md)",
             "",

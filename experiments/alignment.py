@@ -122,23 +122,21 @@ def main() -> int:
         seed: int,
         scale: float | None = None,
     ) -> None:
+        def keep(measured: dict[str, Any]) -> None:
+            report["stages"][name] = {"role": role, **measured}
+            write_json(arguments.out, report)
+
         stored = report["stages"].get(name, {})
-        if len(stored.get("regimes", [])) < len(regimes):
-
-            def keep(measured: dict[str, Any]) -> None:
-                report["stages"][name] = {"role": role, **measured}
-                write_json(arguments.out, report)
-
-            measure_alignment(
-                regimes,
-                known_drifts() + learned,
-                environment,
-                list(range(seed, seed + arguments.agents)),
-                policy_output_scale=scale,
-                tell=lambda line: print(line, flush=True),
-                done={k: v for k, v in stored.items() if k != "role"},
-                keep=keep,
-            )
+        measure_alignment(
+            regimes,
+            known_drifts() + learned,
+            environment,
+            list(range(seed, seed + arguments.agents)),
+            policy_output_scale=scale,
+            tell=lambda line: print(line, flush=True),
+            done={k: v for k, v in stored.items() if k != "role"},
+            keep=keep,
+        )
         path = arguments.page.parent / "figures" / f"alignment_{name}.png"
         path.parent.mkdir(parents=True, exist_ok=True)
         plotting.save(figures.alignment_heatmap(report["stages"][name]), path)

@@ -69,7 +69,6 @@ def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None
     """A search at a time, first seeds first."""
     from experiments.searches import curve, search
 
-    report["plan"] = dict(plan)
     found = report.setdefault("curves", {shape: {} for shape in plan["seeds"]})
     for seed in range(max(plan["seeds"].values())):
         for shape, number in plan["seeds"].items():
@@ -84,15 +83,12 @@ def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None
 
 
 def finals(report: Mapping[str, Any]) -> dict[str, "Estimate"]:
-    """{shape: the last judgement, over searches}."""
-    from scb.statistics import estimate
+    """{shape: the last judgement, over searches}; those that failed altogether are left out."""
+    from experiments.searches import final
+    from scb.statistics import iqm
 
-    found = {}
-    for shape, curves in report["curves"].items():
-        last = [c["fitness"][-1] for c in curves.values() if c["fitness"][-1] is not None]
-        if last:
-            found[shape] = estimate(last)
-    return found
+    found = {shape: final(curves, iqm) for shape, curves in report["curves"].items()}
+    return {shape: x for shape, x in found.items() if x is not None}
 
 
 def verdict(report: Mapping[str, Any]) -> str:
@@ -150,6 +146,7 @@ def draw(report: Mapping[str, Any]) -> "Figure":
 
     from scb import plotting
     from scb.curriculum import horizon
+    from scb.statistics import iqm
 
     looks = (
         (plotting.BLACK, "-"),
@@ -174,7 +171,7 @@ def draw(report: Mapping[str, Any]) -> "Figure":
             left.plot(times, lengths, color=color, linestyle=style, label=shape)
             number = len(curves)
             label = f"{shape} ({number} {'search' if number == 1 else 'searches'})"
-            plotting.search_curve(right, list(curves.values()), label, color, style)
+            plotting.search_curve(right, list(curves.values()), label, color, style, iqm)
         left.set_title("Evaluation episodes' length")
         left.set_ylabel("steps")
         right.set_title("Meta-training on Hopper")

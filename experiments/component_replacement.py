@@ -206,7 +206,7 @@ def draw(report: Mapping[str, Any]) -> "Figure":
 EXPERIMENT = Experiment(
     name="component_replacement",
     title="What of a bandit is needed: its reward and its contexts replaced by an expert's",
-    paper="figure 7, appendix on replacing components",
+    paper="figure 12, appendix on replacing components",
     claim="on Pendulum the bandit's contexts are needed to learn well within 10 000 steps; an expert's Q-function as "
     "the reward does not work well; cloning the expert, or rewarding closeness to its action, on the bandit's contexts "
     "does as well as the bandit's reward.",

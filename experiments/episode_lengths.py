@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from experiments.page import CLASSIC_CONTROL, Experiment, Save, table, text
+from experiments.page import CLASSIC_CONTROL, Experiment, Save, finite, span, table, text
 from experiments.page import main as run
+from experiments.searches import PAPER_SIZES
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -28,21 +29,24 @@ JUDGE_SEED = 10_000
 
 def config_of(environment: str, limit: str, plan: Mapping[str, Any]) -> "DiscoveryConfig":
     """The search of an MDP with this limit: the paper's recipe, at the plan's size."""
+    from scb.curriculum import paper_curriculum
     from scb.discovery import DiscoveryConfig
     from scb.evolution import EvolutionConfig
 
+    size = plan["sizes"][environment]
     return DiscoveryConfig(
         environment,
         parameterization="TI",
         max_steps=None if limit == OWN else int(limit),
         algorithms=tuple(plan["algorithms"]),
-        agents_per_candidate=plan["agents_per_candidate"],
+        agents_per_candidate=size["agents_per_candidate"],
         evaluation_episodes=plan["evaluation_episodes"],
+        curriculum=paper_curriculum(environment, size["generations"]),
         init="random",
         evolution=EvolutionConfig(
             strategy="SNES",
-            population_size=plan["population_size"],
-            num_generations=plan["generations"][environment],
+            population_size=size["population_size"],
+            num_generations=size["generations"],
             sigma=0.05,
             mean_evaluations=plan["mean_evaluations"],
             seed=plan["seed"],
@@ -52,10 +56,9 @@ def config_of(environment: str, limit: str, plan: Mapping[str, Any]) -> "Discove
 
 def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None:
     """A limit of an environment at a time."""
-    report["plan"] = dict(plan)
     found = report.setdefault("environments", {})
     for environment in CLASSIC_CONTROL:
-        entry = found.setdefault(environment, {"returns": {}})
+        entry = found.setdefault(environment, {"returns": {}, "failed": {}})
         for limit in plan["limits"]:
             if limit not in entry["returns"]:
                 _measure_limit(environment, limit, plan, entry)
@@ -78,6 +81,7 @@ def _measure_limit(
     entry["limit"] = int(problem.env_params.max_steps_in_episode)
     space = problem.env.action_space(problem.env_params)
     returns: dict[str, list[float]] = {}
+    failed = 0
     for algorithm in plan["judged_by"] or algorithms_for(space):
         training = SyntheticTraining(
             problem.bandit,
@@ -88,13 +92,14 @@ def _measure_limit(
         (judged,) = judge(
             training, outcome.mean, JUDGE_SEED, plan["agents"], plan["episodes"], mode=True
         ).values()
-        returns[algorithm] = np.round(judged, 2).tolist()
+        returns[algorithm], number = finite(judged, entry["random"])
+        failed += number
         if limit == OWN:
             lengths = synthetic_lengths(
                 training, outcome.mean, jax.random.key(JUDGE_SEED), plan["agents"], plan["episodes"]
             )
             entry.setdefault("lengths", {})[algorithm] = binned(lengths)
-    entry["returns"][limit] = returns
+    entry["returns"][limit], entry["failed"][limit] = returns, failed
 
 
 def synthetic_lengths(
@@ -133,62 +138,68 @@ def shares(entry: Mapping[str, Any]) -> dict[str, float]:
     return {x: n / total for x, n in counts.items()}
 
 
-def scores(report: Mapping[str, Any], environment: str, limit: str) -> "Estimate":
-    """Normalised score over the agents of all algorithms: 0 a random policy, 1 the paper's SAC expert."""
+def normalized(report: Mapping[str, Any], environment: str, limit: str) -> np.ndarray:
+    """[N] scores of the agents of all algorithms: 0 a random policy, 1 the paper's SAC expert."""
     from lpo.suite import REFERENCES
-    from scb.statistics import estimate, normalized_score
+    from scb.statistics import normalized_score
 
     entry = report["environments"][environment]
     returns = np.concatenate([np.asarray(x) for x in entry["returns"][limit].values()])
-    return estimate(normalized_score(returns, entry["random"], REFERENCES[environment]))
+    return normalized_score(returns, entry["random"], REFERENCES[environment])
+
+
+def scores(report: Mapping[str, Any], environment: str, limit: str) -> "Estimate":
+    """Interquartile mean of `normalized`."""
+    from scb.statistics import estimate
+
+    return estimate(normalized(report, environment, limit))
 
 
 def verdict(report: Mapping[str, Any]) -> str:
     """How many episodes end after a step, and what a limit of one step costs or brings."""
+    from scb.statistics import paired_difference
+
     single = {name: shares(x)["1"] for name, x in report["environments"].items()}
     most = [name for name, share in single.items() if share > 0.8]
     listed = ", ".join(f"{name} {share:.0%}" for name, share in single.items())
-    parts = [
-        f"Episodes of one step where many are allowed: {listed}; more than 80% in {len(most)} of {len(single)} "
-        "environments."
-    ]
-    better, worse = [], []
-    for name in report["environments"]:
-        one, own = scores(report, name, "1"), scores(report, name, OWN)
-        assert one.low is not None and one.high is not None
-        assert own.low is not None and own.high is not None
-        if one.low > own.high:
-            better.append(name)
-        elif one.high < own.low:
-            worse.append(name)
-    parts.append(
-        f"With a limit of one step the agents do better in {len(better)}"
-        + (f" ({', '.join(better)})" if better else "")
-        + f", worse in {len(worse)}"
-        + (f" ({', '.join(worse)})" if worse else "")
-        + ", and not clearly either in the others: "
+    better, worse, differences = [], [], []
+    for name in single:
+        # The same seeds and hyperparameters with every limit.
+        found = paired_difference(normalized(report, name, "1"), normalized(report, name, OWN))
+        differences.append(f"{name} {text(found, 2, sign=True)}")
+        if found.low is not None and found.high is not None:
+            better += [name] if found.low > 0 else []
+            worse += [name] if found.high < 0 else []
+    return (
+        f"episodes of one step where many are allowed: {listed}; more than 80% in {len(most)} of {len(single)} "
+        f"environments. What a limit of one step changes in the normalised score (one search each): "
+        f"{', '.join(differences)}; "
         + (
-            "one step costs nothing."
+            "it costs nothing clearly"
             if not worse
-            else "one step is not always as good in searches of this size."
+            else f"it is clearly worse in {' and '.join(worse)}"
         )
+        + (f", and is clearly better in {' and '.join(better)}." if better else ".")
     )
-    return " ".join(parts)
 
 
 def body(report: Mapping[str, Any]) -> list[str]:
     """How it was searched, and both tables."""
     plan = report["plan"]
-    limits = plan["limits"]
+    limits, sizes = plan["limits"], plan["sizes"].values()
     algorithms = ", ".join(x.upper() for x in plan["algorithms"]) or "all of the paper's algorithms"
     judged = ", ".join(x.upper() for x in plan["judged_by"]) or "each of the paper's algorithms"
+    failed = sum(sum(x["failed"].values()) for x in report["environments"].values())
     return [
-        f"SNES from random weights, {plan['population_size']} candidates with {plan['agents_per_candidate']} agents "
-        f"({algorithms}), {min(plan['generations'].values())} to {max(plan['generations'].values())} generations, one "
+        "SNES from random weights with standard deviation 0.05, inner loop: "
+        f"{algorithms}, {span(x['generations'] for x in sizes)} generations of "
+        f"{span(x['population_size'] for x in sizes)} candidates with "
+        f"{span(x['agents_per_candidate'] for x in sizes)} agents, MountainCar with the paper's curriculum; one "
         f"search a limit. Then {plan['agents']} agents of {judged} are trained in the result. Lengths are of "
         f"{plan['episodes']} episodes of each in the synthetic MDP whose limit is the environment's own. Scores are "
-        "normalised, 0 a random policy and 1 the paper's SAC expert; interquartile mean over agents with its 95 % "
-        "interval.",
+        "normalised, 0 a random policy and 1 the paper's SAC expert (the paper divides by what each algorithm earns "
+        "after training in a bandit); interquartile mean over agents with its 95 % interval. Agents whose return was "
+        f"no number, counted as a random policy: {failed}.",
         "",
         "Share of episodes by length (steps):",
         "",
@@ -246,14 +257,10 @@ def draw(report: Mapping[str, Any]) -> "Figure":
             zip(report["environments"], looks, strict=False)
         ):
             found = [scores(report, name, limit) for limit in limits]
-            values = [e.value for e in found]
-            low = [e.value if e.low is None else e.low for e in found]
-            high = [e.value if e.high is None else e.high for e in found]
-            errors = np.abs(np.array([low, high]) - values)
             right.errorbar(
                 np.arange(len(limits)) + 0.06 * (i - 2),
-                values,
-                errors,
+                [e.value for e in found],
+                plotting.error_bar(*found),
                 color=color,
                 marker=marker,
                 linestyle=style,
@@ -270,7 +277,7 @@ def draw(report: Mapping[str, Any]) -> "Figure":
 
 EXPERIMENT = Experiment(
     name="episode_lengths",
-    title="Synthetic MDPs end after one step",
+    title="How long the episodes of synthetic MDPs are",
     paper="figure 2",
     claim="in most environments more than 80% of the episodes of a synthetic MDP that may take many steps end after "
     "one; limiting them to one has next to no negative impact, and is sometimes better.",
@@ -281,11 +288,16 @@ EXPERIMENT = Experiment(
             "limits": [OWN, "10", "1"],
             "algorithms": ["ppo"],
             "judged_by": ["ppo", "sac"],
-            "population_size": 16,
-            "agents_per_candidate": 1,
+            "sizes": {
+                name: {
+                    "generations": 60 if name == "Pendulum-v1" else 30,
+                    "population_size": 16,
+                    "agents_per_candidate": 1,
+                }
+                for name in CLASSIC_CONTROL
+            },
             "evaluation_episodes": 8,
             "mean_evaluations": 16,
-            "generations": dict.fromkeys(CLASSIC_CONTROL, 30) | {"Pendulum-v1": 60},
             "agents": 8,
             "episodes": 50,
         },
@@ -295,12 +307,9 @@ EXPERIMENT = Experiment(
             "limits": [OWN, "100", "50", "10", "5", "2", "1"],
             "algorithms": [],
             "judged_by": [],
-            "population_size": 128,
-            "agents_per_candidate": 1,
+            "sizes": PAPER_SIZES,
             "evaluation_episodes": 50,
             "mean_evaluations": 64,
-            "generations": dict.fromkeys(CLASSIC_CONTROL, 300)
-            | {"Pendulum-v1": 1000, "MountainCar-v0": 1000},
             "agents": 20,
             "episodes": 50,
         },

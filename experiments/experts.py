@@ -49,7 +49,6 @@ def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None
     from scb.agents.settings import environment_setting
     from scb.evaluation import evaluate
 
-    report["plan"] = dict(plan)
     found = report.setdefault("environments", {})
     for environment in plan["environments"]:
         if environment in found:

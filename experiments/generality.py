@@ -2,9 +2,11 @@
 
     python -m experiments.generality
 
-Every agent is trained for the inner loop's 10 000 steps in the zoo's bandit, in bandits of one
-recipe with drawn and with fixed hyperparameters of the inner agents, and in the environment itself.
-The searches of that recipe are run folders under runs/generality and are resumed.
+Agents of the paper's algorithms are trained for the inner loop's 10 000 steps in the zoo's bandit, in
+bandits of one recipe with drawn and with fixed hyperparameters of the inner agents, and in the
+environment itself; so are agents with other networks. A policy is evolved without gradients in each,
+and the bandits' optimal policies need no training. The searches are run folders under
+runs/generality and are resumed.
 """
 
 import sys
@@ -13,14 +15,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from experiments.page import CLASSIC_CONTROL, Experiment, Save, table, text
+from experiments.page import CLASSIC_CONTROL, Experiment, Save, finite, span, table, text
 from experiments.page import main as run
+from experiments.searches import PAPER_SIZES
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from scb.agents.hyperparameters import InnerLoop
     from scb.discovery import DiscoveryConfig
+    from scb.neuroevolution import NeuroevolutionConfig
     from scb.statistics import Estimate
 
 ZOO, DRAWN, FIXED, ENVIRONMENT = SOURCES = (
@@ -32,31 +36,36 @@ ZOO, DRAWN, FIXED, ENVIRONMENT = SOURCES = (
 TOGETHER = "all algorithms"
 WIDE, SWISH = "1 x 512 network", "swish"
 EVOLVED, OPTIMAL = "neuroevolution", "CB-optimal policy"
-# Not used in any search: what the paper calls out of distribution.
+# Not in the paper's inner loop: what it calls out of distribution.
 UNSEEN = (WIDE, SWISH, EVOLVED, OPTIMAL)
 REPORTING_SEED = 10_000
 
 
 def config_of(environment: str, source: str, plan: Mapping[str, Any]) -> "DiscoveryConfig":
     """The search whose inner agents' hyperparameters are drawn, or fixed; nothing else differs."""
+    from scb.curriculum import paper_curriculum
     from scb.discovery import DiscoveryConfig
     from scb.evolution import EvolutionConfig
-    from scb.warm_start import WarmStartConfig
 
+    size = plan["sizes"][environment]
+    # A bandit that is fitted to an expert reaches MountainCar's goal from the start.
+    curriculum = None
+    if plan["init"] == "random":
+        curriculum = paper_curriculum(environment, size["generations"])
     return DiscoveryConfig(
         environment,
         algorithms=tuple(plan["algorithms"]),
         sampled_hyperparameters=source == DRAWN,
-        agents_per_candidate=plan["agents_per_candidate"],
+        agents_per_candidate=size["agents_per_candidate"],
         evaluation_episodes=plan["evaluation_episodes"],
+        curriculum=curriculum,
         init=plan["init"],
-        warm_start=WarmStartConfig(**plan["warm_start"]),
         evolution=EvolutionConfig(
             strategy="SNES",
-            population_size=plan["population_size"],
-            num_generations=plan["generations"],
+            population_size=size["population_size"],
+            num_generations=size["generations"],
             sigma=plan["sigma"],
-            combine="ranks",
+            combine=plan["combine"],
             mean_evaluations=plan["mean_evaluations"],
             seed=plan["seed"],
         ),
@@ -67,12 +76,14 @@ def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None
     """One kind of agent from one source at a time."""
     import scb
     from lpo.suite import random_return
+    from scb.environments.zoo import bandit_metadata
 
-    report["plan"] = dict(plan)
     found, random = report.setdefault("environments", {}), report.setdefault("random", {})
+    failed, digests = report.setdefault("failed", {}), report.setdefault("sha256", {})
     for environment in plan["environments"]:
         if environment not in random:
             random[environment] = round(random_return(*scb.make(environment)), 2)
+            digests[environment] = bandit_metadata(f"Synthetic-{environment}")["sha256"]
         entry = found.setdefault(environment, {source: {} for source in SOURCES})
         for source in SOURCES:
             trainer: _Trainer | None = None
@@ -80,7 +91,10 @@ def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None
                 if agent in entry[source] or (agent == OPTIMAL and source == ENVIRONMENT):
                     continue
                 trainer = trainer or _Trainer(environment, source, plan)
-                entry[source][agent] = np.round(trainer.returns(agent), 2).tolist()
+                returns = trainer.returns(agent)
+                entry[source][agent], number = finite(returns, random[environment])
+                if number:
+                    failed[f"{environment}, {source}, {agent}"] = number
                 save()
 
 
@@ -163,7 +177,7 @@ class _Trainer:
 
         config = NeuroevolutionConfig(**self.plan["neuroevolution"])
         if self.trained_in is self.env:
-            config = NeuroevolutionConfig(**self.plan["neuroevolution_environment"])
+            config = in_environment(config, int(self.env_params.max_steps_in_episode))
         return self._judged_policies(
             lambda key: evolve_policy(self.trained_in, self.trained_in_params, key, config), key
         )
@@ -189,6 +203,15 @@ class _Trainer:
         return np.asarray(judged(jax.random.split(key, self.plan["agents"])))
 
 
+def in_environment(config: "NeuroevolutionConfig", limit: int) -> "NeuroevolutionConfig":
+    """The neuroevolution of a bandit with as many steps of an environment: one episode a candidate."""
+    from dataclasses import replace
+
+    steps = config.population_size * config.num_generations * config.episodes
+    generations = max(1, steps // (config.population_size * limit))
+    return replace(config, episodes=1, num_generations=generations)
+
+
 def with_network(inner: "InnerLoop", network: str) -> "InnerLoop":
     """The same algorithm with one of the networks that no search saw, or with its own."""
     from dataclasses import replace
@@ -212,63 +235,57 @@ def columns(entry: Mapping[str, list[float]]) -> dict[str, np.ndarray]:
     return found | {name: trained[name] for name in (EVOLVED, OPTIMAL) if name in trained}
 
 
-def scores(report: Mapping[str, Any], column: str) -> dict[str, "Estimate"]:
-    """{source: normalised score over all environments} of one kind of agent; 0 random, 1 the paper's expert."""
+def normalized(report: Mapping[str, Any], source: str, column: str) -> list[np.ndarray]:
+    """Per environment the scores of one kind of agent: 0 a random policy, 1 the paper's expert."""
     from lpo.suite import REFERENCES
-    from scb.statistics import estimate, normalized_score
+    from scb.statistics import normalized_score
 
-    found = {}
-    for source in SOURCES:
-        values = [
-            normalized_score(
-                columns(entry[source])[column], report["random"][name], REFERENCES[name]
-            )
-            for name, entry in report["environments"].items()
-            if column in columns(entry[source])
-        ]
-        if values:
-            found[source] = estimate(np.concatenate(values))
-    return found
+    return [
+        normalized_score(columns(entry[source])[column], report["random"][name], REFERENCES[name])
+        for name, entry in report["environments"].items()
+    ]
 
 
 def verdict(report: Mapping[str, Any]) -> str:
     """Robustness to drawn hyperparameters, what drawing them in the search brings, and agents that no search saw."""
-    together = scores(report, TOGETHER)
+    from scb.statistics import stratified_estimate
+
+    together = {source: normalized(report, source, TOGETHER) for source in SOURCES}
+    robust = stratified_estimate(together[ZOO], together[ENVIRONMENT])
+    drawn = stratified_estimate(together[DRAWN], together[FIXED])
+    listed = ", ".join(f"{s} {text(stratified_estimate(x), 2)}" for s, x in together.items())
     parts = [
-        "Normalised scores over all environments (0 a random policy, 1 the paper's expert), agents with drawn "
-        "hyperparameters: "
-        + ", ".join(f"{source} {text(found, 2)}" for source, found in together.items())
-        + ": "
-        + (
-            "bandits are more robust to hyperparameters than the environment"
-            if _above(together[ZOO], together[ENVIRONMENT])
-            else "bandits are not clearly more robust than the environment"
-        )
-        + ", and drawing them in the search "
-        + (
-            "helps"
-            if _above(together[DRAWN], together[FIXED])
-            else "makes no clear difference here"
-        )
-        + "."
+        "normalised scores (0 a random policy, 1 the paper's expert; the mean over environments of the interquartile "
+        f"mean over agents) of the paper's algorithms with drawn hyperparameters: {listed}. The zoo's bandits "
+        + ("are" if _sign(robust) > 0 else "are not")
+        + f" more robust to hyperparameters than the environments (difference {text(robust, 2, sign=True)}). Drawing "
+        f"them in the search (one search each) changes {text(drawn, 2, sign=True)}: "
+        + {1: "it helps.", 0: "no clear difference.", -1: "it harms here."}[_sign(drawn)]
     ]
-    unseen = {name: scores(report, name)[ZOO] for name in UNSEEN}
-    worse = [name for name, x in unseen.items() if _above(together[ZOO], x)]
+    own = stratified_estimate(together[ZOO])
+    unseen = {name: stratified_estimate(normalized(report, ZOO, name)) for name in UNSEEN}
+    worse = [
+        name
+        for name, x in unseen.items()
+        if x.high is not None and own.low is not None and x.high < own.low
+    ]
     parts.append(
-        "Agents that no search saw, in the zoo's bandits: "
+        "Agents that are not in the paper's inner loop, in the zoo's bandits: "
         + ", ".join(f"{name} {text(x, 2)}" for name, x in unseen.items())
+        + "; "
         + (
-            "; none is clearly worse than the agents of the search."
-            if not worse
-            else f"; {' and '.join(worse)} {'is' if len(worse) == 1 else 'are'} worse than the agents of the search."
+            f"clearly worse than those that are: {' and '.join(worse)}."
+            if worse
+            else "none is clearly worse than those that are."
         )
     )
     return " ".join(parts)
 
 
-def _above(a: "Estimate", b: "Estimate") -> bool:
-    """Whether a's interval lies above b's."""
-    return a.low is not None and b.high is not None and a.low > b.high
+def _sign(difference: "Estimate") -> int:
+    """1 or -1 where the interval excludes zero, else 0."""
+    assert difference.low is not None and difference.high is not None
+    return int(difference.low > 0) - int(difference.high < 0)
 
 
 def body(report: Mapping[str, Any]) -> list[str]:
@@ -276,17 +293,24 @@ def body(report: Mapping[str, Any]) -> list[str]:
     from scb.statistics import estimate
 
     plan = report["plan"]
-    own, theirs = plan["neuroevolution"], plan["neuroevolution_environment"]
+    own = plan["neuroevolution"]
+    steps = own["num_generations"] * own["population_size"] * own["episodes"]
+    algorithms = ", ".join(x.upper() for x in plan["algorithms"]) or "all of the paper's algorithms"
+    sizes = list(plan["sizes"].values())
+    failed = sum(report["failed"].values())
     lines = [
         f"{plan['agents']} agents of each algorithm with hyperparameters drawn from the paper's lists, 10 000 steps, "
         f"{plan['episodes']} episodes of most likely actions; reporting seed 10 000. *{TOGETHER}*, *{WIDE}* and "
-        f"*{SWISH}* are over the agents of all algorithms. Neuroevolution is SNES on a policy network: in bandits "
-        f"{own['num_generations']} generations of {own['population_size']} candidates on {own['episodes']} contexts, "
-        f"in environments {theirs['num_generations']} generations of {theirs['population_size']} on "
-        f"{theirs['episodes']} episodes. The two searches take {plan['generations']} generations of "
-        f"{plan['population_size']} candidates from one "
+        f"*{SWISH}* are over the agents of all algorithms. Neuroevolution is SNES on a policy network with {steps} "
+        f"steps: in bandits {own['num_generations']} generations of {own['population_size']} candidates on "
+        f"{own['episodes']} contexts, in environments as many steps with one episode a candidate. The two searches "
+        f"train {algorithms} for {span(x['generations'] for x in sizes)} generations of "
+        f"{span(x['population_size'] for x in sizes)} candidates (SNES, standard deviation {plan['sigma']:g}, returns "
+        f"combined by {plan['combine']}), from one "
         f"{'fit to an expert' if plan['init'] == 'expert' else 'random start'}, and differ only in whether the inner "
-        "agents' hyperparameters are drawn or the paper's underlined ones. Interquartile means with 95 % intervals."
+        "agents' hyperparameters are drawn or the paper's underlined ones. What the zoo's bandits were found with "
+        "stands in their commands (`scb list`). Interquartile means with 95 % intervals. Agents whose return was no "
+        f"number, counted as a random policy: {failed}.",
     ]
     for name, entry in report["environments"].items():
         by_source = {source: columns(entry[source]) for source in SOURCES}
@@ -305,7 +329,7 @@ def body(report: Mapping[str, Any]) -> list[str]:
 
 
 def draw(report: Mapping[str, Any]) -> "Figure":
-    """A panel an environment; left of the dashed line what the searches saw."""
+    """A panel an environment; right of the dashed line what the paper's inner loop does not have."""
     from matplotlib.figure import Figure
 
     from scb import plotting
@@ -330,12 +354,10 @@ def draw(report: Mapping[str, Any]) -> "Figure":
                 for column, values in columns(entry[source]).items():
                     found = estimate(values)
                     x = shown.index(column) + 0.17 * (i - 1.5)
-                    low = found.value if found.low is None else found.low
-                    high = found.value if found.high is None else found.high
                     axes.errorbar(
                         x,
                         found.value,
-                        [[found.value - low], [high - found.value]],
+                        plotting.error_bar(found),
                         fmt=marker,
                         color=color,
                         capsize=2,
@@ -357,7 +379,7 @@ def draw(report: Mapping[str, Any]) -> "Figure":
         plotting.legend_below(figure, (handles, list(SOURCES)), columns=4)
         plotting.figure_title(
             figure,
-            "Trained in ..., judged in the environment; right of the line: unseen by any search",
+            "Judged in the environment after training in ...; right of the line: not in the paper's inner loop",
         )
     return figure
 
@@ -365,19 +387,13 @@ def draw(report: Mapping[str, Any]) -> "Figure":
 _SHARED: dict[str, Any] = {
     "environments": list(CLASSIC_CONTROL),
     "seed": 0,
-    "neuroevolution": {"population_size": 64, "num_generations": 200, "episodes": 64, "sigma": 0.1},
-    "neuroevolution_environment": {
-        "population_size": 64,
-        "num_generations": 10,
-        "episodes": 1,
-        "sigma": 0.1,
-    },
+    "neuroevolution": {"population_size": 64, "num_generations": 200, "episodes": 32, "sigma": 0.1},
 }
 
 EXPERIMENT = Experiment(
     name="generality",
-    title="A bandit trains agents that its search never saw",
-    paper="figure 3 and the appendix on generality",
+    title="What agents a bandit can train",
+    paper="figures 3 and 8 to 11",
     claim="bandits are much more robust to an agent's hyperparameters than their environments are, more so where the "
     "search drew them; and they train agents that no search saw: other networks, other activations, neuroevolution; "
     "the CB-optimal policy does well in the environment.",
@@ -387,11 +403,12 @@ EXPERIMENT = Experiment(
             "runs": "runs/generality/quick",
             "algorithms": ["ppo"],
             "init": "expert",
-            "warm_start": {},
-            "population_size": 16,
-            "generations": 20,
+            "combine": "ranks",
+            "sizes": {
+                name: {"generations": 20, "population_size": 16, "agents_per_candidate": 2}
+                for name in CLASSIC_CONTROL
+            },
             "sigma": 0.02,
-            "agents_per_candidate": 2,
             "evaluation_episodes": 8,
             "mean_evaluations": 32,
             "agents": 8,
@@ -402,11 +419,9 @@ EXPERIMENT = Experiment(
             "runs": "runs/generality/paper",
             "algorithms": [],
             "init": "random",
-            "warm_start": {},
-            "population_size": 128,
-            "generations": 300,
+            "combine": "mean",
+            "sizes": PAPER_SIZES,
             "sigma": 0.05,
-            "agents_per_candidate": 1,
             "evaluation_episodes": 50,
             "mean_evaluations": 64,
             "agents": 20,

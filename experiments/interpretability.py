@@ -176,7 +176,7 @@ def draw(report: Mapping[str, Any]) -> "Figure":
 EXPERIMENT = Experiment(
     name="interpretability",
     title="What a bandit says about its environment",
-    paper="figure 5 and its section",
+    paper="figure 6 and its section",
     claim="SCBs give insights into their environment: the reward hardly depends on Acrobot's angles (compared with its "
     "angular velocities), nor on CartPole's position and angle; MountainCar's bandit never does nothing, its "
     "continuous sibling's often does.",

@@ -10,7 +10,7 @@ import argparse
 import json
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -108,6 +108,19 @@ def unpacked(lines: Sequence[str]) -> "NDArray[np.floating]":
     return np.array([[float(x) for x in line.split()] for line in lines])
 
 
+def finite(returns: Any, instead: float) -> tuple[list[float], int]:
+    """([N] returns to two digits, how many were no number): those count as `instead`, the return of random actions."""
+    values = np.asarray(returns, np.float64)
+    bad = ~np.isfinite(values)
+    return np.round(np.where(bad, instead, values), 2).tolist(), int(bad.sum())
+
+
+def span(numbers: Iterable[int]) -> str:
+    """Such as "30 to 60", or "30" where all are alike."""
+    low, high = min(found := list(numbers)), max(found)
+    return str(low) if low == high else f"{low} to {high}"
+
+
 def text(estimate: "Estimate | Mapping[str, Any]", places: int = 0, sign: bool = False) -> str:
     """An estimate with its interval, with a real minus sign."""
     values = estimate if isinstance(estimate, Mapping) else estimate.as_dict()
@@ -158,14 +171,30 @@ def main(experiment: Experiment, argv: Sequence[str] | None = None) -> int:
 
 
 def render(experiment: Experiment, report: Mapping[str, Any], docs: Path) -> None:
-    """Writes docs/NAME.md and docs/figures/NAME.png."""
+    """Writes docs/NAME.md and docs/figures/NAME.png.
+
+    Raises:
+      UserError: the report is not complete.
+    """
     from scb import plotting
+    from scb.errors import UserError
+
+    if not complete(report):
+        raise UserError(
+            f"the report of {experiment.name} is not complete: run python -m experiments.{experiment.name} "
+            f"--preset {report['preset']}, which goes on where it was."
+        )
 
     docs.mkdir(parents=True, exist_ok=True)
     (docs / f"{experiment.name}.md").write_text(page(experiment, report))
     plotting.save(experiment.draw(report), docs / "figures" / f"{experiment.name}.png")
     if experiment.extras is not None:
         experiment.extras(report, docs)
+
+
+def complete(report: Mapping[str, Any]) -> bool:
+    """Whether everything that the report is about was measured."""
+    return bool(report.get("complete", True))
 
 
 def _measure(experiment: Experiment, preset: str, report: dict[str, Any], out: Path) -> None:
@@ -177,9 +206,16 @@ def _measure(experiment: Experiment, preset: str, report: dict[str, Any], out: P
         raise UserError(
             f"{out} holds the preset {report['preset']}: choose another --out for the preset {preset}."
         )
+    plan = json.loads(json.dumps(dict(experiment.presets[preset])))
+    if report.get("plan", plan) != plan:
+        raise UserError(
+            f"{out} was measured when the preset {preset} was another one: choose another --out."
+        )
     before, start = report.get("seconds", 0.0), time.monotonic()
     report |= {
         "preset": preset,
+        "plan": plan,
+        "complete": False,
         "versions": package_versions(),
         "machine": machine_description(),
     }
@@ -189,7 +225,8 @@ def _measure(experiment: Experiment, preset: str, report: dict[str, Any], out: P
         out.parent.mkdir(parents=True, exist_ok=True)
         write_json(out, report)
 
-    experiment.measure(experiment.presets[preset], report, save)
+    experiment.measure(plan, report, save)
+    report["complete"] = True
     save()
 
 

@@ -1,5 +1,6 @@
 """Discoveries that experiments compare: each in a run folder of its own, so that a killed one goes on."""
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -7,10 +8,20 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from scb.discovery import BanditDiscovery, DiscoveryConfig
     from scb.evolution import Outcome
+    from scb.statistics import Estimate
+
+# The paper's tables of the outer loop, classic control.
+PAPER_SIZES: dict[str, dict[str, int]] = {
+    name: {"generations": 300, "population_size": 128, "agents_per_candidate": 1}
+    for name in ("Acrobot-v1", "CartPole-v1", "MountainCarContinuous-v0")
+} | {
+    "MountainCar-v0": {"generations": 1000, "population_size": 128, "agents_per_candidate": 1},
+    "Pendulum-v1": {"generations": 1000, "population_size": 64, "agents_per_candidate": 8},
+}
 
 
 def search(config: "DiscoveryConfig", folder: str | Path) -> "tuple[BanditDiscovery, Outcome]":
-    """A discovery in this run folder, resumed where it was begun; nothing is computed where it has ended."""
+    """A discovery in this run folder, resumed where it was begun; where it has ended, no generation is computed."""
     from scb.discovery import discover
     from scb.evolution import config_dict
     from scb.runs import Run
@@ -27,26 +38,37 @@ def curve(metrics: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]:
     """What a search distribution's mean was worth over the generations, from a run's log.
 
     Returns:
-      {"generation", "fitness" (interquartile mean over agents; None where one failed), "failed" (mean number of
-      candidates without a finite fitness since the last judgement)}.
+      {"generation", "fitness" (interquartile mean over agents; None where one failed), "mean" (over agents),
+      "failed" (mean number of candidates without a finite fitness since the last judgement)}.
     """
     generations: list[int] = []
     fitness: list[float | None] = []
+    mean: list[float | None] = []
     failed: list[float] = []
     since: list[int] = []
     for line in metrics:
         if "mean/fitness" in line:
             generations.append(line["generation"])
             fitness.append(_rounded(line.get("mean/fitness_iqm")))
+            mean.append(_rounded(line["mean/fitness"]))
             failed.append(round(sum(since) / len(since), 3) if since else 0.0)
             since = []
         since.append(line["failed"])
         if "final_mean/fitness" in line:
             generations.append(line["generation"] + 1)
             fitness.append(_rounded(line.get("final_mean/fitness_iqm")))
+            mean.append(_rounded(line["final_mean/fitness"]))
             failed.append(round(sum(since) / len(since), 3))
-    return {"generation": generations, "fitness": fitness, "failed": failed}
+    return {"generation": generations, "fitness": fitness, "mean": mean, "failed": failed}
+
+
+def final(curves: Mapping[str, Mapping[str, Any]], statistic: Any) -> "Estimate | None":
+    """The last judgement, over the searches of {seed: curve}; None where every one failed."""
+    from scb.statistics import estimate
+
+    last = [c["fitness"][-1] for c in curves.values() if c["fitness"][-1] is not None]
+    return estimate(last, statistic) if last else None
 
 
 def _rounded(value: float | None) -> float | None:
-    return None if value is None else round(float(value), 2)
+    return None if value is None or not math.isfinite(value) else round(float(value), 2)

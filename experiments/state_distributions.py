@@ -27,7 +27,6 @@ BANDIT_ROUGHNESS, EXPERT_ROUGHNESS = "bandit's roughness", "expert's roughness"
 
 def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None:
     """An environment at a time."""
-    report["plan"] = dict(plan)
     found = report.setdefault("environments", {})
     for environment in plan["environments"]:
         if environment not in found:
@@ -52,9 +51,10 @@ def _examine(environment: str, plan: Mapping[str, Any]) -> dict[str, Any]:
     bandit = open_bandit(f"Synthetic-{environment}")
     space = env.action_space(env_params)
     contexts = bandit_states(bandit, key_states, STATES)
-    visited = follow(env, env_params, expert.policy(), key_episodes, plan["episodes"]).states()
-    picked = np.asarray(jax.random.choice(key_pick, len(visited), (STATES,)))
-    visited = visited[picked]
+    episodes = follow(env, env_params, expert.policy(), key_episodes, plan["episodes"])
+    visited = episodes.states()
+    few = len(visited) < STATES
+    visited = visited[np.asarray(jax.random.choice(key_pick, len(visited), (STATES,), replace=few))]
     low, high = flat_bounds(env.observation_space(env_params))
     plane = plane_for(
         environment,
@@ -68,10 +68,10 @@ def _examine(environment: str, plan: Mapping[str, Any]) -> dict[str, Any]:
     def first(actions: Any) -> np.ndarray:
         return np.asarray(actions).reshape(POINTS * POINTS, -1)[:, 0].reshape(POINTS, POINTS)
 
-    best = jax.jit(jax.vmap(optimal_actions(bandit)))
+    best = jax.jit(jax.vmap(optimal_actions(bandit, method="grid")))
     return {
         "sha256": bandit_metadata(bandit.name)["sha256"],
-        "expert": round(expert.mean_return, 2),
+        "expert": round(float(episodes.returns().mean()), 2),
         "labels": list(plane.labels),
         "limits": [list(x) for x in plane.limits],
         "num_actions": int(space.n) if isinstance(space, spaces.Discrete) else None,
@@ -84,18 +84,19 @@ def _examine(environment: str, plan: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def expert_actions(expert: Any, space: Any, observations: np.ndarray) -> np.ndarray:
-    """[N, ...] the action with the largest Q-value of the expert; of 41 evenly spaced ones where continuous."""
+    """[N, ...] the action with the largest Q-value of the expert; of evenly spaced ones where continuous."""
     import jax
     import jax.numpy as jnp
     from gymnax.environments import spaces
 
     from scb.agents.agent import flat_bounds
+    from scb.analysis.optimal_actions import GRID_POINTS
 
     if isinstance(space, spaces.Discrete):
         candidates = jnp.arange(space.n)
     else:
         low, high = flat_bounds(space)
-        candidates = jnp.linspace(low, high, 41).reshape(41, *space.shape)
+        candidates = jnp.linspace(low, high, GRID_POINTS).reshape(GRID_POINTS, *space.shape)
 
     @jax.jit
     @jax.vmap
@@ -199,10 +200,13 @@ def draw(report: Mapping[str, Any]) -> "Figure":
                     axes, plane, unpacked(entry[actions]), entry["num_actions"], entry["bounds"]
                 )
                 points = unpacked(entry[states])
-                axes.plot(*points.T, ".", markersize=1.5, color=plotting.BLACK, alpha=0.5)
+                # A white edge, for black is hard to see on the dark ends of the background.
+                axes.scatter(
+                    *points.T, s=6, color=plotting.BLACK, edgecolors="white", linewidths=0.3
+                )
                 axes.set_title(f"{name}\n{whose}", fontsize=9)
             bar = figure.colorbar(drawn, ax=panels[1, column], location="bottom", aspect=30)
-            bar.set_label("best action", fontsize=8)
+            bar.set_label(f"best action: {ACTIONS[name]}", fontsize=8)
             if entry["num_actions"]:
                 bar.set_ticks(range(entry["num_actions"]))
         plotting.figure_title(
@@ -212,13 +216,22 @@ def draw(report: Mapping[str, Any]) -> "Figure":
     return figure
 
 
+# What the actions are.
+ACTIONS = {
+    "Acrobot-v1": "torque on joint 2, \u22121, 0, 1",
+    "CartPole-v1": "push left, right",
+    "MountainCar-v0": "push left, none, right",
+    "MountainCarContinuous-v0": "force (of its maximum)",
+    "Pendulum-v1": "torque (N m)",
+}
+
 # Which entries of the larger observations span the plane: the largest two numbers are taken.
 _ENTRIES = {"Acrobot-v1": [0, 0, 0, 0, 1, 1], "CartPole-v1": [0, 0, 1, 1]}
 
 EXPERIMENT = Experiment(
     name="state_distributions",
-    title="A bandit's contexts cover more than an expert's states",
-    paper="figure 8, appendix on replacing components",
+    title="The states of an expert and of a bandit",
+    paper="figure 13, appendix on replacing components",
     claim="the synthetic initial states sample a significantly larger part of the state space than what the expert "
     "visits, and the bandit's best actions are smoother than those of the expert's Q-function in several environments.",
     presets={

@@ -284,18 +284,21 @@ def measure_alignment(
       keep: is given the report so far after every regime.
 
     Raises:
-      UserError: `done` is of other objectives.
+      UserError: `done` is of another measurement.
     """
+    asked = {
+        "environment": environment,
+        "steps": steps,
+        "backend": backend,
+        "policy_output_scale": policy_output_scale,
+        "agents": len(seeds),
+        "first_seed": min(seeds),
+    }
     report: dict[str, Any] = dict(done or {})
     if not report:
         found = outcomes(environment, objectives, seeds, steps, backend, policy_output_scale)
         report = {
-            "environment": environment,
-            "steps": steps,
-            "backend": backend,
-            "policy_output_scale": policy_output_scale,
-            "agents": len(seeds),
-            "first_seed": min(seeds),
+            **asked,
             "outcome_iqm": {name: float(iqm(returns)) for name, returns in found.items()},
             "outcome": {name: np.round(returns, 2).tolist() for name, returns in found.items()},
             "regimes": [],
@@ -303,9 +306,12 @@ def measure_alignment(
             "machine": machine_description(),
         }
         keep(report)
-    if set(report["outcome"]) != {objective.name for objective in objectives}:
+    stored = {name: report[name] for name in asked}
+    names = {objective.name for objective in objectives}
+    if stored != asked or set(report["outcome"]) != names:
         raise UserError(
-            f"{environment} was measured with other objectives ({', '.join(report['outcome'])}): choose another --out."
+            f"{environment} was measured with other objectives, agents or steps ({', '.join(report['outcome'])}; "
+            f"{stored}): choose another --out."
         )
     outcome = {name: np.asarray(returns) for name, returns in report["outcome"].items()}
     tell(f"{environment}: " + ", ".join(f"{n} {x:.0f}" for n, x in report["outcome_iqm"].items()))

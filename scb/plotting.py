@@ -17,7 +17,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from scb.statistics import Estimate, estimate
+from scb.statistics import Estimate, Statistic, estimate
 
 BLACK, ORANGE, SKY_BLUE, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"
 BLUE, VERMILLION, PURPLE = "#0072B2", "#D55E00", "#CC79A7"
@@ -62,15 +62,21 @@ def estimate_row(
 ) -> None:
     """On one line of a horizontal plot: the estimate with its interval, and behind it each value a dot."""
     axes.plot(values, np.full(values.size, position), ".", color=color, alpha=0.25)
-    ends = [found.value if end is None else end for end in (found.low, found.high)]
     axes.errorbar(
         found.value,
         position,
-        xerr=np.abs(np.subtract(ends, found.value))[:, None],
+        xerr=error_bar(found),
         fmt="o",
         color=color,
         capsize=3,
     )
+
+
+def error_bar(*found: Estimate) -> NDArray[np.floating]:
+    """[2, N] distances of the intervals' ends from the values, as matplotlib takes them; 0 where an end is unknown."""
+    values = np.array([e.value for e in found])
+    ends = [[e.value if x is None else x for x in (e.low, e.high)] for e in found]
+    return np.abs(np.transpose(ends) - values)
 
 
 def search_curve(
@@ -79,19 +85,21 @@ def search_curve(
     label: str,
     color: str,
     linestyle: Any = "-",
+    statistic: Statistic = np.mean,
 ) -> None:
-    """The mean of several searches over their generations, with its interval over searches.
+    """Several searches over their generations: a statistic of them, with its interval over searches.
 
     Args:
       curves: of each search {"generation": [G], "fitness": [G] with None where there is no number}. A generation
         without any number is a gap in the line; the interval needs two searches.
+      statistic: takes an array and `axis`.
     """
     if not curves:
         return
     generations = np.asarray(curves[0]["generation"])
     fitness = np.array([c["fitness"] for c in curves], float)
     found = [
-        None if np.isnan(column).all() else estimate(column[~np.isnan(column)], statistic=np.mean)
+        None if np.isnan(column).all() else estimate(column[~np.isnan(column)], statistic)
         for column in fitness.T
     ]
     ends = [

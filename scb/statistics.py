@@ -5,7 +5,7 @@ rest: it is as robust as the median against a lucky or a failed seed, and wastes
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from typing import NamedTuple
 
@@ -151,6 +151,50 @@ def paired_difference(
 
     low, high = _bootstrap((first, second), difference, confidence, num_resamples, seed)
     return Estimate(float(difference(first, second, axis=-1)), low, high, first.size)
+
+
+def stratified_estimate(
+    groups: Sequence[ArrayLike],
+    minus: Sequence[ArrayLike] | None = None,
+    confidence: float = 0.95,
+    num_resamples: int = 2000,
+    seed: int = 0,
+) -> Estimate:
+    """The mean over groups of their interquartile means, with an interval that resamples within every group.
+
+    Every group (the runs of an environment) counts alike, however many runs it has.
+
+    Args:
+      groups: [N_g] one number per run, for each group.
+      minus: of the same sizes, run by run on the same seeds; the estimate is then that of the difference,
+        paired in the bootstrap.
+
+    Raises:
+      UserError: no groups, or other sizes in `minus`.
+    """
+    first = [_runs("a group", group) for group in groups]
+    second = None if minus is None else [_runs("a group", group) for group in minus]
+    if not first:
+        raise UserError("there is no group: give at least one.")
+    if second is not None and [x.size for x in first] != [x.size for x in second]:
+        raise UserError("the groups to subtract have other sizes: pair run by run.")
+    generator = np.random.default_rng(seed)
+
+    def statistic(resampled: bool) -> NDArray[np.floating]:
+        total = np.zeros(num_resamples if resampled else 1)
+        for i, group in enumerate(first):
+            rows = np.arange(group.size)[None]
+            if resampled:
+                rows = generator.integers(0, group.size, (num_resamples, group.size))
+            total += iqm(group[rows], axis=1)
+            if second is not None:
+                total -= iqm(second[i][rows], axis=1)
+        return total / len(first)
+
+    tail = 50.0 * (1.0 - confidence)
+    low, high = np.percentile(statistic(True), [tail, 100.0 - tail])
+    size = sum(group.size for group in first)
+    return Estimate(float(statistic(False)[0]), float(low), float(high), size)
 
 
 def normalized_score(

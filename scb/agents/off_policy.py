@@ -186,12 +186,14 @@ class OffPolicyAgent(Agent):
         else:
             steps = config.prefill // config.num_envs
             held = jnp.arange(steps) // config.prefill_hold
+            # A number that no step's key has.
+            key_held = jax.random.fold_in(key_prefill, steps)
 
             def step(standing: Any, inputs: tuple[jax.Array, jax.Array]) -> tuple[Any, Transition]:
                 key, choice = inputs
 
                 def hold(observation: jax.Array, _: jax.Array) -> jax.Array:
-                    return random_actions(observation, jax.random.fold_in(key_prefill, choice))
+                    return random_actions(observation, jax.random.fold_in(key_held, choice))
 
                 actions = random_actions if config.prefill_hold == 1 else hold
                 return self._step(standing, config.num_envs, actions, key, env_params)

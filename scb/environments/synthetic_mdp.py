@@ -7,9 +7,9 @@ The parameterisations of Liesen et al. (2024), appendix "Ablations of the Meta-E
   TI  and a learned initial-state distribution.
   I   that distribution and the reward alone, one step long: the bandit of `synthetic.py`.
 
-The state is the observation, a learned function of its predecessor. Repeated over long episodes it
-may grow beyond any number: NaN and infinities are passed on as they are, and evolution ranks such a
-candidate last.
+The state is the observation, a learned function of its predecessor. With ReLU it may grow beyond any
+number over long episodes (with tanh it is bounded by the last layer's weights): NaN and infinities
+are passed on as they are, and evolution ranks such a candidate last.
 """
 
 from dataclasses import dataclass, field

@@ -11,6 +11,7 @@ def report(**finals):
             str(seed): {
                 "generation": [0, 60],
                 "fitness": [10.0, finals.get(shape, 200.0) + 10.0 * seed],
+                "mean": [10.0, 0.0],
                 "failed": [0.0, 0.0],
                 "seconds": 60.0,
             }

@@ -14,11 +14,12 @@ TINY = {
     "limits": [OWN, "1"],
     "algorithms": ["ppo"],
     "judged_by": ["ppo"],
-    "population_size": 2,
-    "agents_per_candidate": 1,
+    "sizes": {
+        name: {"generations": 1, "population_size": 2, "agents_per_candidate": 1}
+        for name in ("MountainCar-v0", "CartPole-v1")
+    },
     "evaluation_episodes": 1,
     "mean_evaluations": 2,
-    "generations": {"MountainCar-v0": 1},
     "agents": 2,
     "episodes": 3,
 }
@@ -30,11 +31,11 @@ def report(one=-120.0, own=-150.0, single=9):
         "random": -200.0,
         "limit": 200,
         "returns": {OWN: {"ppo": [own, own]}, "1": {"ppo": [one, one]}},
+        "failed": {OWN: 0, "1": 1},
         "lengths": {"ppo": {**dict.fromkeys(BINS, 0), "1": single, "more": 10 - single}},
     }
     environments = {"MountainCar-v0": entry, "CartPole-v1": {**entry, "random": 20.0}}
-    plan = {**TINY, "generations": dict.fromkeys(environments, 1)}
-    return {"environments": environments, "plan": plan}
+    return {"environments": environments, "plan": TINY}
 
 
 def test_lengths_are_counted_once_each():
@@ -45,9 +46,9 @@ def test_lengths_are_counted_once_each():
 def test_the_verdict_follows_the_figures():
     said = experiment.verdict(report())
     assert "MountainCar-v0 90%" in said and "more than 80% in 2 of 2" in said
-    assert "better in 2" in said and "one step costs nothing" in said
+    assert "it costs nothing clearly, and is clearly better in MountainCar-v0 and CartPole" in said
     said = experiment.verdict(report(one=-190.0, single=3))
-    assert "in 0 of 2" in said and "worse in 2" in said and "not always as good" in said
+    assert "in 0 of 2" in said and "clearly worse in MountainCar-v0 and CartPole-v1." in said
 
 
 def test_the_page_and_the_figure_show_every_limit():
@@ -93,6 +94,6 @@ def test_an_mdp_is_searched_before_it_is_judged(tmp_path, monkeypatch):
 def test_presets_have_the_environments_own_limit_and_a_single_step(preset):
     plan = experiment.EXPERIMENT.presets[preset]
     assert {OWN, "1"} <= set(plan["limits"])
-    assert set(plan["generations"]) == set(experiment.CLASSIC_CONTROL)
+    assert set(plan["sizes"]) == set(experiment.CLASSIC_CONTROL)
     config = experiment.config_of("Pendulum-v1", "10", plan)
     assert config.parameterization == "TI" and config.max_steps == 10

@@ -1,4 +1,5 @@
 import copy
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -16,23 +17,21 @@ from experiments.generality import (
     WIDE,
     ZOO,
 )
+from scb.neuroevolution import NeuroevolutionConfig
 
 TINY = {
     "environments": ["CartPole-v1"],
     "seed": 0,
     "algorithms": ["ppo"],
     "init": "random",
-    "warm_start": {},
-    "population_size": 2,
-    "generations": 1,
+    "combine": "mean",
+    "sizes": {"CartPole-v1": {"generations": 1, "population_size": 2, "agents_per_candidate": 1}},
     "sigma": 0.02,
-    "agents_per_candidate": 1,
     "evaluation_episodes": 1,
     "mean_evaluations": 2,
     "agents": 2,
     "episodes": 2,
     "neuroevolution": {"population_size": 8, "num_generations": 20, "episodes": 32, "sigma": 0.1},
-    "neuroevolution_environment": {"population_size": 4, "num_generations": 1, "episodes": 1},
 }
 
 
@@ -57,7 +56,12 @@ def report(**returns):
         if source != ENVIRONMENT:
             entry[source][OPTIMAL] = [500.0] * 4
     plan = generality.EXPERIMENT.presets["quick"]
-    return {"plan": plan, "random": {"CartPole-v1": 20.0}, "environments": {"CartPole-v1": entry}}
+    return {
+        "plan": plan,
+        "random": {"CartPole-v1": 20.0},
+        "failed": {},
+        "environments": {"CartPole-v1": entry},
+    }
 
 
 def test_columns_pool_the_algorithms():
@@ -80,9 +84,15 @@ def test_the_two_searches_differ_in_drawn_hyperparameters_alone():
     plan = generality.EXPERIMENT.presets["quick"]
     drawn, fixed = (generality.config_of("Pendulum-v1", x, plan) for x in (DRAWN, FIXED))
     assert drawn.sampled_hyperparameters and not fixed.sampled_hyperparameters
-    from dataclasses import replace
-
     assert replace(fixed, sampled_hyperparameters=True) == drawn
+
+
+def test_neuroevolution_takes_as_many_steps_of_an_environment_as_of_a_bandit():
+    config = NeuroevolutionConfig(population_size=64, num_generations=200, episodes=32)
+    there = generality.in_environment(config, 200)
+    assert (there.episodes, there.num_generations) == (1, 32)
+    assert there.num_generations * 64 * 200 == 200 * 64 * 32
+    assert generality.in_environment(replace(config, num_generations=1), 999).num_generations == 1
 
 
 def test_every_algorithm_meets_every_network():
@@ -92,17 +102,20 @@ def test_every_algorithm_meets_every_network():
 
 def test_the_verdict_follows_the_figures():
     said = generality.verdict(report(itself=50.0))
-    assert "more robust to hyperparameters than the environment" in said
-    assert "drawing them in the search makes no clear difference" in said
-    assert "none is clearly worse" in said
+    assert "are more robust to hyperparameters than the environments (difference +0.73" in said
+    assert "no clear difference" in said and "none is clearly worse" in said
     changed = copy.deepcopy(report())
+    entry = changed["environments"]["CartPole-v1"]
     for source, value in ((DRAWN, 450.0), (FIXED, 300.0)):
         for agent in ("ppo", "sac"):
-            changed["environments"]["CartPole-v1"][source][agent] = [value] * 4
-    changed["environments"]["CartPole-v1"][ZOO][EVOLVED] = [100.0] * 4
+            entry[source][agent] = [value] * 4
+    entry[ZOO][EVOLVED] = [100.0] * 4
     said = generality.verdict(changed)
-    assert "drawing them in the search helps" in said and "not clearly more robust" in said
-    assert f"{EVOLVED} is worse than the agents of the search" in said
+    assert "it helps" in said and "are not more robust" in said
+    assert f"clearly worse than those that are: {EVOLVED}." in said
+    for agent in ("ppo", "sac"):
+        entry[DRAWN][agent] = [100.0] * 4
+    assert "it harms here" in generality.verdict(changed)
 
 
 def test_the_page_and_the_figure_show_every_kind_of_agent():

@@ -1,4 +1,5 @@
 import json
+from dataclasses import replace
 
 import pytest
 from matplotlib.figure import Figure
@@ -95,3 +96,29 @@ def test_all_experiments_in_one_go_leave_one_page(tmp_path, monkeypatch):
     overview = (tmp_path / "docs" / "experiments.md").read_text()
     assert "[Counting](counting.md)" in overview and "2 measured." in overview
     assert everything.main([*flags, "--preset", "paper"]) == 2
+
+
+def test_a_report_that_is_not_complete_makes_no_page(tmp_path, capsys):
+    flags = ["--out", str(tmp_path / "counting.json"), "--docs", str(tmp_path / "docs")]
+    with pytest.raises(KeyboardInterrupt):
+        page.main(counting(fail_at="b"), flags)
+    assert page.main(counting(), [*flags, "--only-render"]) == 2
+    assert (
+        "not complete: run python -m experiments.counting --preset quick" in capsys.readouterr().err
+    )
+    assert "Measured in part only" in everything.overview([counting()], tmp_path)
+    assert page.main(counting(), flags) == 0
+    assert "2 measured." in everything.overview([counting()], tmp_path)
+
+
+def test_a_report_of_another_plan_is_not_continued(tmp_path, capsys):
+    flags = ["--out", str(tmp_path / "c.json"), "--docs", str(tmp_path)]
+    assert page.main(counting(), flags) == 0
+    presets = {"quick": {"value": 3}, "paper": {"value": 2}}
+    assert page.main(replace(counting(), presets=presets), flags) == 2
+    assert "when the preset quick was another one" in capsys.readouterr().err
+
+
+def test_returns_that_are_no_number_count_as_a_random_policy():
+    assert page.finite([1.234, float("nan"), float("inf")], -7.0) == ([1.23, -7.0, -7.0], 2)
+    assert page.span([3, 3]) == "3" and page.span([30, 60, 30]) == "30 to 60"

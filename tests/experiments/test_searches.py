@@ -4,6 +4,7 @@ from matplotlib.figure import Figure
 
 from experiments import searches
 from scb import plotting
+from scb.commands import _paper_settings
 from scb.discovery import DiscoveryConfig
 from scb.evolution import EvolutionConfig
 
@@ -33,6 +34,18 @@ def test_a_search_that_has_ended_is_read_and_not_run_again(tmp_path):
     assert found["failed"] == [0.0, 0.0, 0.0]
 
 
+def test_the_papers_sizes_are_those_of_its_preset():
+    for name, size in searches.PAPER_SIZES.items():
+        paper = _paper_settings(name)
+        assert size == {key: paper[key] for key in size}
+
+
+def test_the_last_judgement_is_over_searches_that_have_one():
+    curves = {str(i): {"fitness": [0.0, x]} for i, x in enumerate([1.0, None, 4.0])}
+    assert searches.final(curves, np.mean).value == 2.5
+    assert searches.final({"0": {"fitness": [None]}}, np.mean) is None
+
+
 def test_a_judgement_without_a_number_is_a_gap_and_failures_are_averaged():
     metrics = [
         {"generation": 0, "failed": 2, "mean/fitness": -7.0, "mean/fitness_iqm": -6.0},
@@ -43,6 +56,7 @@ def test_a_judgement_without_a_number_is_a_gap_and_failures_are_averaged():
     assert searches.curve(metrics) == {
         "generation": [0, 2, 4],
         "fitness": [-6.0, None, -2.0],
+        "mean": [-7.0, None, -3.0],
         "failed": [0.0, 3.0, 0.5],
     }
 

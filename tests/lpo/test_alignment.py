@@ -179,7 +179,7 @@ def test_the_report_holds_every_regime_and_is_drawn(monkeypatch, tmp_path):
         keep=lambda found: kept.append(len(found["regimes"])),
     )
     assert kept == [3] and longer["regimes"][:2] == report["regimes"][:2]
-    with pytest.raises(UserError, match="measured with other objectives"):
+    with pytest.raises(UserError, match="measured with other objectives, agents or steps"):
         measure_alignment(regimes, family[:2], "Pendulum-v1", [7, 8], done=report)
     path = plotting.save(figures.alignment_heatmap(report), tmp_path / "alignment.png")
     assert path.stat().st_size > 5000

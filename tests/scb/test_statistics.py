@@ -13,6 +13,7 @@ from scb.statistics import (
     normalized_score,
     paired_difference,
     spearman,
+    stratified_estimate,
 )
 
 
@@ -179,3 +180,44 @@ def test_an_estimate_goes_into_json():
         "high": None,
         "n": 1,
     }
+
+
+# -- groups
+# ----------------------------------------------------------------------------------------
+
+
+def test_groups_count_alike_however_many_runs_they_have():
+    few, many = np.full(4, 1.0), np.full(40, 3.0)
+    found = stratified_estimate([few, many])
+    assert (found.value, found.low, found.high, found.n) == (2.0, 2.0, 2.0, 44)
+
+
+def test_the_stratified_interval_covers_as_often_as_it_says():
+    generator = np.random.default_rng(0)
+    hits = 0
+    for seed in range(200):
+        groups = [generator.normal(mean, 1.0, 20) for mean in (0.0, 10.0)]
+        found = stratified_estimate(groups, num_resamples=400, seed=seed)
+        hits += found.low <= 5.0 <= found.high
+    assert 170 <= hits <= 199
+
+
+def test_paired_differences_of_groups_cancel_what_is_common():
+    generator = np.random.default_rng(1)
+    common = [generator.normal(0.0, 100.0, 12) for _ in range(3)]
+    found = stratified_estimate([x + 1.0 for x in common], common)
+    np.testing.assert_allclose([found.value, found.low, found.high], 1.0, atol=1e-9)
+    assert stratified_estimate(common).high - stratified_estimate(common).low > 30.0
+
+
+@pytest.mark.parametrize(
+    ("groups", "minus", "message"),
+    [
+        ([], None, "there is no group"),
+        ([[1.0, 2.0]], [[1.0]], "the groups to subtract have other sizes"),
+        ([[1.0, np.nan]], None, "a group holds 1 NaN"),
+    ],
+)
+def test_groups_that_cannot_be_compared_are_refused(groups, minus, message):
+    with pytest.raises(UserError, match=message):
+        stratified_estimate(groups, minus)
