@@ -8,13 +8,15 @@ The comparisons are what `lpo evaluate --out` wrote for that objective; nothing 
 import argparse
 import json
 import sys
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 
-def _short(name: str) -> str:
-    """What a comparison calls an objective: a file by its stem, for a path means nothing elsewhere."""
-    return Path(name).stem if name.endswith(".npz") else name
+def _short(name: str, file: Path, zoo_name: str) -> str:
+    """What a comparison calls an objective: this one by its name in the zoo, another file by its stem."""
+    stem = Path(name).stem if name.endswith(".npz") else name
+    return zoo_name if stem == file.stem else stem
 
 
 def main() -> int:
@@ -36,6 +38,7 @@ def main() -> int:
         raise UserError(f"{objective.name} is a closed form: the zoo holds learned objectives.")
     metadata: dict[str, Any] = dict(objective.metadata)
     results = dict(metadata["results"])
+    short = partial(_short, file=arguments.objective, zoo_name=arguments.name)
     reporting_seeds = {}
     for path in arguments.comparisons:
         comparison = json.loads(path.read_text())
@@ -50,11 +53,11 @@ def main() -> int:
             "steps": curves[0]["steps"][-1],
             "episodes": curves[0]["episodes"],
             "mode_actions": curves[0]["mode_actions"],
-            "final_iqm": {_short(c["objective"]): c["final_iqm"] for c in curves},
-            "area_iqm": {_short(c["objective"]): c["area_iqm"] for c in curves},
+            "final_iqm": {short(c["objective"]): c["final_iqm"] for c in curves},
+            "area_iqm": {short(c["objective"]): c["area_iqm"] for c in curves},
             "reference": comparison["reference"],
             "paired_differences": {
-                _short(name): x for name, x in comparison["paired_differences"].items()
+                short(name): x for name, x in comparison["paired_differences"].items()
             },
         }
     metadata["results"] = results
