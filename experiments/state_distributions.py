@@ -6,7 +6,7 @@ The experts are those of `experiments.experts`, trained again.
 """
 
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -22,6 +22,7 @@ CELLS = 20  # of the grid whose share of visited cells is the coverage
 STATES = 2000
 SEED = 41_000
 BANDIT_COVERAGE, EXPERT_COVERAGE = "bandit's coverage", "expert's coverage"
+OUTSIDE = "contexts off the plane"
 BANDIT_ROUGHNESS, EXPERT_ROUGHNESS = "bandit's roughness", "expert's roughness"
 
 
@@ -76,11 +77,25 @@ def _examine(environment: str, plan: Mapping[str, Any]) -> dict[str, Any]:
         "limits": [list(x) for x in plane.limits],
         "num_actions": int(space.n) if isinstance(space, spaces.Discrete) else None,
         "bounds": None if discrete else [float(x[0]) for x in flat_bounds(space)],
-        "contexts": packed(plane.project(contexts)),
-        "visited": packed(plane.project(visited)),
+        "contexts": stored_points(plane.project(contexts), plane.limits),
+        "visited": stored_points(plane.project(visited), plane.limits),
         "bandit_actions": packed(first(best(jnp.asarray(nodes)))),
         "expert_actions": packed(first(expert_actions(expert, space, nodes))),
     }
+
+
+def stored_points(points: np.ndarray, limits: Any) -> list[str]:
+    """[N, 2] points as thousandths of the plane, 50 a line: four times smaller than a line each."""
+    low, high = np.transpose(limits)
+    thousandths = np.round((points - low) / (high - low) * 1000).astype(int)
+    return [" ".join(map(str, line)) for line in np.split(thousandths.ravel(), len(points) // 50)]
+
+
+def points_of(lines: Sequence[str], limits: Any) -> np.ndarray:
+    """[N, 2] what `stored_points` stored, to a thousandth of the plane."""
+    low, high = np.transpose(limits)
+    thousandths = np.array([int(x) for line in lines for x in line.split()]).reshape(-1, 2)
+    return np.asarray(low + thousandths / 1000 * (high - low))
 
 
 def expert_actions(expert: Any, space: Any, observations: np.ndarray) -> np.ndarray:
@@ -123,12 +138,20 @@ def roughness(actions: np.ndarray, num_actions: int | None, bounds: Any) -> floa
     return float(np.mean(steps > 0 if num_actions else steps / (bounds[1] - bounds[0])))
 
 
+def outside(points: np.ndarray, limits: Any) -> float:
+    """The share of the points that lie off the plane, where no state of the environment is."""
+    low, high = np.transpose(limits)
+    return float(np.mean(np.any((points < low) | (points > high), axis=1)))
+
+
 def summary(entry: Mapping[str, Any]) -> dict[str, float]:
-    """Coverage of both distributions and roughness of both best actions."""
-    shape = (entry["num_actions"], entry["bounds"])
+    """Coverage of both distributions, contexts off the plane, and roughness of both best actions."""
+    shape, limits = (entry["num_actions"], entry["bounds"]), entry["limits"]
+    contexts, visited = (points_of(entry[name], limits) for name in ("contexts", "visited"))
     return {
-        BANDIT_COVERAGE: coverage(unpacked(entry["contexts"]), entry["limits"]),
-        EXPERT_COVERAGE: coverage(unpacked(entry["visited"]), entry["limits"]),
+        BANDIT_COVERAGE: coverage(contexts, limits),
+        EXPERT_COVERAGE: coverage(visited, limits),
+        OUTSIDE: outside(contexts, limits),
         BANDIT_ROUGHNESS: roughness(unpacked(entry["bandit_actions"]), *shape),
         EXPERT_ROUGHNESS: roughness(unpacked(entry["expert_actions"]), *shape),
     }
@@ -199,7 +222,7 @@ def draw(report: Mapping[str, Any]) -> "Figure":
                 drawn = figures.action_grid(
                     axes, plane, unpacked(entry[actions]), entry["num_actions"], entry["bounds"]
                 )
-                points = unpacked(entry[states])
+                points = points_of(entry[states], entry["limits"])
                 # A white edge, for black is hard to see on the dark ends of the background.
                 axes.scatter(
                     *points.T, s=6, color=plotting.BLACK, edgecolors="white", linewidths=0.3

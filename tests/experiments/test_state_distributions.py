@@ -16,8 +16,8 @@ def entry(contexts, visited, bandit_actions, expert_actions, num_actions=2):
         "limits": LIMITS,
         "num_actions": num_actions,
         "bounds": None if num_actions else [-2.0, 2.0],
-        "contexts": packed(contexts),
-        "visited": packed(visited),
+        "contexts": experiment.stored_points(contexts, LIMITS),
+        "visited": experiment.stored_points(visited, LIMITS),
         "bandit_actions": packed(bandit_actions),
         "expert_actions": packed(expert_actions),
     }
@@ -40,10 +40,19 @@ def report():
 def test_coverage_and_roughness_are_shares():
     corners = np.array([[0.01, 0.01], [0.02, 0.03], [0.99, 0.99]])
     assert experiment.coverage(corners, LIMITS) == 2 / 400
+    assert experiment.outside(np.array([[0.5, 1.5], [0.5, 0.5]]), LIMITS) == 0.5
     checkered = np.indices((6, 6)).sum(0) % 2
     assert experiment.roughness(checkered, 2, None) == 1.0
     assert experiment.roughness(checkered, None, (0.0, 4.0)) == 0.25
     assert experiment.roughness(np.zeros((6, 6)), 2, None) == 0.0
+
+
+def test_points_are_stored_to_a_thousandth_of_the_plane():
+    limits = [[-2.0, 2.0], [10.0, 110.0]]
+    points = np.random.default_rng(0).uniform([-2.0, 10.0], [2.0, 110.0], (100, 2))
+    again = experiment.points_of(experiment.stored_points(points, limits), limits)
+    np.testing.assert_allclose(again, points, atol=0.051)
+    np.testing.assert_allclose(again[:, 0], points[:, 0], atol=0.0021)
 
 
 def test_the_verdict_follows_the_figures(report):
@@ -70,7 +79,9 @@ def test_states_and_best_actions_of_one_environment(monkeypatch):
     found, saved = {}, []
     experiment.measure(plan, found, lambda: saved.append(1))
     examined = found["environments"]["MountainCar-v0"]
-    contexts, visited = unpacked(examined["contexts"]), unpacked(examined["visited"])
+    contexts, visited = (
+        experiment.points_of(examined[name], examined["limits"]) for name in ("contexts", "visited")
+    )
     assert contexts.shape == visited.shape == (2000, 2)
     # An agent of a few hundred steps stays in the valley; the bandit shows far more.
     assert np.ptp(contexts[:, 0]) > 2 * np.ptp(visited[:, 0])
