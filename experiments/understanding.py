@@ -311,7 +311,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     out.parent.mkdir(parents=True, exist_ok=True)
     write_json(out, report)
     (arguments.docs / "understanding.md").write_text(markdown(report))
-    plotting.save(figure, arguments.docs / "figures" / "understanding.png")
+    # Half the usual resolution: it is a tall figure of smooth maps, which compress badly.
+    plotting.save(figure, arguments.docs / "figures" / "understanding.png", dpi=100)
     return 0
 
 

@@ -131,10 +131,10 @@ def legend_below(figure: Figure, entries: tuple[list[Any], list[Any]], columns: 
     figure.legend(*entries, loc="outside lower center", ncols=columns, columnspacing=1.5)
 
 
-def save(figure: Figure, path: str | Path) -> Path:
+def save(figure: Figure, path: str | Path, dpi: int = DPI) -> Path:
     """Writes a PNG whose bytes depend on the figure alone: no date, no version in its metadata."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     with figure_style():
-        figure.savefig(path, format="png", dpi=DPI, metadata={"Software": None})
+        figure.savefig(path, format="png", dpi=dpi, metadata={"Software": None})
     return path
