@@ -1,0 +1,32 @@
+from experiments import alignment
+
+
+def stage(environment, correlations, bandit="Synthetic-Pendulum-v1"):
+    regimes = [
+        {
+            "name": name,
+            "bandit": bandit,
+            "reward_noise": 0.0 if name == "reward noise 0.0" else 5.0,
+            "alignment": {alignment.FITNESS: {"spearman": value}},
+        }
+        for name, value in correlations.items()
+    ]
+    return {"environment": environment, "regimes": regimes}
+
+
+def test_the_recommendation_is_the_best_over_both_initialisations():
+    plain = {"reward noise 0.0": 0.2, "default": 0.9, "epochs 1": 0.95}
+    small = {"reward noise 0.0": 0.1, "default": 0.8, "epochs 1": 0.5}
+    report = {
+        "stages": {
+            "pendulum": stage("Pendulum-v1", plain),
+            "pendulum_small_last_layer": stage("Pendulum-v1", small),
+        }
+    }
+    said = alignment.recommendation(report)
+    assert "the best of 3 regimes is *default* with 0.85; the default has 0.85, the best." in said
+    report["stages"]["CartPole-v1"] = stage("CartPole-v1", {"x": -0.3}, "Synthetic-CartPole-v1")
+    assert "CartPole-v1 \u22120.30." in alignment.recommendation(report)
+    report["stages"]["pendulum_small_last_layer"] = stage("Pendulum-v1", small | {"epochs 1": 0.9})
+    said = alignment.recommendation(report)
+    assert "*epochs 1* with 0.93" in said and "1 regime is above it" in said
