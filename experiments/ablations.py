@@ -66,36 +66,25 @@ def config_of(
     """The search's configuration: the paper's recipe, at the plan's size."""
     from dataclasses import replace
 
+    from experiments import searches
     from scb.curriculum import paper_curriculum
-    from scb.discovery import DiscoveryConfig
     from scb.environments.synthetic import BanditConfig
-    from scb.evolution import EvolutionConfig
 
     parameterization, latent, shape = search.split(" | ")
-    own = plan["environments"][environment]
+    size = plan["environments"][environment]
     curriculum = None
     if shape != NONE:
-        curriculum = paper_curriculum(environment, own["generations"])
+        curriculum = paper_curriculum(environment, size["generations"])
         assert curriculum is not None
         curriculum = replace(curriculum, shape=shape)
-    return DiscoveryConfig(
+    return searches.config_of(
         environment,
+        plan,
+        size,
+        seed,
         parameterization=parameterization,
         bandit=BanditConfig(latent=latent),
-        algorithms=tuple(plan["algorithms"]),
-        agents_per_candidate=own["agents_per_candidate"],
-        evaluation_episodes=plan["episodes"],
         curriculum=curriculum,
-        init="random",
-        evolution=EvolutionConfig(
-            strategy="SNES",
-            population_size=own["population_size"],
-            num_generations=own["generations"],
-            sigma=0.05,
-            mean_evaluations=plan["mean_evaluations"],
-            evaluate_mean_every=plan["evaluate_mean_every"],
-            seed=seed,
-        ),
     )
 
 
@@ -216,8 +205,8 @@ def body(report: Mapping[str, Any]) -> list[str]:
                 )
     return [
         f"SNES from random weights with standard deviation 0.05, inner loop: {algorithms} with hyperparameters drawn "
-        f"from the paper's lists, {plan['episodes']} evaluation episodes. {sizes}. The mean of the search distribution "
-        f"is judged by {plan['mean_evaluations']} agents; a line is the mean over searches of their interquartile "
+        f"from the paper's lists, {plan['evaluation_episodes']} evaluation episodes. {sizes}. The mean of the "
+        f"search distribution is judged by {plan['mean_evaluations']} agents; a line is the mean over searches of their interquartile "
         "mean, with the 95 % bootstrap interval over searches. T: transition, reward and termination are learned; "
         "TI: and the initial state; I: a bandit; IC: with a linear curriculum of the evaluation's length, with which "
         "MountainCar's latents are searched too. "
@@ -281,7 +270,7 @@ def _presets() -> dict[str, dict[str, Any]]:
             **shared,
             "runs": "runs/ablations/quick",
             "algorithms": ["ppo"],
-            "episodes": 8,
+            "evaluation_episodes": 8,
             "mean_evaluations": 16,
             "environments": {
                 "Pendulum-v1": {
@@ -302,7 +291,7 @@ def _presets() -> dict[str, dict[str, Any]]:
             **shared,
             "runs": "runs/ablations/paper",
             "algorithms": [],
-            "episodes": 50,
+            "evaluation_episodes": 50,
             "mean_evaluations": 64,
             "environments": {
                 "Pendulum-v1": {**PAPER_SIZES["Pendulum-v1"], "seeds": 5},

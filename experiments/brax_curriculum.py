@@ -41,27 +41,16 @@ def curriculum_of(shape: str, generations: int) -> "CurriculumConfig | None":
 
 def config_of(shape: str, seed: int, plan: Mapping[str, Any]) -> "DiscoveryConfig":
     """The search with this curriculum: the paper's recipe, at the plan's size."""
-    from scb.discovery import DiscoveryConfig
-    from scb.evolution import EvolutionConfig
+    from experiments import searches
 
-    return DiscoveryConfig(
+    return searches.config_of(
         ENVIRONMENT,
+        plan,
+        plan,
+        seed,
         backend=plan["backend"],
-        algorithms=tuple(plan["algorithms"]),
         mode=plan["mode"],
-        agents_per_candidate=1,
-        evaluation_episodes=plan["episodes"],
         curriculum=curriculum_of(shape, plan["generations"]),
-        init="random",
-        evolution=EvolutionConfig(
-            strategy="SNES",
-            population_size=plan["population_size"],
-            num_generations=plan["generations"],
-            sigma=0.05,
-            mean_evaluations=plan["mean_evaluations"],
-            evaluate_mean_every=plan["evaluate_mean_every"],
-            seed=seed,
-        ),
     )
 
 
@@ -131,8 +120,8 @@ def body(report: Mapping[str, Any]) -> list[str]:
     return [
         f"Hopper in `{plan['backend']}` physics. SNES from random weights with standard deviation 0.05, "
         f"{plan['generations']} generations of {plan['population_size']} candidates, inner loop {algorithms} with the "
-        f"paper's fixed hyperparameters, {plan['episodes']} evaluation episodes. The paper's curriculum (100 to 1000 "
-        "steps between the first and the ninth tenth of the search) in several shapes; the mean of the search "
+        f"paper's fixed hyperparameters, {plan['evaluation_episodes']} evaluation episodes. The paper's curriculum (100 "
+        "to 1000 steps between the first and the ninth tenth of the search) in several shapes; the mean of the search "
         f"distribution is judged over whole episodes by {plan['mean_evaluations']} agents, whatever the curriculum. "
         "Interquartile means, 95 % intervals over searches where there are several.",
         "",
@@ -196,7 +185,8 @@ EXPERIMENT = Experiment(
             "mode": "all",
             "population_size": 16,
             "generations": 60,
-            "episodes": 4,
+            "agents_per_candidate": 1,
+            "evaluation_episodes": 4,
             "mean_evaluations": 8,
             "evaluate_mean_every": 5,
             "seeds": {NONE: 3, "linear": 1, "exponential": 1, "step": 1},
@@ -208,7 +198,8 @@ EXPERIMENT = Experiment(
             "mode": "sequential",
             "population_size": 256,
             "generations": 2000,
-            "episodes": 16,
+            "agents_per_candidate": 1,
+            "evaluation_episodes": 16,
             "mean_evaluations": 64,
             "evaluate_mean_every": 20,
             "seeds": {

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from experiments import zoo_table
 from experiments.page import Experiment, Save, table, text
 from experiments.page import main as run
 
@@ -24,38 +25,14 @@ if TYPE_CHECKING:
 
 OURS, PUBLISHED = "ours", "published"
 REPORTING_SEED = 10_000
-# Final returns in Liesen et al. (2024), table of Brax results: {environment: {algorithm: (environment, bandit)}}.
-PAPER: dict[str, dict[str, tuple[float, float]]] = {
-    "hopper": {
-        "ppo": (2521.9, 853.5),
-        "sac": (3119.4, 2738.8),
-        "ddpg": (1536.0, 3012.4),
-        "td3": (3325.8, 2985.3),
-    },
-    "walker2d": {
-        "ppo": (2039.6, 858.3),
-        "sac": (4140.1, 1323.1),
-        "ddpg": (698.3, 1304.3),
-        "td3": (4605.8, 1321.8),
-    },
-    "swimmer": {
-        "ppo": (83.6, 348.5),
-        "sac": (124.8, 361.6),
-        "ddpg": (348.5, 365.1),
-        "td3": (232.2, 365.4),
-    },
-    "halfcheetah": {
-        "ppo": (3487.1, 1657.4),
-        "sac": (7735.5, 5810.4),
-        "ddpg": (3263.3, 6162.4),
-        "td3": (13213.5, 6555.8),
-    },
-    "humanoidstandup": {
-        "ppo": (17243.5, 13356.1),
-        "sac": (23808.1, 21105.2),
-        "ddpg": (24944.8, 21039.0),
-        "td3": (28376.2, 20372.0),
-    },
+# Final returns of agents trained in the environment, Liesen et al. (2024), table of Brax results, columns EE;
+# those of agents trained in bandits are `zoo_table.PAPER`.
+PAPER: dict[str, dict[str, float]] = {
+    "hopper": {"ppo": 2521.9, "sac": 3119.4, "ddpg": 1536.0, "td3": 3325.8},
+    "walker2d": {"ppo": 2039.6, "sac": 4140.1, "ddpg": 698.3, "td3": 4605.8},
+    "swimmer": {"ppo": 83.6, "sac": 124.8, "ddpg": 348.5, "td3": 232.2},
+    "halfcheetah": {"ppo": 3487.1, "sac": 7735.5, "ddpg": 3263.3, "td3": 13213.5},
+    "humanoidstandup": {"ppo": 17243.5, "sac": 23808.1, "ddpg": 24944.8, "td3": 28376.2},
 }
 
 
@@ -103,7 +80,6 @@ def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None
 def _in_bandit(
     kind: str, environment: str, backend: str | None, algorithm: str, plan: Mapping[str, Any]
 ) -> dict[str, Any]:
-    from experiments.zoo_table import arrays_digest
     from scb.agents.hyperparameters import inner_loop
     from scb.environments.zoo import bandit_metadata, open_bandit
     from scb.importer import PUBLISHED_BANDITS, published_bandit
@@ -117,7 +93,7 @@ def _in_bandit(
         folder = published_folder()
         assert folder is not None
         bandit = published_bandit(folder / f"{name}.npz")
-        digest = arrays_digest(folder / f"{name}.npz")
+        digest = zoo_table.arrays_digest(folder / f"{name}.npz")
     inner = inner_loop(algorithm, environment, env.action_space(env_params))
     curves = _curves(
         inner.agent(bandit),
@@ -293,8 +269,8 @@ def body(report: Mapping[str, Any]) -> list[str]:
                     algorithm.upper(),
                     text(estimate(finals(curves))),
                     text(estimate(finals(own[algorithm]))) if algorithm in own else "",
-                    "" if paper is None else f"{paper[1]:.0f}",
-                    "" if paper is None else f"{paper[0]:.0f}",
+                    "" if paper is None else f"{zoo_table.PAPER[environment][algorithm]:.0f}",
+                    "" if paper is None else f"{paper:.0f}",
                     f"{curves['seconds'] / len(curves['returns']):.1f}",
                     f"{own[algorithm]['seconds'] / len(own[algorithm]['returns']):.0f}"
                     if algorithm in own
@@ -389,7 +365,7 @@ def draw(report: Mapping[str, Any]) -> "Figure":
                 paper = PAPER.get(name.split(" ")[0], {}).get(algorithm)
                 # The paper's physics.
                 if algorithm not in own and paper is not None and "(generalized)" in name:
-                    axes.axhline(paper[0], color=plotting.GREY, linestyle=":")
+                    axes.axhline(paper, color=plotting.GREY, linestyle=":")
                 axes.set_xscale("log")
                 axes.set_title(f"{name}\n{algorithm.upper()}", fontsize=9)
                 axes.set_xlabel("training steps")

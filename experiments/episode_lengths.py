@@ -29,28 +29,18 @@ JUDGE_SEED = 10_000
 
 def config_of(environment: str, limit: str, plan: Mapping[str, Any]) -> "DiscoveryConfig":
     """The search of an MDP with this limit: the paper's recipe, at the plan's size."""
+    from experiments import searches
     from scb.curriculum import paper_curriculum
-    from scb.discovery import DiscoveryConfig
-    from scb.evolution import EvolutionConfig
 
     size = plan["sizes"][environment]
-    return DiscoveryConfig(
+    return searches.config_of(
         environment,
+        plan,
+        size,
+        plan["seed"],
         parameterization="TI",
         max_steps=None if limit == OWN else int(limit),
-        algorithms=tuple(plan["algorithms"]),
-        agents_per_candidate=size["agents_per_candidate"],
-        evaluation_episodes=plan["evaluation_episodes"],
         curriculum=paper_curriculum(environment, size["generations"]),
-        init="random",
-        evolution=EvolutionConfig(
-            strategy="SNES",
-            population_size=size["population_size"],
-            num_generations=size["generations"],
-            sigma=0.05,
-            mean_evaluations=plan["mean_evaluations"],
-            seed=plan["seed"],
-        ),
     )
 
 

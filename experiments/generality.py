@@ -43,32 +43,21 @@ REPORTING_SEED = 10_000
 
 def config_of(environment: str, source: str, plan: Mapping[str, Any]) -> "DiscoveryConfig":
     """The search whose inner agents' hyperparameters are drawn, or fixed; nothing else differs."""
+    from experiments import searches
     from scb.curriculum import paper_curriculum
-    from scb.discovery import DiscoveryConfig
-    from scb.evolution import EvolutionConfig
 
-    size = plan["sizes"][environment]
+    size, curriculum = plan["sizes"][environment], None
     # A bandit that is fitted to an expert reaches MountainCar's goal from the start.
-    curriculum = None
     if plan["init"] == "random":
         curriculum = paper_curriculum(environment, size["generations"])
-    return DiscoveryConfig(
+    return searches.config_of(
         environment,
-        algorithms=tuple(plan["algorithms"]),
+        plan,
+        size,
+        plan["seed"],
         sampled_hyperparameters=source == DRAWN,
-        agents_per_candidate=size["agents_per_candidate"],
-        evaluation_episodes=plan["evaluation_episodes"],
         curriculum=curriculum,
         init=plan["init"],
-        evolution=EvolutionConfig(
-            strategy="SNES",
-            population_size=size["population_size"],
-            num_generations=size["generations"],
-            sigma=plan["sigma"],
-            combine=plan["combine"],
-            mean_evaluations=plan["mean_evaluations"],
-            seed=plan["seed"],
-        ),
     )
 
 

@@ -20,6 +20,40 @@ PAPER_SIZES: dict[str, dict[str, int]] = {
 }
 
 
+def config_of(
+    environment: str, plan: Mapping[str, Any], size: Mapping[str, int], seed: int, **changes: Any
+) -> "DiscoveryConfig":
+    """The paper's recipe (SNES from random weights) at a plan's size.
+
+    Args:
+      plan: "algorithms", "evaluation_episodes", "mean_evaluations", and where it differs from the paper
+        "sigma", "combine" and "evaluate_mean_every".
+      size: "generations", "population_size", "agents_per_candidate".
+      changes: what else of the DiscoveryConfig is another.
+    """
+    from scb.discovery import DiscoveryConfig
+    from scb.evolution import EvolutionConfig
+
+    evolution = EvolutionConfig(
+        strategy="SNES",
+        population_size=size["population_size"],
+        num_generations=size["generations"],
+        sigma=plan.get("sigma", 0.05),
+        combine=plan.get("combine", "mean"),
+        mean_evaluations=plan["mean_evaluations"],
+        evaluate_mean_every=plan.get("evaluate_mean_every", 10),
+        seed=seed,
+    )
+    given: dict[str, Any] = {
+        "algorithms": tuple(plan["algorithms"]),
+        "agents_per_candidate": size["agents_per_candidate"],
+        "evaluation_episodes": plan["evaluation_episodes"],
+        "init": "random",
+        "evolution": evolution,
+    }
+    return DiscoveryConfig(environment, **given | changes)
+
+
 def search(config: "DiscoveryConfig", folder: str | Path) -> "tuple[BanditDiscovery, Outcome]":
     """A discovery in this run folder, resumed where it was begun; where it has ended, no generation is computed."""
     from scb.discovery import discover

@@ -5,7 +5,7 @@ from experiments.ablations import LATENTS, NONE, SHAPES, name_of
 
 TINY = {
     "algorithms": ["ppo"],
-    "episodes": 2,
+    "evaluation_episodes": 2,
     "mean_evaluations": 2,
     "evaluate_mean_every": 1,
     "environments": {
