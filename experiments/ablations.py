@@ -206,7 +206,8 @@ def body(report: Mapping[str, Any]) -> list[str]:
     return [
         f"SNES from random weights with standard deviation 0.05, inner loop: {algorithms} with hyperparameters drawn "
         f"from the paper's lists, {plan['evaluation_episodes']} evaluation episodes. {sizes}. The mean of the "
-        f"search distribution is judged by {plan['mean_evaluations']} agents; a line is the mean over searches of their interquartile "
+        f"search distribution is judged by {plan['mean_evaluations']} agents; a line is the mean over searches of "
+        "their interquartile "
         "mean, with the 95 % bootstrap interval over searches. T: transition, reward and termination are learned; "
         "TI: and the initial state; I: a bandit; IC: with a linear curriculum of the evaluation's length, with which "
         "MountainCar's latents are searched too. "
