@@ -122,8 +122,8 @@ def body(report: Mapping[str, Any]) -> list[str]:
         f"{plan['generations']} generations of {plan['population_size']} candidates, inner loop {algorithms} with the "
         f"paper's fixed hyperparameters, {plan['evaluation_episodes']} evaluation episodes. The paper's curriculum "
         "(100 to 1000 steps between the first and the ninth tenth of the search) in several shapes; the mean of the "
-        f"search distribution is judged over whole episodes by {plan['mean_evaluations']} agents, whatever the curriculum. "
-        "Interquartile means, 95 % intervals over searches where there are several.",
+        f"search distribution is judged over whole episodes by {plan['mean_evaluations']} agents, whatever "
+        "the curriculum. Interquartile means, 95 % intervals over searches where there are several.",
         "",
         *table(["curriculum", "searches", "return at the end", "minutes a search"], rows),
     ]
