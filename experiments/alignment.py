@@ -93,8 +93,9 @@ def markdown(report: dict[str, Any]) -> str:
         "Every objective of the family trains PPO on the environment and in each regime of a bandit. The table "
         "gives Spearman's correlation between a regime's fitness and the environment's final return (IQM), with "
         "95 % bootstrap intervals over agents. Drawing agents again adds their scatter once more to what is ranked, so "
-        "an interval of few agents leans downwards and may even lie below its estimate. A regime differs from the default (reward noise 5, 200 contexts, the "
-        "environment's own number of iterations, epochs, minibatches and learning rate) in what its name says.",
+        "an interval of few agents leans downwards and may even lie below its estimate. A regime differs from the "
+        "default (reward noise 5, 200 contexts, the environment's own number of iterations, epochs, minibatches and "
+        "learning rate) in what its name says.",
         "",
         recommendation(report),
     ]
