@@ -142,7 +142,7 @@ def main() -> int:
     configure_jax()
 
     from lpo import figures
-    from lpo.alignment import Regime, known_drifts, measure_alignment
+    from lpo.alignment import Regime, forget_programs, known_drifts, measure_alignment
     from lpo.objectives import load_objective, zoo_names
     from scb import plotting
     from scb.runs import write_json
@@ -194,6 +194,7 @@ def main() -> int:
         if not arguments.skip_confirmation:
             regimes = [Regime(bandit, **variation) for variation in CONFIRMED]
             regimes += [Regime(PENDULUM, **variation) for variation in CONFIRMED]
+            forget_programs()
             stage(environment, environment, "the confirmation", regimes, CONFIRMATION_SEED)
     arguments.page.write_text(markdown(report))
     return 0

@@ -206,6 +206,12 @@ def _program(regime: Regime, drift: Drift, size: int) -> Callable[..., Any]:
     return map_population(train, size, (0, 0, None, None, None))
 
 
+def forget_programs() -> None:
+    """Frees what was compiled: a process that keeps hundreds of programs runs out of memory maps."""
+    _program.cache_clear()
+    jax.clear_caches()
+
+
 @dataclass(frozen=True)
 class Alignment:
     """Spearman's correlation between a fitness and an outcome over a family of objectives.

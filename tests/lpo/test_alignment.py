@@ -131,7 +131,7 @@ def test_agents_of_a_regime_are_judged_in_every_way():
 
 def test_regimes_that_differ_in_traced_numbers_share_a_program_and_nothing_else(monkeypatch):
     ppo, made = known_drifts()[2], []
-    module._program.cache_clear()
+    module.forget_programs()
     monkeypatch.setattr(
         module,
         "map_population",
@@ -145,6 +145,10 @@ def test_regimes_that_differ_in_traced_numbers_share_a_program_and_nothing_else(
     assert (plain != noisy).all() and (plain != fast).all() and (noisy != fast).all()
     regime_fitness(replace(TINY, iterations=2), [ppo], [1, 2])
     assert len(made) == 2
+    module.forget_programs()
+    again = regime_fitness(TINY, [ppo], [1, 2])[ppo.name]["return, mode actions"]
+    assert len(made) == 3
+    np.testing.assert_allclose(again, plain, rtol=1e-5)
 
 
 def test_the_report_holds_every_regime_and_is_drawn(monkeypatch, tmp_path):
