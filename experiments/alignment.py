@@ -117,7 +117,9 @@ def markdown(report: dict[str, Any]) -> str:
             "| --- |" + " --- |" * len(FITNESSES),
             *(
                 f"| {row['name']} | "
-                + " | ".join(correlation_text(row["alignment"][f]) for f in FITNESSES)
+                + " | ".join(
+                    correlation_text(row["alignment"][f]).replace("-", "\u2212") for f in FITNESSES
+                )
                 + " |"
                 for row in stage["regimes"]
             ),

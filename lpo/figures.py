@@ -6,6 +6,7 @@ Ito (2008), which stay apart for colour-blind readers; line style and marker say
 a grey print.
 """
 
+import textwrap
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -348,8 +349,9 @@ def alignment_heatmap(report: Mapping[str, Any]) -> Figure:
         figure = Figure(figsize=(WIDTH, 1.6 + 0.42 * len(rows)))
         axes = figure.subplots()
         image = axes.imshow(values, cmap="RdBu", vmin=-1.0, vmax=1.0, aspect="auto")
-        axes.set_xticks(range(len(fitnesses)), [name.replace(", ", ",\n") for name in fitnesses])
-        axes.set_yticks(range(len(rows)), [row["name"] for row in rows])
+        # Long names are broken, or they would take the room of the map.
+        axes.set_xticks(range(len(fitnesses)), [textwrap.fill(name, 15) for name in fitnesses])
+        axes.set_yticks(range(len(rows)), [textwrap.fill(row["name"], 34) for row in rows])
         axes.grid(visible=False)
         axes.tick_params(length=0)
         for i, row in enumerate(rows):
@@ -370,8 +372,8 @@ def alignment_heatmap(report: Mapping[str, Any]) -> Figure:
         number = len(report["outcome_iqm"])
         figure_title(
             figure,
-            f"How the bandit's fitness ranks {number} objectives, against {report['environment']} "
-            f"(n = {report['agents']} agents each, 95 % intervals)",
+            f"How fitness in the bandit ranks {number} objectives, against {report['environment']}\n"
+            f"({report['agents']} agents each, 95 % intervals)",
         )
     return figure
 
