@@ -1,6 +1,10 @@
+from types import SimpleNamespace
+
 import numpy as np
+import pytest
 
 from experiments import brax_curriculum as experiment
+from experiments import searches
 from experiments.brax_curriculum import NONE
 
 
@@ -56,6 +60,7 @@ def test_the_page_and_the_figure_show_every_curriculum():
     np.testing.assert_array_equal(lengths[NONE], 1000)
 
 
+@pytest.mark.slow
 def test_a_search_with_a_curriculum_is_judged_over_whole_episodes(tmp_path, monkeypatch):
     # MountainCar has a curriculum too, and is far cheaper than Hopper.
     monkeypatch.setattr(experiment, "ENVIRONMENT", "MountainCar-v0")
@@ -79,3 +84,30 @@ def test_a_search_with_a_curriculum_is_judged_over_whole_episodes(tmp_path, monk
     assert found["curves"]["linear"]["0"]["fitness"] == [-200.0, -200.0]
     experiment.measure(plan, found, lambda: saved.append(1))
     assert len(saved) == 1
+
+
+def test_every_search_is_measured_once(monkeypatch):
+    asked = []
+
+    def search(config, folder):
+        asked.append((config.curriculum, config.evolution.seed))
+        line = {
+            "generation": 0,
+            "failed": 0,
+            "final_mean/fitness": 7.0,
+            "final_mean/fitness_iqm": 8.0,
+        }
+        return None, SimpleNamespace(metrics=[line], seconds=1.0)
+
+    monkeypatch.setattr(searches, "search", search)
+    plan = {**experiment.EXPERIMENT.presets["quick"], "seeds": {NONE: 2, "step": 1}}
+    found = {"plan": plan}
+    experiment.measure(plan, found, lambda: None)
+    # First seeds first, so that an interrupted measurement has every curriculum.
+    assert [(c and c.shape, seed) for c, seed in asked] == [(None, 0), ("step", 0), (None, 1)]
+    assert {shape: x.value for shape, x in experiment.finals(found).items()} == {
+        NONE: 8.0,
+        "step": 8.0,
+    }
+    experiment.measure(plan, found, lambda: None)
+    assert len(asked) == 3

@@ -129,6 +129,7 @@ def test_agents_of_a_regime_are_judged_in_every_way():
     np.testing.assert_allclose(again["transfer"], fitness["transfer"][[2, 1]], rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_regimes_that_differ_in_traced_numbers_share_a_program_and_nothing_else(monkeypatch):
     ppo, made = known_drifts()[2], []
     module.forget_programs()
