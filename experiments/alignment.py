@@ -5,10 +5,11 @@
 First the choice: the family of known drifts and the zoo's learned ones train agents on Pendulum-v1,
 and in regimes of the Pendulum bandit that differ from the default in one thing each (reward noise,
 contexts, iterations, epochs, minibatches, learning rate). The same with a small last layer of the
-policy, on both sides. Then the confirmation, on seeds and environments that chose nothing: the same
-regimes' correlation with the outcome on other environments, each with its own bandit. `--adversaries
-FILES` adds objectives that evolution found. Regimes that --out holds already are kept, so the same
-command continues an interrupted one.
+policy, on both sides. Then the confirmation, on seeds that chose nothing: the correlation of a few
+regimes with the outcome on other environments, and on Pendulum for objectives that are not in the
+family. `--adversaries FILES` adds objectives that evolution found to the family; those of `--held-out
+FILES` confirm alone. Regimes that --out holds already are kept, so the same command continues an
+interrupted one.
 """
 
 import argparse
@@ -18,6 +19,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from experiments.page import exit_status
 from lpo.cli import configure_jax
 
 PENDULUM = "Synthetic-Pendulum-v1"
@@ -32,14 +34,12 @@ VARIATIONS: list[dict[str, Any]] = [
     # The paper's own inner loop: no noise, 20 batches of 500, a learning rate of 0.005.
     {"reward_noise": 0.0, "contexts": 500, "iterations": 20, "learning_rate": 5e-3},
 ]
-DEFAULT_NOISE = 5.0
 FIRST_SEED = 500  # neither the seeds that meta-training sees nor those that report
 CONFIRMATION_SEED = 700
-CONFIRMATIONS = {
-    "CartPole-v1": "Synthetic-CartPole-v1",
-    "MountainCarContinuous-v0": "Synthetic-MountainCarContinuous-v0",
-}
-CONFIRMED: list[dict[str, Any]] = [{"reward_noise": x} for x in (0.0, 2.0, 5.0)]
+# Steps in the environment: after PPO's own number every objective solves either task, and nothing is ranked.
+CONFIRMATIONS = {"CartPole-v1": 10_000, "Acrobot-v1": 20_000}
+CONFIRMED: list[dict[str, Any]] = [{"reward_noise": x} for x in (0.0, 2.0, 5.0, 10.0)]
+HELD_OUT = "Pendulum-v1, held out"
 
 
 # What `lpo meta-train` judges candidates by.
@@ -49,6 +49,8 @@ CHOICES = ("pendulum", "pendulum_small_last_layer")
 
 def recommendation(report: dict[str, Any]) -> str:
     """The regime that ranks best under both initialisations, and where the default stands."""
+    from lpo.alignment import Regime
+
     stages = [report["stages"][name] for name in CHOICES if name in report["stages"]]
     found = {
         row["name"]: [
@@ -69,15 +71,19 @@ def recommendation(report: dict[str, Any]) -> str:
             else f", and {better} {'regime is' if better == 1 else 'regimes are'} above it."
         )
     )
-    confirmed = [
-        f"{stage['environment']} {row['alignment'][FITNESS]['spearman'] or 0.0:.2f}"
-        for name, stage in report["stages"].items()
-        if name not in CHOICES
-        for row in stage["regimes"]
-        if row["reward_noise"] == DEFAULT_NOISE and stage["environment"] in row["bandit"]
-    ]
+    confirmed = []
+    for name, stage in report["stages"].items():
+        of_own_bandit = {
+            row["reward_noise"]: row["alignment"][FITNESS]["spearman"] or 0.0
+            for row in stage["regimes"]
+            if stage["environment"] in row["bandit"]
+        }
+        if name not in CHOICES:
+            confirmed.append(
+                f"{name} {of_own_bandit[Regime().reward_noise]:.2f} (without noise {of_own_bandit[0.0]:.2f})"
+            )
     if confirmed:
-        said += f" The default on environments that chose nothing, each with its own bandit: {', '.join(confirmed)}."
+        said += f" Where nothing was chosen, the default of the environment's own bandit has: {', '.join(confirmed)}."
     return said.replace(" -", " \u2212")
 
 
@@ -108,10 +114,11 @@ def markdown(report: dict[str, Any]) -> str:
             "",
             f"## {stage['environment']}: {stage['role']}",
             "",
-            f"Seeds {stage['first_seed']} to {stage['first_seed'] + stage['agents'] - 1}. Final return of the "
-            f"family (IQM): {family}.",
+            f"Seeds {stage['first_seed']} to {stage['first_seed'] + stage['agents'] - 1}. "
+            + (f"Return after {stage['steps']} steps" if stage["steps"] else "Final return")
+            + f" (IQM): {family}.",
             "",
-            f"![Correlations with {stage['environment']}](figures/alignment_{name}.png)",
+            f"![Correlations with {stage['environment']}](figures/{figure_name(name)})",
             "",
             "| regime | " + " | ".join(FITNESSES) + " |",
             "| --- |" + " --- |" * len(FITNESSES),
@@ -129,6 +136,11 @@ def markdown(report: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
+def figure_name(stage: str) -> str:
+    """The file name of a stage's heat map."""
+    return f"alignment_{stage.replace(', ', '_').replace(' ', '_')}.png"
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -136,6 +148,13 @@ def main() -> int:
     parser.add_argument("--agents", type=int, default=16, help="agents of each objective")
     parser.add_argument(
         "--adversaries", type=Path, nargs="*", default=[], help="learned objectives' files"
+    )
+    parser.add_argument(
+        "--held-out",
+        type=Path,
+        nargs="*",
+        default=[],
+        help="files of objectives that confirm alone",
     )
     parser.add_argument("--skip-confirmation", action="store_true")
     parser.add_argument("--out", type=Path, default=Path("docs/data/alignment.json"))
@@ -145,14 +164,22 @@ def main() -> int:
 
     from lpo import figures
     from lpo.alignment import Regime, forget_programs, known_drifts, measure_alignment
-    from lpo.objectives import load_objective, zoo_names
+    from lpo.objectives import Objective, load_objective, zoo_names
     from scb import plotting
     from scb.runs import write_json
 
     arguments.out.parent.mkdir(parents=True, exist_ok=True)
-    learned = [load_objective(name) for name in zoo_names()]
-    # Every run's file is called objective.npz: an adversary has the name that its file was given.
-    learned += [replace(load_objective(path), name=path.stem) for path in arguments.adversaries]
+
+    def named(path: Path) -> Objective:
+        # Every run's file is called objective.npz; its folder tells runs apart.
+        name = path.parent.name if path.stem == "objective" else path.stem
+        return replace(load_objective(path), name=name)
+
+    family = [
+        *known_drifts(),
+        *map(load_objective, zoo_names()),
+        *map(named, arguments.adversaries),
+    ]
     report: dict[str, Any] = {
         "command": " ".join(["python -m experiments.alignment", *sys.argv[1:]]),
         "stages": {},
@@ -166,7 +193,9 @@ def main() -> int:
         role: str,
         regimes: list[Regime],
         seed: int,
+        objectives: list[Objective] = family,
         scale: float | None = None,
+        steps: int | None = None,
     ) -> None:
         def keep(measured: dict[str, Any]) -> None:
             report["stages"][name] = {"role": role, **measured}
@@ -175,15 +204,16 @@ def main() -> int:
         stored = report["stages"].get(name, {})
         measure_alignment(
             regimes,
-            known_drifts() + learned,
+            objectives,
             environment,
             list(range(seed, seed + arguments.agents)),
+            steps=steps,
             policy_output_scale=scale,
             tell=lambda line: print(line, flush=True),
             done={k: v for k, v in stored.items() if k != "role"},
             keep=keep,
         )
-        path = arguments.page.parent / "figures" / f"alignment_{name}.png"
+        path = arguments.page.parent / "figures" / figure_name(name)
         path.parent.mkdir(parents=True, exist_ok=True)
         plotting.save(figures.alignment_heatmap(report["stages"][name]), path)
 
@@ -191,16 +221,22 @@ def main() -> int:
     stage("pendulum", "Pendulum-v1", "the choice", variations, FIRST_SEED)
     small = [replace(regime, policy_output_scale=0.01) for regime in variations]
     role = "the choice, last layer of the policy times 0.01"
-    stage("pendulum_small_last_layer", "Pendulum-v1", role, small, FIRST_SEED, 0.01)
-    for environment, bandit in CONFIRMATIONS.items():
+    stage("pendulum_small_last_layer", "Pendulum-v1", role, small, FIRST_SEED, scale=0.01)
+    of_pendulum = [Regime(PENDULUM, **variation) for variation in CONFIRMED]
+    if arguments.held_out:
+        held_out = [named(path) for path in arguments.held_out]
+        role = "the confirmation, objectives that are not in the family"
+        stage(HELD_OUT, "Pendulum-v1", role, of_pendulum, CONFIRMATION_SEED, held_out)
+    for environment, steps in CONFIRMATIONS.items():
         if not arguments.skip_confirmation:
-            regimes = [Regime(bandit, **variation) for variation in CONFIRMED]
-            regimes += [Regime(PENDULUM, **variation) for variation in CONFIRMED]
+            regimes = [Regime(f"Synthetic-{environment}", **variation) for variation in CONFIRMED]
+            regimes += of_pendulum
             forget_programs()
-            stage(environment, environment, "the confirmation", regimes, CONFIRMATION_SEED)
+            role = "the confirmation"
+            stage(environment, environment, role, regimes, CONFIRMATION_SEED, steps=steps)
     arguments.page.write_text(markdown(report))
     return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(exit_status("alignment", main))

@@ -36,6 +36,8 @@ from typing import Any
 
 import numpy as np
 
+from experiments.page import exit_status
+
 EPISODES = 20
 STEPS = 10_000
 THIS, PEER = "this project", "rejax 0.1.3"
@@ -319,4 +321,4 @@ def _json_of(command: list[str]) -> dict[str, list[float]]:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(exit_status("benchmark", main))

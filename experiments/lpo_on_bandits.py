@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from experiments.page import text
+from experiments.page import exit_status, text
 from lpo.cli import configure_jax
 
 if TYPE_CHECKING:
@@ -456,4 +456,4 @@ def _judge(
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(exit_status("lpo_on_bandits", main))

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+from experiments.page import exit_status
 from lpo.cli import configure_jax
 
 
@@ -91,4 +92,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(exit_status("meta_training_cost", main))

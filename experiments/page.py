@@ -156,18 +156,27 @@ def main(experiment: Experiment, argv: Sequence[str] | None = None) -> int:
     arguments = parser.parse_args(argv)
     configure_jax()
 
-    from scb.errors import UserError
-
     out = DATA / f"{experiment.name}.json" if arguments.out is None else arguments.out
-    try:
+
+    def measure_and_render() -> int:
         report = read(out, missing_is_new=not arguments.only_render)
         if not arguments.only_render:
             _measure(experiment, arguments.preset, report, out)
         render(experiment, report, arguments.docs)
+        return 0
+
+    return exit_status(experiment.name, measure_and_render)
+
+
+def exit_status(name: str, command: Callable[[], int]) -> int:
+    """What a command returns; 2 where it raises a UserError, whose sentence goes to stderr behind the name."""
+    from scb.errors import UserError
+
+    try:
+        return command()
     except UserError as error:
-        print(f"{experiment.name}: {error}", file=sys.stderr)
+        print(f"{name}: {error}", file=sys.stderr)
         return 2
-    return 0
 
 
 def render(experiment: Experiment, report: Mapping[str, Any], docs: Path) -> None:

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from experiments.page import text
+from experiments.page import exit_status, text
 from lpo.cli import configure_jax
 
 if TYPE_CHECKING:
@@ -298,4 +298,4 @@ def _learn(arguments: argparse.Namespace, name: str, seed: int, entry: dict[str,
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(exit_status("transfer_study", main))

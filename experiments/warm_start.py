@@ -17,6 +17,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from experiments.page import exit_status
 from lpo.cli import configure_jax
 
 # Not the seeds that results are reported on.
@@ -139,4 +140,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(exit_status("warm_start", main))

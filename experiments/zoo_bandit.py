@@ -14,6 +14,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from experiments.page import exit_status
+
 
 def results_of(table: Mapping[str, Any], sha256: str, backend: str | None = None) -> dict[str, Any]:
     """{"PPO": {...}, ...} of the bandit with this checksum, in its physics; empty where the table has none."""
@@ -65,4 +67,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(exit_status("zoo_bandit", main))

@@ -12,6 +12,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from experiments.page import exit_status
+
 
 def _short(name: str, file: Path, zoo_name: str) -> str:
     """What a comparison calls an objective: this one by its name in the zoo, another file by its stem."""
@@ -72,4 +74,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(exit_status("zoo_entry", main))

@@ -6,7 +6,6 @@ each trains agents on the environment and in every regime of a bandit, and Spear
 between the two is the regime's alignment.
 """
 
-import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
@@ -18,12 +17,11 @@ import numpy as np
 
 from lpo.drift import ClipDrift, DPODrift, Drift, NoDrift
 from lpo.generalization import (
-    by_objective,
     check_names,
     check_seeds,
     compare,
     families,
-    objectives_and_seeds,
+    over_objectives,
     training_setting,
 )
 from lpo.meta_training import MetaTrainingConfig, TaskTraining, inner_loop
@@ -151,16 +149,23 @@ def regime_fitness(
     check_seeds(seeds)
     found = {}
     for family in families(objectives):
-        task = regime.task(family[0])
-        parameters, every_seed = objectives_and_seeds(family, seeds)
-        program = _program(regime.static(), family[0].drift, len(every_seed))
-        results = program(
-            parameters, every_seed, regime.hyperparameters(), task.env_params, task.training_params
-        )
-        of_family = by_objective(np.asarray(results, np.float64), len(family))
+        of_family = np.asarray(_family_fitness(regime, family, seeds), np.float64)
         for objective, of_it in zip(family, of_family, strict=True):
             found[objective.name] = dict(zip(FITNESSES, of_it.T, strict=True))
     return found
+
+
+def _family_fitness(regime: Regime, family: Sequence[Objective], seeds: Sequence[int]) -> Any:
+    """[objectives, S, F] fitnesses of objectives that share a drift."""
+    task = regime.task(family[0])
+    program = _program(regime.static(), family[0].drift, len(family) * len(seeds))
+    return over_objectives(
+        lambda parameters, every_seed: program(
+            parameters, every_seed, regime.hyperparameters(), task.env_params, task.training_params
+        ),
+        family,
+        seeds,
+    )
 
 
 @lru_cache(maxsize=64)
@@ -321,11 +326,9 @@ def measure_alignment(
         )
     outcome = {name: np.asarray(returns) for name, returns in report["outcome"].items()}
     tell(f"{environment}: " + ", ".join(f"{n} {x:.0f}" for n, x in report["outcome_iqm"].items()))
-    known = {
-        json.dumps({name: row[name] for name in asdict(Regime())}) for row in report["regimes"]
-    }
+    known = {Regime(**{name: row[name] for name in asdict(Regime())}) for row in report["regimes"]}
     for regime in regimes:
-        if json.dumps(asdict(regime)) in known:
+        if regime in known:
             continue
         watch = Stopwatch()
         fitness = regime_fitness(regime, objectives, seeds)

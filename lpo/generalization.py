@@ -179,35 +179,23 @@ def families(objectives: Sequence[Objective]) -> list[list[Objective]]:
 
 
 def over_objectives(
-    function: Callable[[Any, jax.Array], Any], objectives: Sequence[Objective], seeds: Sequence[int]
+    mapped: Callable[[Any, np.ndarray], Any], objectives: Sequence[Objective], seeds: Sequence[int]
 ) -> Any:
-    """Calls a function for every objective of a family and every seed, as one program.
+    """Calls a function for every objective of a family with every seed, all at once.
 
     Args:
-      function: (drift parameters, seed) -> pytree of arrays.
+      mapped: ([N] drift parameters, [N] seeds) -> pytree of [N, ...], such as `map_population` makes.
 
     Returns:
       The pytree, every leaf [objectives, seeds, ...].
     """
-    parameters, every_seed = objectives_and_seeds(objectives, seeds)
-    results = map_population(function, len(every_seed), (0, 0))(parameters, every_seed)
-    return by_objective(results, len(objectives))
-
-
-def objectives_and_seeds(
-    objectives: Sequence[Objective], seeds: Sequence[int]
-) -> tuple[Any, np.ndarray]:
-    """([N] drift parameters, [N] seeds) of every objective of a family with every seed, objectives outermost."""
     parameters = jax.tree.map(
         lambda *leaves: jnp.repeat(jnp.stack(leaves), len(seeds), axis=0),
         *(objective.parameters for objective in objectives),
     )
-    return parameters, np.tile(np.asarray(seeds, np.uint32), len(objectives))
-
-
-def by_objective(results: Any, number: int) -> Any:
-    """[N, ...] results of `objectives_and_seeds` -> [number, seeds, ...]."""
-    return jax.tree.map(lambda x: np.reshape(x, (number, -1, *x.shape[1:])), results)
+    results = mapped(parameters, np.tile(np.asarray(seeds, np.uint32), len(objectives)))
+    shape = (len(objectives), len(seeds))
+    return jax.tree.map(lambda x: np.reshape(x, (*shape, *x.shape[1:])), results)
 
 
 def _family_curves(
@@ -244,7 +232,8 @@ def _family_curves(
         return returns
 
     # In double precision, so that curves read back from JSON give the same estimates.
-    returns = np.asarray(over_objectives(train, objectives, seeds), np.float64)
+    mapped = map_population(train, len(objectives) * len(seeds), (0, 0))
+    returns = np.asarray(over_objectives(mapped, objectives, seeds), np.float64)
     steps = np.arange(returns.shape[2]) * every * config.batch_size
     return [
         LearningCurves(
