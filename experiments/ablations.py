@@ -13,9 +13,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from experiments import searches
 from experiments.page import Experiment, Save, table, text
 from experiments.page import main as run
-from experiments.searches import PAPER_SIZES
+from experiments.searches import NONE, PAPER_SIZES
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -27,7 +28,6 @@ ENVIRONMENTS = ("Pendulum-v1", "MountainCar-v0")
 # The paper finds no curriculum for Pendulum.
 WITH_CURRICULUM = ("MountainCar-v0",)
 WORST = {"MountainCar-v0": -200.0}  # what an agent earns that never reaches the goal
-NONE = "none"
 LATENTS = {
     "normal": "normal",
     "uniform": "uniform",
@@ -55,7 +55,7 @@ def rows(environment: str) -> dict[str, dict[str, str]]:
     return found
 
 
-def searches(environment: str) -> list[str]:
+def searches_of(environment: str) -> list[str]:
     """Every search of an environment once."""
     return list(dict.fromkeys(s for row in rows(environment).values() for s in row.values()))
 
@@ -64,19 +64,10 @@ def config_of(
     environment: str, search: str, seed: int, plan: Mapping[str, Any]
 ) -> "DiscoveryConfig":
     """The search's configuration: the paper's recipe, at the plan's size."""
-    from dataclasses import replace
-
-    from experiments import searches
-    from scb.curriculum import paper_curriculum
     from scb.environments.synthetic import BanditConfig
 
     parameterization, latent, shape = search.split(" | ")
     size = plan["environments"][environment]
-    curriculum = None
-    if shape != NONE:
-        curriculum = paper_curriculum(environment, size["generations"])
-        assert curriculum is not None
-        curriculum = replace(curriculum, shape=shape)
     return searches.config_of(
         environment,
         plan,
@@ -84,32 +75,31 @@ def config_of(
         seed,
         parameterization=parameterization,
         bandit=BanditConfig(latent=latent),
-        curriculum=curriculum,
+        curriculum=searches.curriculum_of(environment, shape, size["generations"]),
     )
 
 
 def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None:
     """A search at a time, seeds outermost, so that an interrupted run has all lines."""
-    from experiments.searches import curve, search
-
     found = report.setdefault("environments", {name: {} for name in ENVIRONMENTS})
     for seed in range(max(x["seeds"] for x in plan["environments"].values())):
         for environment in ENVIRONMENTS:
-            for name in searches(environment):
+            for name in searches_of(environment):
                 curves = found[environment].setdefault(name, {})
                 if str(seed) in curves or seed >= plan["environments"][environment]["seeds"]:
                     continue
                 folder = f"{plan['runs']}/{environment}/{name.replace(' | ', '-')}-{seed}"
-                _, outcome = search(config_of(environment, name, seed, plan), folder)
-                curves[str(seed)] = {**curve(outcome.metrics), "seconds": round(outcome.seconds, 1)}
+                _, outcome = searches.search(config_of(environment, name, seed, plan), folder)
+                curves[str(seed)] = {
+                    **searches.curve(outcome.metrics),
+                    "seconds": round(outcome.seconds, 1),
+                }
                 save()
 
 
 def finals(report: Mapping[str, Any], environment: str, search: str) -> "Estimate | None":
     """The last judgement, the mean over searches; None where every one failed."""
-    from experiments.searches import final
-
-    return final(report["environments"][environment][search], np.mean)
+    return searches.final(report["environments"][environment][search], np.mean)
 
 
 def _worst_failing(report: Mapping[str, Any], environment: str, search: str) -> float:
@@ -183,15 +173,14 @@ def body(report: Mapping[str, Any]) -> list[str]:
         f"{x['agents_per_candidate']} agents, {x['seeds']} searches a line"
         for name, x in plan["environments"].items()
     )
-    algorithms = ", ".join(x.upper() for x in plan["algorithms"]) or "all of the paper's algorithms"
+    algorithms = searches.algorithms_text(plan["algorithms"])
     lines = []
     for environment in ENVIRONMENTS:
         for row, labels in rows(environment).items():
             for label, search in labels.items():
                 found = finals(report, environment, search)
                 seconds = [
-                    c["seconds"]
-                    for c in report["environments"][environment].get(search, {}).values()
+                    c["seconds"] for c in report["environments"][environment][search].values()
                 ]
                 lines.append(
                     [
@@ -207,10 +196,9 @@ def body(report: Mapping[str, Any]) -> list[str]:
         f"SNES from random weights with standard deviation 0.05, inner loop: {algorithms} with hyperparameters drawn "
         f"from the paper's lists, {plan['evaluation_episodes']} evaluation episodes. {sizes}. The mean of the "
         f"search distribution is judged by {plan['mean_evaluations']} agents; a line is the mean over searches of "
-        "their interquartile "
-        "mean, with the 95 % bootstrap interval over searches. T: transition, reward and termination are learned; "
-        "TI: and the initial state; I: a bandit; IC: with a linear curriculum of the evaluation's length, with which "
-        "MountainCar's latents are searched too. "
+        "their interquartile mean, with the 95 % bootstrap interval over searches. T: transition, reward and "
+        "termination are learned; TI: and the initial state; I: a bandit; IC: with a linear curriculum of the "
+        "evaluation's length, with which MountainCar's latents are searched too. "
         "*Without a number* is the largest share of candidates that failed (NaN or infinite returns) between two "
         "judgements; networks are the paper's, with one hidden layer of tanh, whose states are bounded, unlike those "
         "of the ReLU networks in the authors' released code.",

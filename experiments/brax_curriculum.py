@@ -12,37 +12,22 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from experiments import searches
 from experiments.page import Experiment, Save, table, text
 from experiments.page import main as run
+from experiments.searches import NONE, curriculum_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from scb.curriculum import CurriculumConfig
     from scb.discovery import DiscoveryConfig
     from scb.statistics import Estimate
 
 ENVIRONMENT = "hopper"
-NONE = "none"
-
-
-def curriculum_of(shape: str, generations: int) -> "CurriculumConfig | None":
-    """The paper's curriculum for Brax, scaled to a search of this length, in another shape."""
-    from dataclasses import replace
-
-    from scb.curriculum import paper_curriculum
-
-    if shape == NONE:
-        return None
-    curriculum = paper_curriculum(ENVIRONMENT, generations)
-    assert curriculum is not None
-    return replace(curriculum, shape=shape)
 
 
 def config_of(shape: str, seed: int, plan: Mapping[str, Any]) -> "DiscoveryConfig":
     """The search with this curriculum: the paper's recipe, at the plan's size."""
-    from experiments import searches
-
     return searches.config_of(
         ENVIRONMENT,
         plan,
@@ -50,22 +35,22 @@ def config_of(shape: str, seed: int, plan: Mapping[str, Any]) -> "DiscoveryConfi
         seed,
         backend=plan["backend"],
         mode=plan["mode"],
-        curriculum=curriculum_of(shape, plan["generations"]),
+        curriculum=curriculum_of(ENVIRONMENT, shape, plan["generations"]),
     )
 
 
 def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None:
     """A search at a time, first seeds first."""
-    from experiments.searches import curve, search
-
     found = report.setdefault("curves", {shape: {} for shape in plan["seeds"]})
     for seed in range(max(plan["seeds"].values())):
         for shape, number in plan["seeds"].items():
             if seed >= number or str(seed) in found[shape]:
                 continue
-            _, outcome = search(config_of(shape, seed, plan), f"{plan['runs']}/{shape}-{seed}")
+            _, outcome = searches.search(
+                config_of(shape, seed, plan), f"{plan['runs']}/{shape}-{seed}"
+            )
             found[shape][str(seed)] = {
-                **curve(outcome.metrics),
+                **searches.curve(outcome.metrics),
                 "seconds": round(outcome.seconds, 1),
             }
             save()
@@ -73,10 +58,9 @@ def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None
 
 def finals(report: Mapping[str, Any]) -> dict[str, "Estimate"]:
     """{shape: the last judgement, over searches}; those that failed altogether are left out."""
-    from experiments.searches import final
     from scb.statistics import iqm
 
-    found = {shape: final(curves, iqm) for shape, curves in report["curves"].items()}
+    found = {shape: searches.final(curves, iqm) for shape, curves in report["curves"].items()}
     return {shape: x for shape, x in found.items() if x is not None}
 
 
@@ -107,7 +91,7 @@ def verdict(report: Mapping[str, Any]) -> str:
 def body(report: Mapping[str, Any]) -> list[str]:
     """How it was searched, and the final judgements."""
     plan = report["plan"]
-    algorithms = ", ".join(x.upper() for x in plan["algorithms"]) or "all of the paper's algorithms"
+    algorithms = searches.algorithms_text(plan["algorithms"])
     rows = [
         [
             shape,
@@ -150,7 +134,7 @@ def draw(report: Mapping[str, Any]) -> "Figure":
         figure = Figure(figsize=(plotting.WIDTH, 3.8))
         left, right = figure.subplots(1, 2)
         for (shape, curves), (color, style) in zip(report["curves"].items(), looks, strict=False):
-            curriculum = curriculum_of(shape, generations)
+            curriculum = curriculum_of(ENVIRONMENT, shape, generations)
             times = np.arange(generations + 1)
             lengths: Any = (
                 np.full(times.size, 1000)

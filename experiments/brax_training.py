@@ -80,11 +80,12 @@ def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None
 def _in_bandit(
     kind: str, environment: str, backend: str | None, algorithm: str, plan: Mapping[str, Any]
 ) -> dict[str, Any]:
+    import scb
     from scb.agents.hyperparameters import inner_loop
     from scb.environments.zoo import bandit_metadata, open_bandit
     from scb.importer import PUBLISHED_BANDITS, published_bandit
 
-    env, env_params = _make(environment, backend)
+    env, env_params = scb.make(environment, backend)
     if kind == OURS:
         bandit = open_bandit(f"Synthetic-{environment}")
         digest = bandit_metadata(bandit.name)["sha256"]
@@ -112,9 +113,10 @@ def _in_environment(
 ) -> dict[str, Any]:
     from dataclasses import replace
 
+    import scb
     from scb.agents.settings import environment_setting
 
-    env, env_params = _make(environment, backend)
+    env, env_params = scb.make(environment, backend)
     setting = environment_setting(environment, algorithm)
     setting = replace(
         setting, config=replace(setting.config, total_steps=plan["environment_steps"])
@@ -128,12 +130,6 @@ def _in_environment(
         plan["environment_agents"],
         plan,
     )
-
-
-def _make(environment: str, backend: str | None) -> tuple[Any, Any]:
-    import scb
-
-    return scb.make(environment, **({} if backend is None else {"backend": backend}))
 
 
 def _curves(
@@ -151,36 +147,28 @@ def _curves(
 
     import jax
 
+    from scb.evolution import map_population
+
     every, iterations = evaluation_steps(agent.config.num_iterations, plan["points"])
-    before, each = _steps(agent.config)
     # Evaluations are evenly spaced, for which a few iterations may be added at the end.
-    agent = replace(agent, config=replace(agent.config, total_steps=before + iterations * each))
+    steps = agent.config.steps_after(iterations)
+    agent = replace(agent, config=replace(agent.config, total_steps=steps))
 
     def evaluation(state: Any, key: Any) -> Any:
         episodes = agent.evaluate(state, key, plan["episodes"], env, env_params, mode=True)
         return episodes.returns.mean()
 
-    @jax.jit
-    @jax.vmap
     def train(key: Any) -> Any:
         return agent.train_with_evaluations(key, hyperparameters, trained_in, evaluation, every)[1]
 
     start = time.monotonic()
-    returns = np.asarray(train(jax.random.split(jax.random.key(REPORTING_SEED), number)))
+    keys = jax.random.split(jax.random.key(REPORTING_SEED), number)
+    returns = map_population(train, number, (0,))(keys)
     return {
-        "steps": (before + np.arange(0, iterations + 1, every) * each).tolist(),
+        "steps": [agent.config.steps_after(n) for n in range(0, iterations + 1, every)],
         "returns": np.round(returns, 1).tolist(),
         "seconds": round(time.monotonic() - start, 1),
     }
-
-
-def _steps(config: Any) -> tuple[int, int]:
-    """Environment steps before an agent's first iteration, and of each iteration."""
-    from scb.agents.ppo import PPOConfig
-
-    if isinstance(config, PPOConfig):
-        return 0, config.batch_size
-    return config.prefill, config.num_envs
 
 
 def evaluation_steps(iterations: int, points: int) -> tuple[int, int]:
@@ -356,12 +344,7 @@ def draw(report: Mapping[str, Any]) -> "Figure":
                     shown = np.asarray(found["steps"]) > 0
                     steps = np.asarray(found["steps"])[shown]
                     estimates = [estimate(x) for x in np.transpose(found["returns"])[shown]]
-                    middle = np.array([e.value for e in estimates])
-                    below, above = plotting.error_bar(*estimates)
-                    axes.plot(steps, middle, color=color, linestyle=style)
-                    axes.fill_between(
-                        steps, middle - below, middle + above, color=color, alpha=0.2, linewidth=0
-                    )
+                    plotting.estimate_curve(axes, steps, estimates, color, style)
                 paper = PAPER.get(name.split(" ")[0], {}).get(algorithm)
                 # The paper's physics.
                 if algorithm not in own and paper is not None and "(generalized)" in name:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from experiments import searches
 from experiments.page import CLASSIC_CONTROL, Experiment, Save, finite, span, table, text
 from experiments.page import main as run
 from experiments.searches import PAPER_SIZES
@@ -19,7 +20,7 @@ from experiments.searches import PAPER_SIZES
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from scb.discovery import DiscoveryConfig
+    from scb.discovery import DiscoveryConfig, SyntheticTraining
     from scb.statistics import Estimate
 
 OWN = "max"  # the evaluation environment's own limit
@@ -29,7 +30,6 @@ JUDGE_SEED = 10_000
 
 def config_of(environment: str, limit: str, plan: Mapping[str, Any]) -> "DiscoveryConfig":
     """The search of an MDP with this limit: the paper's recipe, at the plan's size."""
-    from experiments import searches
     from scb.curriculum import paper_curriculum
 
     size = plan["sizes"][environment]
@@ -60,13 +60,12 @@ def _measure_limit(
 ) -> None:
     import jax
 
-    from experiments.searches import search
     from lpo.suite import random_return
     from scb.agents.hyperparameters import algorithms_for, inner_loop
-    from scb.discovery import SyntheticTraining, judge
+    from scb.discovery import SyntheticTraining
 
     folder = f"{plan['runs']}/{environment}-{limit}"
-    problem, outcome = search(config_of(environment, limit, plan), folder)
+    problem, outcome = searches.search(config_of(environment, limit, plan), folder)
     entry["random"] = round(random_return(problem.env, problem.env_params), 2)
     entry["limit"] = int(problem.env_params.max_steps_in_episode)
     space = problem.env.action_space(problem.env_params)
@@ -79,37 +78,42 @@ def _measure_limit(
             problem.env_params,
             inner_loop(algorithm, environment, space),
         )
-        (judged,) = judge(
-            training, outcome.mean, JUDGE_SEED, plan["agents"], plan["episodes"], mode=True
-        ).values()
+        judged, lengths = returns_and_lengths(
+            training, outcome.mean, jax.random.key(JUDGE_SEED), plan["agents"], plan["episodes"]
+        )
         returns[algorithm], number = finite(judged, entry["random"])
         failed += number
         if limit == OWN:
-            lengths = synthetic_lengths(
-                training, outcome.mean, jax.random.key(JUDGE_SEED), plan["agents"], plan["episodes"]
-            )
             entry.setdefault("lengths", {})[algorithm] = binned(lengths)
     entry["returns"][limit], entry["failed"][limit] = returns, failed
 
 
-def synthetic_lengths(
-    training: Any, weights: Any, key: Any, num_agents: int, num_episodes: int
-) -> np.ndarray:
-    """[N, E] steps of episodes in the synthetic environment itself, of agents trained there."""
+def returns_and_lengths(
+    training: "SyntheticTraining", weights: Any, key: Any, num_agents: int, num_episodes: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Of agents trained in the synthetic environment.
+
+    Returns:
+      ([N] mean returns in the environment with most likely actions, [N, E] steps of episodes in the synthetic one).
+    """
     import jax
 
-    params = training.synthetic.params(weights)
+    from scb.evolution import map_population
+
     key_draw, key_agents = jax.random.split(key)
 
-    @jax.jit
-    @jax.vmap
-    def lengths(hyperparameters: Any, key: Any) -> Any:
-        key_train, key_act = jax.random.split(key)
-        state = training.agent.train(key_train, hyperparameters, params)
-        return training.agent.evaluate(state, key_act, num_episodes, env_params=params).lengths
+    def one(hyperparameters: Any, key: Any, weights: Any) -> Any:
+        key_train, key_judge, key_act = jax.random.split(key, 3)
+        state = training.train(weights, hyperparameters, key_train)
+        returns = training.evaluate(state, key_judge, num_episodes, mode=True)
+        params = training.synthetic.params(weights)
+        episodes = training.agent.evaluate(state, key_act, num_episodes, env_params=params)
+        return returns.mean(), episodes.lengths
 
+    hyperparameters = training.inner.sample(key_draw, num_agents)
     keys = jax.random.split(key_agents, num_agents)
-    return np.asarray(lengths(training.inner.sample(key_draw, num_agents), keys))
+    returns, lengths = map_population(one, num_agents, (0, 0, None))(hyperparameters, keys, weights)
+    return np.asarray(returns), np.asarray(lengths)
 
 
 def binned(lengths: np.ndarray) -> dict[str, int]:
@@ -177,8 +181,8 @@ def body(report: Mapping[str, Any]) -> list[str]:
     """How it was searched, and both tables."""
     plan = report["plan"]
     limits, sizes = plan["limits"], plan["sizes"].values()
-    algorithms = ", ".join(x.upper() for x in plan["algorithms"]) or "all of the paper's algorithms"
-    judged = ", ".join(x.upper() for x in plan["judged_by"]) or "each of the paper's algorithms"
+    algorithms = searches.algorithms_text(plan["algorithms"])
+    judged = searches.algorithms_text(plan["judged_by"], "each of the paper's algorithms")
     failed = sum(sum(x["failed"].values()) for x in report["environments"].values())
     return [
         "SNES from random weights with standard deviation 0.05, inner loop: "

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from experiments import searches
 from experiments.page import CLASSIC_CONTROL, Experiment, Save, finite, span, table, text
 from experiments.page import main as run
 from experiments.searches import PAPER_SIZES
@@ -43,7 +44,6 @@ REPORTING_SEED = 10_000
 
 def config_of(environment: str, source: str, plan: Mapping[str, Any]) -> "DiscoveryConfig":
     """The search whose inner agents' hyperparameters are drawn, or fixed; nothing else differs."""
-    from experiments import searches
     from scb.curriculum import paper_curriculum
 
     size, curriculum = plan["sizes"][environment], None
@@ -108,7 +108,6 @@ class _Trainer:
 
     def __init__(self, environment: str, source: str, plan: Mapping[str, Any]) -> None:
         import scb
-        from experiments.searches import search
         from scb.environments.zoo import open_bandit
 
         self.environment, self.plan = environment, plan
@@ -121,7 +120,7 @@ class _Trainer:
             self.trained_in_params = self.trained_in.default_params
         elif source != ENVIRONMENT:
             kind = "drawn" if source == DRAWN else "fixed"
-            problem, outcome = search(
+            problem, outcome = searches.search(
                 config_of(environment, source, plan), f"{plan['runs']}/{environment}-{kind}"
             )
             self.trained_in = problem.bandit
@@ -146,6 +145,8 @@ class _Trainer:
     def _trained(self, inner: "InnerLoop", key: Any) -> np.ndarray:
         import jax
 
+        from scb.evolution import map_population
+
         agent, episodes = inner.agent(self.trained_in), self.plan["episodes"]
         key_draw, key_agents = jax.random.split(key)
         number = self.plan["agents"]
@@ -157,9 +158,10 @@ class _Trainer:
                 state, key_judge, episodes, self.env, self.env_params, mode=True
             ).returns.mean()
 
-        judge = jax.jit(jax.vmap(judged, in_axes=(0, 0, None)))
+        hyperparameters = inner.sample(key_draw, number)
         keys = jax.random.split(key_agents, number)
-        return np.asarray(judge(inner.sample(key_draw, number), keys, self.trained_in_params))
+        judge = map_population(judged, number, (0, 0, None))
+        return np.asarray(judge(hyperparameters, keys, self.trained_in_params))
 
     def _evolved(self, key: Any) -> np.ndarray:
         from scb.neuroevolution import NeuroevolutionConfig, evolve_policy
@@ -181,15 +183,15 @@ class _Trainer:
         import jax
 
         from scb.evaluation import evaluate
+        from scb.evolution import map_population
 
-        @jax.jit
-        @jax.vmap
         def judged(key: Any) -> Any:
             key_make, key_judge = jax.random.split(key)
             policy, episodes = make(key_make), self.plan["episodes"]
             return evaluate(self.env, self.env_params, policy, key_judge, episodes).returns.mean()
 
-        return np.asarray(judged(jax.random.split(key, self.plan["agents"])))
+        number = self.plan["agents"]
+        return np.asarray(map_population(judged, number, (0,))(jax.random.split(key, number)))
 
 
 def in_environment(config: "NeuroevolutionConfig", limit: int) -> "NeuroevolutionConfig":
@@ -284,7 +286,7 @@ def body(report: Mapping[str, Any]) -> list[str]:
     plan = report["plan"]
     own = plan["neuroevolution"]
     steps = own["num_generations"] * own["population_size"] * own["episodes"]
-    algorithms = ", ".join(x.upper() for x in plan["algorithms"]) or "all of the paper's algorithms"
+    algorithms = searches.algorithms_text(plan["algorithms"])
     sizes = list(plan["sizes"].values())
     failed = sum(report["failed"].values())
     lines = [

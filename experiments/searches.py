@@ -6,9 +6,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from scb.curriculum import CurriculumConfig
     from scb.discovery import BanditDiscovery, DiscoveryConfig
     from scb.evolution import Outcome
     from scb.statistics import Estimate
+
+NONE = "none"  # the curriculum that is none
 
 # The paper's tables of the outer loop, classic control.
 PAPER_SIZES: dict[str, dict[str, int]] = {
@@ -52,6 +55,34 @@ def config_of(
         "evolution": evolution,
     }
     return DiscoveryConfig(environment, **given | changes)
+
+
+def curriculum_of(environment: str, shape: str, generations: int) -> "CurriculumConfig | None":
+    """The paper's curriculum for an environment, scaled to a search of this length, in a shape; None for NONE.
+
+    Raises:
+      UserError: the paper has no curriculum for the environment.
+    """
+    from dataclasses import replace
+
+    from scb.curriculum import paper_curriculum
+    from scb.errors import UserError
+
+    if shape == NONE:
+        return None
+    curriculum = paper_curriculum(environment, generations)
+    if curriculum is None:
+        raise UserError(
+            f"the paper has no curriculum for {environment}: its shape must be {NONE!r}."
+        )
+    return replace(curriculum, shape=shape)
+
+
+def algorithms_text(
+    algorithms: Sequence[str], otherwise: str = "all of the paper's algorithms"
+) -> str:
+    """Such as "PPO, SAC"; a plan's empty list stands for all."""
+    return ", ".join(name.upper() for name in algorithms) or otherwise
 
 
 def search(config: "DiscoveryConfig", folder: str | Path) -> "tuple[BanditDiscovery, Outcome]":

@@ -38,11 +38,11 @@ def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None
 def _examine(environment: str, plan: Mapping[str, Any]) -> dict[str, Any]:
     import jax
     import jax.numpy as jnp
-    from gymnax.environments import spaces
 
     from experiments import experts
     from scb.agents.agent import flat_bounds
-    from scb.analysis.optimal_actions import optimal_actions
+    from scb.analysis.components import ReplacedBandit, q_reward
+    from scb.analysis.optimal_actions import first_action, optimal_actions
     from scb.analysis.planes import plane_for
     from scb.analysis.states import bandit_states, follow
     from scb.environments.zoo import bandit_metadata, open_bandit
@@ -64,62 +64,39 @@ def _examine(environment: str, plan: Mapping[str, Any]) -> dict[str, Any]:
         (np.asarray(low), np.asarray(high)),
     )
     _, _, nodes = plane.grid(POINTS)
-    discrete = isinstance(space, spaces.Discrete)
 
-    def first(actions: Any) -> np.ndarray:
-        return np.asarray(actions).reshape(POINTS * POINTS, -1)[:, 0].reshape(POINTS, POINTS)
+    def best(reward: Any) -> list[str]:
+        actions = jax.jit(jax.vmap(optimal_actions(reward, method="grid")))(jnp.asarray(nodes))
+        # A map has one number a node: of several action dimensions the first.
+        firsts = np.asarray(actions).reshape(POINTS * POINTS, -1)[:, 0]
+        return packed(firsts.reshape(POINTS, POINTS))
 
-    best = jax.jit(jax.vmap(optimal_actions(bandit, method="grid")))
+    num_actions, bounds = first_action(space)
     return {
         "sha256": bandit_metadata(bandit.name)["sha256"],
         "expert": round(float(episodes.returns().mean()), 2),
         "labels": list(plane.labels),
         "limits": [list(x) for x in plane.limits],
-        "num_actions": int(space.n) if isinstance(space, spaces.Discrete) else None,
-        "bounds": None if discrete else [float(x[0]) for x in flat_bounds(space)],
+        "num_actions": num_actions,
+        "bounds": None if bounds is None else list(bounds),
         "contexts": stored_points(plane.project(contexts), plane.limits),
         "visited": stored_points(plane.project(visited), plane.limits),
-        "bandit_actions": packed(first(best(jnp.asarray(nodes)))),
-        "expert_actions": packed(first(expert_actions(expert, space, nodes))),
+        "bandit_actions": best(bandit),
+        "expert_actions": best(ReplacedBandit(bandit, q_reward(expert, space))),
     }
 
 
 def stored_points(points: np.ndarray, limits: Any) -> list[str]:
     """[N, 2] points as thousandths of the plane, 50 a line: four times smaller than a line each."""
     low, high = np.transpose(limits)
-    thousandths = np.round((points - low) / (high - low) * 1000).astype(int)
-    return [" ".join(map(str, line)) for line in np.split(thousandths.ravel(), len(points) // 50)]
+    thousandths = np.round((points - low) / (high - low) * 1000)
+    return packed(thousandths.reshape(len(points) // 50, -1))
 
 
 def points_of(lines: Sequence[str], limits: Any) -> np.ndarray:
     """[N, 2] what `stored_points` stored, to a thousandth of the plane."""
     low, high = np.transpose(limits)
-    thousandths = np.array([int(x) for line in lines for x in line.split()]).reshape(-1, 2)
-    return np.asarray(low + thousandths / 1000 * (high - low))
-
-
-def expert_actions(expert: Any, space: Any, observations: np.ndarray) -> np.ndarray:
-    """[N, ...] the action with the largest Q-value of the expert; of evenly spaced ones where continuous."""
-    import jax
-    import jax.numpy as jnp
-    from gymnax.environments import spaces
-
-    from scb.agents.agent import flat_bounds
-    from scb.analysis.optimal_actions import GRID_POINTS
-
-    if isinstance(space, spaces.Discrete):
-        candidates = jnp.arange(space.n)
-    else:
-        low, high = flat_bounds(space)
-        candidates = jnp.linspace(low, high, GRID_POINTS).reshape(GRID_POINTS, *space.shape)
-
-    @jax.jit
-    @jax.vmap
-    def best(observation: Any) -> Any:
-        values = jax.vmap(lambda action: expert.q_value(observation, action))(candidates)
-        return candidates[jnp.argmax(values)]
-
-    return np.asarray(best(jnp.asarray(observations)))
+    return np.asarray(low + unpacked(lines).reshape(-1, 2) / 1000 * (high - low))
 
 
 def coverage(points: np.ndarray, limits: Any) -> float:

@@ -213,7 +213,7 @@ def _family_curves(
     for name, value in (("points", points), ("episodes", episodes)):
         if value < 1:
             raise UserError(f"{name} is {value}: it must be at least 1.")
-    env, env_params = make(environment, **({} if backend is None else {"backend": backend}))
+    env, env_params = make(environment, backend)
     setting = setting or environment_setting(environment)
     config = _rounded_to_points(setting.config, min(points, setting.config.num_iterations))
     agent = PPO(env, config, objectives[0].drift)

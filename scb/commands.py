@@ -478,7 +478,7 @@ def train(
         load(bandit) if bandit.endswith(".npz") else open_bandit(bandit)
     )
     target = evaluation_environment or loaded.name.removeprefix(PREFIX)
-    env, env_params = make(target, **({} if backend is None else {"backend": backend}))
+    env, env_params = make(target, backend)
     check_fits(loaded, env, env_params, target)
     inner = inner_loop(algorithm, target, loaded.action_space(), not fixed_hyperparameters)
     training = SyntheticTraining(loaded, env, env_params, inner)

@@ -214,8 +214,7 @@ class BanditDiscovery:
     """The evolution problem: a candidate is a synthetic environment's weights."""
 
     def __init__(self, config: DiscoveryConfig) -> None:
-        arguments = {} if config.backend is None else {"backend": config.backend}
-        self.env, self.env_params = make(config.environment, **arguments)
+        self.env, self.env_params = make(config.environment, config.backend)
         space = self.env.action_space(self.env_params)
         if not config.algorithms:
             config = replace(config, algorithms=algorithms_for(space))

@@ -6,10 +6,10 @@ Liesen et al. (2024) train such policies in discovered bandits, whose search nev
 from dataclasses import dataclass
 from typing import Any
 
-import evosax.algorithms
 import jax
 import jax.numpy as jnp
 import numpy as np
+from evosax.algorithms import SNES
 from flax import linen as nn
 from gymnax.environments import environment, spaces
 
@@ -86,7 +86,7 @@ def evolve_policy(
 
     key_init, key_start, key_search = jax.random.split(key, 3)
     start = network.init(key_init, jnp.zeros(size))
-    snes = evosax.algorithms.algorithms["SNES"](config.population_size, start)
+    snes = SNES(config.population_size, start)
     params = snes.default_params.replace(std_init=config.sigma)
 
     def generation(state: Any, key: jax.Array) -> tuple[Any, None]:

@@ -15,7 +15,7 @@ import matplotlib.style
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from scb.statistics import Estimate, Statistic, estimate
 
@@ -96,21 +96,29 @@ def search_curve(
     """
     if not curves:
         return
-    generations = np.asarray(curves[0]["generation"])
     fitness = np.array([c["fitness"] for c in curves], float)
     found = [
-        None if np.isnan(column).all() else estimate(column[~np.isnan(column)], statistic)
+        Estimate(np.nan, None, None, 0)
+        if np.isnan(column).all()
+        else estimate(column[~np.isnan(column)], statistic)
         for column in fitness.T
     ]
-    ends = [
-        (np.nan,) * 3
-        if e is None
-        else (e.value, *(e.value if end is None else end for end in (e.low, e.high)))
-        for e in found
-    ]
-    middle, low, high = np.transpose(ends)
-    axes.plot(generations, middle, color=color, linestyle=linestyle, label=label)
-    axes.fill_between(generations, low, high, color=color, alpha=0.15, linewidth=0)
+    estimate_curve(axes, curves[0]["generation"], found, color, linestyle, label)
+
+
+def estimate_curve(
+    axes: Axes,
+    x: ArrayLike,
+    found: Sequence[Estimate],
+    color: str,
+    linestyle: Any = "-",
+    label: str | None = None,
+) -> None:
+    """A line through estimates, their intervals a band."""
+    middle = np.array([e.value for e in found])
+    below, above = error_bar(*found)
+    axes.plot(x, middle, color=color, linestyle=linestyle, label=label)
+    axes.fill_between(x, middle - below, middle + above, color=color, alpha=0.15, linewidth=0)
 
 
 @contextmanager

@@ -165,8 +165,6 @@ class InnerLoop:
     @property
     def steps(self) -> int:
         """Environment steps of one training."""
-        if isinstance(self.config, PPOConfig):
-            return self.config.num_iterations * self.config.batch_size
         return int(self.config.num_environment_steps)
 
 

@@ -83,10 +83,14 @@ class OffPolicyConfig:
     def num_iterations(self) -> int:
         return -(-(self.total_steps - self.prefill) // self.num_envs)
 
+    def steps_after(self, num_iterations: int) -> int:
+        """Environment steps after so many iterations, the prefill included."""
+        return self.prefill + num_iterations * self.num_envs
+
     @property
     def num_environment_steps(self) -> int:
         """Steps that a training takes: `total_steps` rounded up."""
-        return self.prefill + self.num_iterations * self.num_envs
+        return self.steps_after(self.num_iterations)
 
 
 class Transition(NamedTuple):

@@ -100,6 +100,15 @@ class PPOConfig:
     def num_iterations(self) -> int:
         return -(-self.total_steps // self.batch_size)
 
+    def steps_after(self, num_iterations: int) -> int:
+        """Environment steps after so many iterations."""
+        return num_iterations * self.batch_size
+
+    @property
+    def num_environment_steps(self) -> int:
+        """Steps that a training takes: `total_steps` rounded up."""
+        return self.steps_after(self.num_iterations)
+
 
 @struct.dataclass
 class PPOHyperparameters:

@@ -46,8 +46,6 @@ class Setting:
     @property
     def num_environment_steps(self) -> int:
         """Environment steps of one training."""
-        if isinstance(self.config, PPOConfig):
-            return self.config.num_iterations * self.config.batch_size
         return int(self.config.num_environment_steps)
 
 

@@ -6,12 +6,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from gymnax.environments import environment, spaces
+from gymnax.environments import environment
 from rich.console import Console
 
 from scb.agents.agent import flat_bounds
 from scb.analysis.importance import reward_variance
-from scb.analysis.optimal_actions import optimal_actions, optimal_policy
+from scb.analysis.optimal_actions import first_action, optimal_actions, optimal_policy
 from scb.analysis.planes import observation_names, plane_for
 from scb.analysis.states import bandit_states, follow
 from scb.discovery import check_fits
@@ -54,11 +54,7 @@ def explain(
     returns = trajectories.returns()
     earned = estimate(returns)
     best = jax.jit(jax.vmap(optimal_actions(bandit)))
-    discrete = isinstance(space, spaces.Discrete)
-    bounds = None
-    if not isinstance(space, spaces.Discrete):
-        low, high = flat_bounds(space)
-        bounds = (float(low[0]), float(high[0]))
+    num_actions, bounds = first_action(space)
 
     def drawn(observations: np.ndarray) -> np.ndarray:
         actions = np.asarray(best(jnp.asarray(observations)))
@@ -79,7 +75,7 @@ def explain(
     }
     if bandit.observation_size < 2:
         return numbers, {}
-    several = not discrete and bandit.num_actions > 1
+    several = num_actions is None and bandit.num_actions > 1
     everything = np.concatenate([contexts, shown])
     low, high = flat_bounds(env.observation_space(env_params))
     box = (np.asarray(low), np.asarray(high))
@@ -88,7 +84,7 @@ def explain(
         "summary": f"its optimal policy earns {earned} in {environment_name}",
         "plane": plane_for(environment_name, everything, importance.tolist(), box),
         "best": drawn,
-        "num_actions": int(space.n) if discrete else None,
+        "num_actions": num_actions,
         "bounds": bounds,
         "episode": trajectories.observations[usual][trajectories.active[usual]],
         "contexts": contexts,
@@ -127,7 +123,7 @@ def explain_command(
         raise UserError(f"seed is {seed}: it must be 0 or larger.")
     loaded = open_bandit(bandit)
     target = evaluation_environment or loaded.name.removeprefix(PREFIX)
-    env, env_params = make(target, **({} if backend is None else {"backend": backend}))
+    env, env_params = make(target, backend)
     check_fits(loaded, env, env_params, target)
     folder = Path("runs") / "explain" / loaded.name if out is None else out
     numbers, parts = explain(loaded, env, env_params, target, episodes, seed)

@@ -69,6 +69,16 @@ def optimal_policy(
     return lambda observation, key: best(jnp.ravel(observation))
 
 
+def first_action(
+    space: spaces.Box | spaces.Discrete,
+) -> tuple[int | None, tuple[float, float] | None]:
+    """What a map of actions is drawn with: (number of discrete actions, None), or (None, bounds of the first one)."""
+    if isinstance(space, spaces.Discrete):
+        return int(space.n), None
+    low, high = flat_bounds(space)
+    return None, (float(low[0]), float(high[0]))
+
+
 def _grid(space: spaces.Box) -> jax.Array:
     """[N, ...] every combination of evenly spaced values."""
     low, high = (np.asarray(x) for x in flat_bounds(space))

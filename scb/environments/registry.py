@@ -15,18 +15,23 @@ def environment_names() -> list[str]:
     return [*gymnax.registered_envs, *BRAX_NAMES]
 
 
-def make(name: str, **arguments: Any) -> tuple[environment.Environment[Any, Any], Any]:
+def make(
+    name: str, backend: str | None = None, **arguments: Any
+) -> tuple[environment.Environment[Any, Any], Any]:
     """An environment and its default parameters.
 
     Args:
       name: "Synthetic-Pendulum-v1", "CartPole-v1", "hopper", ..., or the file.npz of a bandit or of a
         synthetic MDP.
-      arguments: for the environment's constructor; Brax takes `backend="generalized" | "positional"
-        | "spring"`.
+      backend: "generalized", "positional" or "spring" for Brax environments; None for their own, and
+        for every other environment.
+      arguments: for the environment's constructor.
 
     Raises:
       UserError: unknown name (with near matches), or arguments that the environment doesn't take.
     """
+    if backend is not None:
+        arguments["backend"] = backend
     if name.endswith(".npz"):
         synthetic = load(name)
         return synthetic, synthetic.default_params

@@ -34,16 +34,16 @@ def report(**finals):
                 }
                 for seed in range(2)
             }
-            for search in ablations.searches(environment)
+            for search in ablations.searches_of(environment)
         }
     return {"environments": environments, "plan": ablations.EXPERIMENT.presets["quick"]}
 
 
 def test_every_search_of_the_papers_rows_is_there_once():
-    searches = ablations.searches("MountainCar-v0")
+    searches = ablations.searches_of("MountainCar-v0")
     # T, TI, I, IC; three other latents; four other shapes.
     assert len(searches) == len(set(searches)) == 4 + (len(LATENTS) - 1) + (len(SHAPES) - 1)
-    assert len(ablations.searches("Pendulum-v1")) == 3 + len(LATENTS) - 1
+    assert len(ablations.searches_of("Pendulum-v1")) == 3 + len(LATENTS) - 1
 
 
 def test_a_search_is_the_papers_recipe_with_one_thing_changed():
@@ -62,7 +62,7 @@ def test_a_search_is_the_papers_recipe_with_one_thing_changed():
 def test_transitions_alone_do_not_reach_the_goal_of_mountain_car(tmp_path, monkeypatch):
     monkeypatch.setattr(ablations, "ENVIRONMENTS", ("MountainCar-v0",))
     wanted = [name_of("T", "normal", NONE)]
-    monkeypatch.setattr(ablations, "searches", lambda environment: wanted)
+    monkeypatch.setattr(ablations, "searches_of", lambda environment: wanted)
     found, saved = {}, []
     plan = {**TINY, "runs": str(tmp_path)}
     ablations.measure(plan, found, lambda: saved.append(1))

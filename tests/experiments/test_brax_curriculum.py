@@ -6,6 +6,7 @@ import pytest
 from experiments import brax_curriculum as experiment
 from experiments import searches
 from experiments.brax_curriculum import NONE
+from scb.errors import UserError
 
 
 def report(**finals):
@@ -27,11 +28,13 @@ def report(**finals):
 
 
 def test_a_curriculum_is_the_papers_in_another_shape():
-    curriculum = experiment.curriculum_of("cosine", 2000)
+    curriculum = searches.curriculum_of("hopper", "cosine", 2000)
     assert curriculum.shape == "cosine" and (curriculum.initial, curriculum.final) == (100, 1000)
     assert (curriculum.begin, curriculum.transition) == (200, 1600)
-    assert experiment.curriculum_of("step", 60).begin == 6
-    assert experiment.curriculum_of(NONE, 60) is None
+    assert searches.curriculum_of("hopper", "step", 60).begin == 6
+    assert searches.curriculum_of("hopper", NONE, 60) is None
+    with pytest.raises(UserError, match="no curriculum for Pendulum-v1"):
+        searches.curriculum_of("Pendulum-v1", "linear", 60)
     config = experiment.config_of("linear", 2, experiment.EXPERIMENT.presets["paper"])
     assert (
         config.mode == "sequential" and config.backend == "generalized" and config.init == "random"
