@@ -5,11 +5,11 @@
 First the choice: the family of known drifts and the zoo's learned ones train agents on Pendulum-v1,
 and in regimes of the Pendulum bandit that differ from the default in one thing each (reward noise,
 contexts, iterations, epochs, minibatches, learning rate). The same with a small last layer of the
-policy, on both sides. Then the confirmation, on seeds that chose nothing: the correlation of a few
-regimes with the outcome on other environments, and on Pendulum for objectives that are not in the
-family. `--adversaries FILES` adds objectives that evolution found to the family; those of `--held-out
-FILES` confirm alone. Regimes that --out holds already are kept, so the same command continues an
-interrupted one.
+policy, on both sides. `--adversaries FILES` adds objectives that evolution found. Then the
+confirmation, on seeds that chose nothing: the correlation of a few regimes with the outcome on other
+environments, and on Pendulum for objectives that are not in the family, closed forms and the learned
+ones of `--held-out FILES`. Regimes that --out holds already are kept, so the same command continues
+an interrupted one.
 """
 
 import argparse
@@ -163,7 +163,13 @@ def main() -> int:
     configure_jax()
 
     from lpo import figures
-    from lpo.alignment import Regime, forget_programs, known_drifts, measure_alignment
+    from lpo.alignment import (
+        Regime,
+        forget_programs,
+        known_drifts,
+        measure_alignment,
+        other_drifts,
+    )
     from lpo.objectives import Objective, load_objective, zoo_names
     from scb import plotting
     from scb.runs import write_json
@@ -223,8 +229,8 @@ def main() -> int:
     role = "the choice, last layer of the policy times 0.01"
     stage("pendulum_small_last_layer", "Pendulum-v1", role, small, FIRST_SEED, scale=0.01)
     of_pendulum = [Regime(PENDULUM, **variation) for variation in CONFIRMED]
-    if arguments.held_out:
-        held_out = [named(path) for path in arguments.held_out]
+    if not arguments.skip_confirmation:
+        held_out = [*other_drifts(), *map(named, arguments.held_out)]
         role = "the confirmation, objectives that are not in the family"
         stage(HELD_OUT, "Pendulum-v1", role, of_pendulum, CONFIRMATION_SEED, held_out)
     for environment, steps in CONFIRMATIONS.items():

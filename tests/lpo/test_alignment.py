@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from lpo.alignment import (
     correlation_text,
     known_drifts,
     measure_alignment,
+    other_drifts,
     regime_fitness,
 )
 from lpo.generalization import training_setting
@@ -113,6 +115,14 @@ def test_the_family_is_ppo_dpo_and_none_each_with_its_own_parameters():
     assert charge("ppo-0.2") == pytest.approx(np.exp(0.5) - 1.2, rel=1e-5)
     assert charge("ppo-1") == charge("none") == 0.0
     assert charge("dpo (1, 0.3)") > charge("dpo (4, 1.2)") > 0.0
+
+
+def test_what_confirms_the_choice_did_not_choose():
+    def parameters(objectives):
+        return {tuple(map(float, jax.tree.leaves(o.parameters))) for o in objectives}
+
+    assert len(parameters(other_drifts())) == len(other_drifts()) == 12
+    assert not parameters(other_drifts()) & parameters(known_drifts())
 
 
 def test_agents_of_a_regime_are_judged_in_every_way():
