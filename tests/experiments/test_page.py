@@ -122,3 +122,20 @@ def test_a_report_of_another_plan_is_not_continued(tmp_path, capsys):
 def test_returns_that_are_no_number_count_as_a_random_policy():
     assert page.finite([1.234, float("nan"), float("inf")], -7.0) == ([1.23, -7.0, -7.0], 2)
     assert page.span([3, 3]) == "3" and page.span([30, 60, 30]) == "30 to 60"
+
+
+MEASURED = [name for name in everything.found() if (page.DATA / f"{name}.json").exists()]
+
+
+@pytest.mark.parametrize("name", MEASURED)
+def test_the_committed_page_is_that_of_the_committed_report(name):
+    experiment = everything.found()[name]
+    report = page.read(page.DATA / f"{name}.json")
+    plan = json.loads(json.dumps(experiment.presets[report["preset"]]))
+    assert page.complete(report) and report.get("plan", plan) == plan
+    assert (page.DOCS / f"{name}.md").read_text() == page.page(experiment, report)
+
+
+def test_the_committed_overview_is_that_of_the_committed_reports():
+    experiments = list(everything.found().values())
+    assert (page.DOCS / "experiments.md").read_text() == everything.overview(experiments, page.DATA)
