@@ -1,12 +1,13 @@
 """What makes an objective carry over from a bandit: every lever of the meta-training, one at a time.
 
-    python -m experiments.transfer_study --out docs/data/transfer_study.json
+    python -m experiments.transfer_study
 
 Each variation changes one setting of `lpo meta-train`, learns an objective with it, and trains PPO
 with what it learned: on Pendulum, with Flax's initialisation of the policy and with a small last layer,
 and on Hopper, which no choice ever looked at. Searches are run folders under --runs and are resumed;
 what --out holds already is not measured again, so the same command continues an interrupted study.
-`--variations` names some of them; `--only-render` makes page and figure from --out.
+`--variations` names some of them, and `--meta-seeds` further searches of these; `--only-render` makes
+page and figure from --out.
 """
 
 import argparse
@@ -50,6 +51,7 @@ VARIATIONS: dict[str, dict[str, Any]] = {
     "stopped by validation": {"validate": True},
 }
 REFERENCES = ("ppo", "ppo-1", "dpo")
+NO_SEARCH = "no search"  # stands for the meta-seed of a reference
 
 
 @dataclass(frozen=True)
@@ -89,7 +91,11 @@ def settings_of(
 
 
 def summary(report: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """One row an objective: per evaluation the estimate, and the paired difference to the default's."""
+    """One row an objective: per evaluation the estimate, and the paired difference to the default's.
+
+    A difference is over the searches of one seed in both; a reference, which has one set of agents and
+    no search, stands against each search of the default.
+    """
     from scb.statistics import estimate, paired_difference
 
     rows = []
@@ -97,16 +103,17 @@ def summary(report: Mapping[str, Any]) -> list[dict[str, Any]]:
     for name, entry in report["objectives"].items():
         row: dict[str, Any] = {"name": name, "seconds": entry.get("seconds")}
         for evaluation, returns in entry["returns"].items():
-            row[evaluation] = estimate(np.concatenate(returns))
-            # The reference has one set of agents, a variation one for each of its searches.
-            if (
-                evaluation in default
-                and name != "default"
-                and len(returns) == len(default[evaluation])
-            ):
-                row[f"{evaluation}, difference"] = paired_difference(
-                    np.concatenate(returns), np.concatenate(default[evaluation])
-                )
+            row["searches"] = 0 if name in REFERENCES else len(returns)
+            row[evaluation] = estimate(np.concatenate(list(returns.values())))
+            of_default = default.get(evaluation, {})
+            pairs = [
+                (returns[NO_SEARCH] if name in REFERENCES else returns[seed], of_default[seed])
+                for seed in of_default
+                if name in REFERENCES or seed in returns
+            ]
+            if pairs and name != "default":
+                own, others = map(np.concatenate, zip(*pairs, strict=True))
+                row[f"{evaluation}, difference"] = paired_difference(own, others)
         rows.append(row)
     return rows
 
@@ -118,19 +125,19 @@ def markdown(report: Mapping[str, Any]) -> str:
     lines = [
         "# What makes an objective carry over from a bandit",
         "",
-        "`python -m experiments.transfer_study --out docs/data/transfer_study.json`",
+        "`python -m experiments.transfer_study`, then with `--variations` and `--meta-seeds` for more searches",
         "",
         f"Each row is learned on a bandit by {searches['generations']} generations of "
-        f"{searches['population_size']} candidates, {len(searches['seeds'])} "
-        f"{'search' if len(searches['seeds']) == 1 else 'searches'}; it differs from the default in what its name "
-        "says. Then PPO is trained with it. Final return with the most likely actions, interquartile mean over "
-        "agents and 95 % bootstrap interval; in round brackets the paired difference to the default where its "
-        "interval excludes zero.",
+        f"{searches['population_size']} candidates, as many times as the column of searches says; it differs from "
+        "the default in what its name says. Then PPO is trained with it. Final return with the most likely actions, "
+        "interquartile mean over agents and 95 % bootstrap interval; in round brackets the paired difference to the "
+        "default's searches of the same seeds where its interval excludes zero. Intervals are over agents: how much "
+        "another search would differ, only the rows of several searches say.",
         "",
         "![Final returns by variation](figures/transfer_study.png)",
         "",
-        "| objective | " + " | ".join(evaluations) + " | minutes |",
-        "| --- |" + " --- |" * (len(evaluations) + 1),
+        "| objective | " + " | ".join(evaluations) + " | searches | minutes |",
+        "| --- |" + " --- |" * (len(evaluations) + 2),
     ]
     for row in summary(report):
         cells = []
@@ -142,7 +149,8 @@ def markdown(report: Mapping[str, Any]) -> str:
                 cell += f" ({sign}{abs(difference.value):.0f})"
             cells.append(cell)
         minutes = "" if row["seconds"] is None else f"{row['seconds'] / 60:.1f}"
-        lines.append(f"| {row['name']} | {' | '.join(cells)} | {minutes} |")
+        searched = str(row["searches"] or "")
+        lines.append(f"| {row['name']} | {' | '.join(cells)} | {searched} | {minutes} |")
     described = [
         f"{e['name']}: {e['seeds']} agents a search, seeds from {e['first_seed']}"
         + (f", {e['steps']} steps" if e["steps"] else "")
@@ -190,7 +198,8 @@ def draw(report: Mapping[str, Any]) -> "Figure":
                 color = {"default": VERMILLION}.get(
                     row["name"], BLUE if row["name"] in REFERENCES else GREY
                 )
-                agents = np.concatenate(report["objectives"][row["name"]]["returns"][evaluation])
+                returns = report["objectives"][row["name"]]["returns"][evaluation]
+                agents = np.concatenate(list(returns.values()))
                 estimate_row(axes, position, agents, row[evaluation], color)
             axes.set_title(evaluation)
             axes.set_xlabel("final return")
@@ -217,7 +226,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     searches = {
         "generations": arguments.generations,
         "population_size": arguments.population_size,
-        "seeds": arguments.meta_seeds,
     }
     report: dict[str, Any] = {}
     if arguments.out.exists():
@@ -255,10 +263,10 @@ def _measure(
     entries = report.setdefault("objectives", {})
     arguments.out.parent.mkdir(parents=True, exist_ok=True)
 
-    def judge(name: str, evaluation: Evaluation, objectives: Sequence[Any]) -> None:
+    def judge(name: str, evaluation: Evaluation, objectives: Mapping[str, Any]) -> None:
         comparison = compare(
             evaluation.environment,
-            objectives,
+            list(objectives.values()),
             evaluation.seed_list(),
             setting=training_setting(
                 evaluation.environment, evaluation.steps, evaluation.policy_output_scale
@@ -266,20 +274,25 @@ def _measure(
             backend=evaluation.backend,
             points=1,
         )
-        returns = [np.round(c.final, 2).tolist() for c in comparison.curves]
-        entries[name].setdefault("returns", {})[evaluation.name] = returns
+        returns = entries[name].setdefault("returns", {}).setdefault(evaluation.name, {})
+        for seed, curves in zip(objectives, comparison.curves, strict=True):
+            returns[seed] = np.round(curves.final, 2).tolist()
+            print(f"{name} | {evaluation.name} | {seed} | {estimate(curves.final)}", flush=True)
         write_json(arguments.out, report)
-        print(f"{name} | {evaluation.name} | {estimate(np.concatenate(returns))}", flush=True)
 
     for name in (*REFERENCES, *arguments.variations):
         entry = entries.setdefault(name, {})
         if name in REFERENCES:
-            objectives = [load_objective(name)]
+            objectives = {NO_SEARCH: load_objective(name)}
         else:
-            objectives = [_learn(arguments, name, seed, entry) for seed in arguments.meta_seeds]
+            objectives = {
+                str(seed): _learn(arguments, name, seed, entry) for seed in arguments.meta_seeds
+            }
         for evaluation in EVALUATIONS:
-            if evaluation.name not in entry.get("returns", {}):
-                judge(name, evaluation, objectives)
+            known = entry.get("returns", {}).get(evaluation.name, {})
+            missing = {seed: x for seed, x in objectives.items() if seed not in known}
+            if missing:
+                judge(name, evaluation, missing)
 
 
 def _learn(arguments: argparse.Namespace, name: str, seed: int, entry: dict[str, Any]) -> Any:
