@@ -118,6 +118,36 @@ def summary(report: Mapping[str, Any]) -> list[dict[str, Any]]:
     return rows
 
 
+def findings(report: Mapping[str, Any]) -> str:
+    """Which variations are clearly better or worse than the default, where; "clearly" is an interval without zero."""
+
+    def differing(row: Mapping[str, Any], sign: int) -> list[str]:
+        found = {e["name"]: row.get(f"{e['name']}, difference") for e in report["evaluations"]}
+        return [
+            name
+            for name, x in found.items()
+            if x is not None and (x.low > 0 if sign > 0 else x.high < 0)
+        ]
+
+    rows = [row for row in summary(report) if row["searches"] and row["name"] != "default"]
+    found = {row["name"]: (differing(row, 1), differing(row, -1)) for row in rows}
+    parts = {
+        "Clearly worse than the default somewhere, and nowhere clearly better": [
+            name for name, (better, worse) in found.items() if worse and not better
+        ],
+        "Clearly better somewhere, and nowhere clearly worse": [
+            name for name, (better, worse) in found.items() if better and not worse
+        ],
+        "Clearly better in one place and worse in another": [
+            f"{name} (better: {', '.join(better)}; worse: {', '.join(worse)})"
+            for name, (better, worse) in found.items()
+            if better and worse
+        ],
+        "Not clearly apart from it": [name for name, x in found.items() if x == ([], [])],
+    }
+    return " ".join(f"{said}: {'; '.join(names) or 'none'}." for said, names in parts.items())
+
+
 def markdown(report: Mapping[str, Any]) -> str:
     """The page with the table."""
     evaluations = [e["name"] for e in report["evaluations"]]
@@ -133,6 +163,8 @@ def markdown(report: Mapping[str, Any]) -> str:
         "interquartile mean over agents and 95 % bootstrap interval; in round brackets the paired difference to the "
         "default's searches of the same seeds where its interval excludes zero. Intervals are over agents: how much "
         "another search would differ, only the rows of several searches say.",
+        "",
+        findings(report),
         "",
         "![Final returns by variation](figures/transfer_study.png)",
         "",

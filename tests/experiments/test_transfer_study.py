@@ -63,6 +63,10 @@ def test_the_page_says_returns_and_differences_that_exclude_zero(report, tmp_pat
     assert reference["Pendulum, difference"].value == pytest.approx(-290.0)
     assert reference["searches"] == 0
     assert "- no reward noise: `lpo meta-train --reward-noise=0.0`" in page
+    assert "nowhere clearly better: no reward noise." in page
+    assert "nowhere clearly worse: none." in page
+    report["objectives"]["no reward noise"]["returns"]["Pendulum"] = {"0": [0.0, 1.0, 2.0, 3.0]}
+    assert "no reward noise (better: Pendulum; worse: Pendulum, small" in module.findings(report)
     path = plotting.save(module.draw(report), tmp_path / "figure.png")
     assert path.stat().st_size > 20_000
 
