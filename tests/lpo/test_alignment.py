@@ -125,6 +125,7 @@ def test_what_confirms_the_choice_did_not_choose():
     assert not parameters(other_drifts()) & parameters(known_drifts())
 
 
+@pytest.mark.slow
 def test_agents_of_a_regime_are_judged_in_every_way():
     ppo = known_drifts()[2]
     dpo = known_drifts()[-1]

@@ -92,6 +92,7 @@ def test_fitness_transfer_is_the_return_in_the_evaluation_environment(config):
     assert WORST_PENDULUM_RETURN < min(values) <= max(values) < -100
 
 
+@pytest.mark.slow
 def test_the_same_code_trains_on_the_environment_itself(config):
     # Two epochs: at the first update of a batch the ratio is 1, where all drifts are alike and all
     # candidates tie.

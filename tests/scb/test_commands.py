@@ -265,6 +265,7 @@ def test_a_file_gives_the_lists_to_draw_from(asked_for, tmp_path):
     assert sorted(drawn.learning_rate.tolist()) == [0.25, 1.0]
 
 
+@pytest.mark.slow
 def test_a_synthetic_mdp_is_discovered_and_its_command_asks_for_the_same_again(tmp_path, asked_for):
     flags = ["--parameterization", "T", "--max-steps", "3", "--mode", "sequential"]
     flags += ["--algorithms", "ppo,dqn,ppo", "--curriculum", "linear:2:4:0:2", "--mode-actions"]

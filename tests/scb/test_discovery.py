@@ -192,6 +192,7 @@ def test_judging_takes_new_agents_for_another_seed(discovered):
         assert (returns != c[actions]).any() and len(set(returns)) > 1
 
 
+@pytest.mark.slow
 def test_judging_trains_once_and_evaluates_twice(discovered, monkeypatch):
     problem, outcome = discovered
     bandit, inner = problem.bandit, problem.trainings["ppo"].inner
@@ -282,6 +283,7 @@ def trained_in_turns(tmp_path_factory):
     return run.folder, *discover(SEQUENTIAL, run, quiet=True)
 
 
+@pytest.mark.slow
 def test_in_the_mode_sequential_a_generation_trains_the_algorithm_whose_turn_it_is(
     trained_in_turns,
 ):
@@ -370,6 +372,7 @@ def test_an_empty_list_stands_for_the_papers_algorithms(environment):
 # ----------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_curriculum_is_one_program_whose_horizon_is_traced():
     # CartPole pays 1 a step and no pole falls within 3 steps, so a return is the horizon: linear
     # from 1 to 3 within 2 generations.
