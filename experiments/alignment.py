@@ -71,25 +71,30 @@ def recommendation(report: dict[str, Any]) -> str:
             else f", and {better} {'regime is' if better == 1 else 'regimes are'} above it."
         )
     )
-    confirmed = []
+    confirmed, carried = [], []
     for name, stage in report["stages"].items():
-        of_own_bandit = {
-            row["reward_noise"]: row["alignment"][FITNESS]["spearman"] or 0.0
+        if name in CHOICES:
+            continue
+        of_regime = {
+            (row["bandit"], row["reward_noise"]): row["alignment"][FITNESS]["spearman"] or 0.0
             for row in stage["regimes"]
-            if stage["environment"] in row["bandit"]
         }
-        if name not in CHOICES:
-            confirmed.append(
-                f"{name} {of_own_bandit[Regime().reward_noise]:.2f} (without noise {of_own_bandit[0.0]:.2f})"
-            )
+        own, noise = f"Synthetic-{stage['environment']}", Regime().reward_noise
+        confirmed.append(
+            f"{name} {of_regime[own, noise]:.2f} (without noise {of_regime[own, 0.0]:.2f})"
+        )
+        if own != PENDULUM:
+            carried.append(f"{name} {of_regime[PENDULUM, noise]:.2f}")
     if confirmed:
-        said += f" Where nothing was chosen, the default of the environment's own bandit has: {', '.join(confirmed)}."
+        said += f" Where nothing was chosen, the default on the environment's own bandit has: {', '.join(confirmed)}."
+    if carried:
+        said += f" On Pendulum's bandit: {', '.join(carried)}."
     return said.replace(" -", " \u2212")
 
 
 def markdown(report: dict[str, Any]) -> str:
     """The page with the tables."""
-    from lpo.alignment import FITNESSES, correlation_text
+    from lpo.alignment import FITNESSES, correlation_text, regime_label
 
     lines = [
         "# Which bandit regime ranks objectives as the environment does",
@@ -123,7 +128,7 @@ def markdown(report: dict[str, Any]) -> str:
             "| regime | " + " | ".join(FITNESSES) + " |",
             "| --- |" + " --- |" * len(FITNESSES),
             *(
-                f"| {row['name']} | "
+                f"| {regime_label(row, stage['environment'])} | "
                 + " | ".join(
                     correlation_text(row["alignment"][f]).replace("-", "\u2212") for f in FITNESSES
                 )

@@ -16,6 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, MaxNLocator, NullFormatter
 from numpy.typing import NDArray
 
+from lpo.alignment import regime_label
 from scb.errors import UserError
 from scb.plotting import (
     BLACK,
@@ -336,6 +337,7 @@ def alignment_heatmap(report: Mapping[str, Any]) -> Figure:
     """
     rows = report["regimes"]
     fitnesses = list(rows[0]["alignment"])
+    labels = [regime_label(row, report["environment"]) for row in rows]
     values = np.array(
         [
             [
@@ -351,7 +353,7 @@ def alignment_heatmap(report: Mapping[str, Any]) -> Figure:
         image = axes.imshow(values, cmap="RdBu", vmin=-1.0, vmax=1.0, aspect="auto")
         # Long names are broken, or they would take the room of the map.
         axes.set_xticks(range(len(fitnesses)), [textwrap.fill(name, 15) for name in fitnesses])
-        axes.set_yticks(range(len(rows)), [textwrap.fill(row["name"], 34) for row in rows])
+        axes.set_yticks(range(len(rows)), [textwrap.fill(name, 34) for name in labels])
         axes.grid(visible=False)
         axes.tick_params(length=0)
         for i, row in enumerate(rows):
@@ -368,7 +370,7 @@ def alignment_heatmap(report: Mapping[str, Any]) -> Figure:
                     color="white" if abs(values[i, j]) > 0.7 else "black",
                 )
         bar = figure.colorbar(image, ax=axes)
-        bar.set_label("Spearman's correlation over objectives")
+        bar.set_label("Spearman's correlation")
         number = len(report["outcome_iqm"])
         figure_title(
             figure,

@@ -25,11 +25,12 @@ def test_the_recommendation_is_the_best_over_both_initialisations():
     }
     said = alignment.recommendation(report)
     assert "the best of 3 regimes is *default* with 0.85; the default has 0.85, the best." in said
-    report["stages"]["CartPole-v1"] = stage(
-        "CartPole-v1", {"default": -0.3, "reward noise 0.0": 0.1}, "Synthetic-CartPole-v1"
-    )
+    own = stage("CartPole-v1", {"default": -0.3, "reward noise 0.0": 0.1}, "Synthetic-CartPole-v1")
+    own["regimes"] += stage("CartPole-v1", {"default": 0.6})["regimes"]
+    report["stages"]["CartPole-v1"] = own
     said = alignment.recommendation(report)
-    assert "CartPole-v1 \u22120.30 (without noise 0.10)." in said
+    assert "own bandit has: CartPole-v1 \u22120.30 (without noise 0.10)." in said
+    assert said.endswith("On Pendulum's bandit: CartPole-v1 0.60.")
     report["stages"]["pendulum_small_last_layer"] = stage("Pendulum-v1", small | {"epochs 1": 0.9})
     said = alignment.recommendation(report)
     assert "*epochs 1* with 0.93" in said and "1 regime is above it" in said
