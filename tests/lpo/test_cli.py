@@ -630,7 +630,8 @@ def test_align_measures_every_combination_and_stores_it(monkeypatch, working_fol
         assert {"ppo-0.2", "none", "lpo-pendulum"} <= {o.name for o in objectives}
         assert (environment, seeds) == ("Pendulum-v1", [500, 501])
         cell = {"spearman": 0.5, "low": 0.25, "high": 0.75}
-        rows = [{"name": str(r), "alignment": dict.fromkeys(FITNESSES, cell)} for r in regimes]
+        measured = {"alignment": dict.fromkeys(FITNESSES, cell)}
+        rows = [{"name": str(r), "bandit": r.bandit, **measured} for r in regimes]
         return {
             "environment": environment,
             "agents": 2,
