@@ -419,7 +419,7 @@ EXPERIMENT = Experiment(
             "episodes": 50,
         },
     },
-    minutes={"quick": "40", "paper": "days; for a GPU"},
+    minutes={"quick": "60", "paper": "days; for a GPU"},
     measure=measure,
     verdict=verdict,
     body=body,
