@@ -89,11 +89,8 @@ def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None
                 if str(seed) in curves or seed >= plan["environments"][environment]["seeds"]:
                     continue
                 folder = f"{plan['runs']}/{environment}/{name.replace(' | ', '-')}-{seed}"
-                _, outcome = searches.search(config_of(environment, name, seed, plan), folder)
-                curves[str(seed)] = {
-                    **searches.curve(outcome.metrics),
-                    "seconds": round(outcome.seconds, 1),
-                }
+                config = config_of(environment, name, seed, plan)
+                curves[str(seed)] = searches.searched_curve(config, folder)
                 save()
 
 

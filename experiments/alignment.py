@@ -233,13 +233,12 @@ def main() -> int:
     small = [replace(regime, policy_output_scale=0.01) for regime in variations]
     role = "the choice, last layer of the policy times 0.01"
     stage("pendulum_small_last_layer", "Pendulum-v1", role, small, FIRST_SEED, scale=0.01)
-    of_pendulum = [Regime(PENDULUM, **variation) for variation in CONFIRMED]
     if not arguments.skip_confirmation:
+        regimes = [Regime(PENDULUM, **variation) for variation in CONFIRMED]
         held_out = [*other_drifts(), *map(named, arguments.held_out)]
         role = "the confirmation, objectives that are not in the family"
-        stage(HELD_OUT, "Pendulum-v1", role, of_pendulum, CONFIRMATION_SEED, held_out)
-    for environment, steps in CONFIRMATIONS.items():
-        if not arguments.skip_confirmation:
+        stage(HELD_OUT, "Pendulum-v1", role, regimes, CONFIRMATION_SEED, held_out)
+        for environment, steps in CONFIRMATIONS.items():
             regimes = [Regime(f"Synthetic-{environment}", **variation) for variation in CONFIRMED]
             regimes.append(Regime(PENDULUM))
             forget_programs()

@@ -46,13 +46,9 @@ def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None
         for shape, number in plan["seeds"].items():
             if seed >= number or str(seed) in found[shape]:
                 continue
-            _, outcome = searches.search(
+            found[shape][str(seed)] = searches.searched_curve(
                 config_of(shape, seed, plan), f"{plan['runs']}/{shape}-{seed}"
             )
-            found[shape][str(seed)] = {
-                **searches.curve(outcome.metrics),
-                "seconds": round(outcome.seconds, 1),
-            }
             save()
 
 

@@ -15,6 +15,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from experiments.page import exit_status
 from experiments.zoo_table import ENVIRONMENTS, TARGETS, label, read_report
 from lpo.cli import configure_jax
 
@@ -397,19 +398,16 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = parser.parse_args(argv)
     configure_jax()
 
-    from scb.errors import UserError
-
-    try:
+    def collect_and_render() -> int:
         if not arguments.only_render:
             report = collect(arguments.folders)
             write_report(arguments.out, report)
             for left in report["left_out"]:
                 print(f"left out: {left['name']}, since {left['why']}")
         render(read_report(arguments.out), arguments.docs)
-    except UserError as error:
-        print(f"discovery_cost: {error}", file=sys.stderr)
-        return 2
-    return 0
+        return 0
+
+    return exit_status("discovery_cost", collect_and_render)
 
 
 if __name__ == "__main__":

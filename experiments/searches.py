@@ -99,6 +99,12 @@ def search(config: "DiscoveryConfig", folder: str | Path) -> "tuple[BanditDiscov
         run.close()
 
 
+def searched_curve(config: "DiscoveryConfig", folder: str | Path) -> dict[str, Any]:
+    """`curve` of a search, and its "seconds"; searched first where that has not ended yet."""
+    _, outcome = search(config, folder)
+    return {**curve(outcome.metrics), "seconds": round(outcome.seconds, 1)}
+
+
 def curve(metrics: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]:
     """What a search distribution's mean was worth over the generations, from a run's log.
 

@@ -17,6 +17,8 @@ from experiments.page import main as run
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from scb.environments.synthetic import SyntheticBandit
+
 POINTS = 50  # of the grid of best actions, in either direction
 CELLS = 20  # of the grid whose share of visited cells is the coverage
 STATES = 2000
@@ -65,8 +67,8 @@ def _examine(environment: str, plan: Mapping[str, Any]) -> dict[str, Any]:
     )
     _, _, nodes = plane.grid(POINTS)
 
-    def best(reward: Any) -> list[str]:
-        actions = jax.jit(jax.vmap(optimal_actions(reward, method="grid")))(jnp.asarray(nodes))
+    def best(rewarding: "SyntheticBandit") -> list[str]:
+        actions = jax.jit(jax.vmap(optimal_actions(rewarding, method="grid")))(jnp.asarray(nodes))
         # A map has one number a node: of several action dimensions the first.
         firsts = np.asarray(actions).reshape(POINTS * POINTS, -1)[:, 0]
         return packed(firsts.reshape(POINTS, POINTS))

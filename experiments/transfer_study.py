@@ -103,34 +103,36 @@ def summary(report: Mapping[str, Any]) -> list[dict[str, Any]]:
     for name, entry in report["objectives"].items():
         row: dict[str, Any] = {"name": name, "seconds": entry.get("seconds")}
         for evaluation, returns in entry["returns"].items():
+            of_default = default.get(evaluation, {})
+            own = dict.fromkeys(of_default, returns[NO_SEARCH]) if name in REFERENCES else returns
+            seeds = [seed for seed in of_default if seed in own]
             row["searches"] = 0 if name in REFERENCES else len(returns)
             row[evaluation] = estimate(np.concatenate(list(returns.values())))
-            of_default = default.get(evaluation, {})
-            pairs = [
-                (returns[NO_SEARCH] if name in REFERENCES else returns[seed], of_default[seed])
-                for seed in of_default
-                if name in REFERENCES or seed in returns
-            ]
-            if pairs and name != "default":
-                own, others = map(np.concatenate, zip(*pairs, strict=True))
-                row[f"{evaluation}, difference"] = paired_difference(own, others)
+            if seeds and name != "default":
+                row[f"{evaluation}, difference"] = paired_difference(
+                    np.concatenate([own[seed] for seed in seeds]),
+                    np.concatenate([of_default[seed] for seed in seeds]),
+                )
         rows.append(row)
     return rows
 
 
-def findings(report: Mapping[str, Any]) -> str:
-    """Which variations are clearly better or worse than the default, where; "clearly" is an interval without zero."""
+def findings(rows: Sequence[Mapping[str, Any]], evaluations: Sequence[str]) -> str:
+    """Which variations of a `summary` are clearly better or worse than the default: an interval without zero."""
 
     def differing(row: Mapping[str, Any], sign: int) -> list[str]:
-        found = {e["name"]: row.get(f"{e['name']}, difference") for e in report["evaluations"]}
+        found = {name: row.get(f"{name}, difference") for name in evaluations}
         return [
             name
             for name, x in found.items()
             if x is not None and (x.low > 0 if sign > 0 else x.high < 0)
         ]
 
-    rows = [row for row in summary(report) if row["searches"] and row["name"] != "default"]
-    found = {row["name"]: (differing(row, 1), differing(row, -1)) for row in rows}
+    found = {
+        row["name"]: (differing(row, 1), differing(row, -1))
+        for row in rows
+        if row["searches"] and row["name"] != "default"
+    }
     parts = {
         "Clearly worse than the default somewhere, and nowhere clearly better": [
             name for name, (better, worse) in found.items() if worse and not better
@@ -151,7 +153,7 @@ def findings(report: Mapping[str, Any]) -> str:
 def markdown(report: Mapping[str, Any]) -> str:
     """The page with the table."""
     evaluations = [e["name"] for e in report["evaluations"]]
-    searches = report["searches"]
+    searches, rows = report["searches"], summary(report)
     lines = [
         "# What makes an objective carry over from a bandit",
         "",
@@ -164,14 +166,14 @@ def markdown(report: Mapping[str, Any]) -> str:
         "default's searches of the same seeds where its interval excludes zero. Intervals are over agents: how much "
         "another search would differ, only the rows of several searches say.",
         "",
-        findings(report),
+        findings(rows, evaluations),
         "",
         "![Final returns by variation](figures/transfer_study.png)",
         "",
         "| objective | " + " | ".join(evaluations) + " | searches | minutes |",
         "| --- |" + " --- |" * (len(evaluations) + 2),
     ]
-    for row in summary(report):
+    for row in rows:
         cells = []
         for evaluation in evaluations:
             cell = text(row[evaluation]) if evaluation in row else ""

@@ -22,6 +22,7 @@ from typing import Any
 
 import numpy as np
 
+from experiments.page import exit_status
 from lpo.cli import configure_jax
 
 PROGRESS = (0.0, 0.5, 1.0)
@@ -281,11 +282,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     from lpo.objectives import load_objective, zoo_names
     from scb import plotting
     from scb.artefacts import package_versions
-    from scb.errors import UserError
     from scb.runs import write_json
 
     out = arguments.docs / "data" / "understanding.json"
-    try:
+
+    def measure_and_render() -> int:
         kept = json.loads(out.read_text()) if out.exists() else {}
         names = arguments.objectives or ["ppo", "dpo", *zoo_names()]
         comparisons = arguments.comparisons
@@ -305,15 +306,14 @@ def main(argv: Sequence[str] | None = None) -> int:
         figure = drift_figures.drift_and_gradient(
             [load_objective(name) for name in names], PROGRESS
         )
-    except UserError as error:
-        print(f"understanding: {error}", file=sys.stderr)
-        return 2
-    out.parent.mkdir(parents=True, exist_ok=True)
-    write_json(out, report)
-    (arguments.docs / "understanding.md").write_text(markdown(report))
-    # Half the usual resolution: it is a tall figure of smooth maps, which compress badly.
-    plotting.save(figure, arguments.docs / "figures" / "understanding.png", dpi=100)
-    return 0
+        out.parent.mkdir(parents=True, exist_ok=True)
+        write_json(out, report)
+        (arguments.docs / "understanding.md").write_text(markdown(report))
+        # Half the usual resolution: it is a tall figure of smooth maps, which compress badly.
+        plotting.save(figure, arguments.docs / "figures" / "understanding.png", dpi=100)
+        return 0
+
+    return exit_status("understanding", measure_and_render)
 
 
 if __name__ == "__main__":

@@ -27,6 +27,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from experiments.page import exit_status
 from lpo.cli import configure_jax
 
 if TYPE_CHECKING:
@@ -642,9 +643,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     configure_jax()
 
     from scb.artefacts import machine_description, package_versions
-    from scb.errors import UserError
 
-    try:
+    def measure_and_render() -> int:
         if not arguments.only_render:
             published = arguments.published
             if published is None and DEFAULT_PUBLISHED.is_dir():
@@ -673,10 +673,9 @@ def main(argv: Sequence[str] | None = None) -> int:
             found = candidates(arguments.bandits, published, arguments.skip_brax)
             measure(found, protocol, report, arguments.out)
         render(read_report(arguments.out), arguments.docs)
-    except UserError as error:
-        print(f"zoo_table: {error}", file=sys.stderr)
-        return 2
-    return 0
+        return 0
+
+    return exit_status("zoo_table", measure_and_render)
 
 
 if __name__ == "__main__":

@@ -112,28 +112,29 @@ def known_drifts() -> list[Objective]:
     """Clips from 0.05 to 1, no drift, and DPO over alpha and beta: a family that spans the scale."""
     none = NoDrift()
     return [
-        *closed_forms((0.05, 0.1, 0.2, 0.3, 0.5, 1.0), ()),
+        *_clips(0.05, 0.1, 0.2, 0.3, 0.5, 1.0),
         Objective("none", none, none.init(jax.random.key(0))),
-        *closed_forms((), ((1.0, 0.3), (2.0, 0.6), (4.0, 1.2))),
+        *_dpo((1.0, 0.3), (2.0, 0.6), (4.0, 1.2)),
     ]
 
 
 def other_drifts() -> list[Objective]:
     """Closed forms that are not among `known_drifts` and span the scale as well: to confirm what those chose."""
     between = ((0.5, 0.15), (1.0, 0.6), (2.0, 0.3), (2.0, 1.2), (4.0, 0.6), (8.0, 2.4))
-    return closed_forms((0.03, 0.07, 0.15, 0.25, 0.4, 0.7), between)
+    return [*_clips(0.03, 0.07, 0.15, 0.25, 0.4, 0.7), *_dpo(*between)]
 
 
-def closed_forms(clips: Sequence[float], dpo: Sequence[tuple[float, float]]) -> list[Objective]:
-    """PPO with these clips, and DPO with these (alpha, beta)."""
+# Objectives of one drift with other parameters share a program.
+def _clips(*clips: float) -> list[Objective]:
     key = jax.random.key(0)
-    # Objectives of one drift with other parameters share a program.
+    return [Objective(f"ppo-{clip:g}", ClipDrift(), ClipDrift(clip).init(key)) for clip in clips]
+
+
+def _dpo(*parameters: tuple[float, float]) -> list[Objective]:
+    key = jax.random.key(0)
     return [
-        *(Objective(f"ppo-{clip:g}", ClipDrift(), ClipDrift(clip).init(key)) for clip in clips),
-        *(
-            Objective(f"dpo ({alpha:g}, {beta:g})", DPODrift(), DPODrift(alpha, beta).init(key))
-            for alpha, beta in dpo
-        ),
+        Objective(f"dpo ({alpha:g}, {beta:g})", DPODrift(), DPODrift(alpha, beta).init(key))
+        for alpha, beta in parameters
     ]
 
 

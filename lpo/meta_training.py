@@ -275,7 +275,7 @@ class TaskTraining:
             points = self.agent_config.num_iterations // self.area_every + 1
         agents = config.agents_per_candidate
         share = sum(config.horizons) / len(config.horizons) if config.horizons else 1.0
-        training = self.agent_config.num_iterations * self.agent_config.batch_size
+        training = self.agent_config.num_environment_steps
         return EnvironmentSteps(
             training=round(agents * training * share),
             evaluation=agents

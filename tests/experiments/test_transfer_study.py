@@ -66,7 +66,8 @@ def test_the_page_says_returns_and_differences_that_exclude_zero(report, tmp_pat
     assert "nowhere clearly better: no reward noise." in page
     assert "nowhere clearly worse: none." in page
     report["objectives"]["no reward noise"]["returns"]["Pendulum"] = {"0": [0.0, 1.0, 2.0, 3.0]}
-    assert "no reward noise (better: Pendulum; worse: Pendulum, small" in module.findings(report)
+    said = module.findings(module.summary(report), [e.name for e in module.EVALUATIONS])
+    assert "no reward noise (better: Pendulum; worse: Pendulum, small" in said
     path = plotting.save(module.draw(report), tmp_path / "figure.png")
     assert path.stat().st_size > 20_000
 
