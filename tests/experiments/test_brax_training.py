@@ -19,6 +19,7 @@ def report():
     plan = {**experiment.EXPERIMENT.presets["quick"], "bandit_algorithms": ["ppo", "sac"]}
     return {
         "plan": plan,
+        "left_out": [],
         "bandits": {name: {"ppo": in_bandit, "sac": in_bandit} for name in NAMES},
         "environments": {"hopper (spring)": {"ppo": fast}, "hopper (generalized)": {"ppo": slow}},
     }
@@ -54,6 +55,9 @@ def test_the_verdict_follows_the_figures(report):
 def test_the_page_and_the_figure_show_bandits_environments_and_the_paper(report):
     lines = experiment.body(report)
     assert any("| 854 | 2522 |" in line for line in lines)  # the paper's PPO on Hopper
+    assert "Left out" not in lines[0]
+    report["left_out"] = ["walker2d (generalized), published"]
+    assert "that holds them: walker2d (generalized), published." in experiment.body(report)[0]
     figure = experiment.draw(report)
     assert len(figure.axes) == 4
     ppo, sac = figure.axes[:2]
@@ -85,10 +89,14 @@ def test_agents_are_followed_in_a_bandit_and_in_an_environment():
     assert len(saved) == 2
 
 
-def test_without_the_published_bandits_it_says_what_to_do(monkeypatch, tmp_path):
-    from scb.errors import UserError
-
+def test_without_the_published_bandits_ours_are_measured_alone(monkeypatch, tmp_path):
     monkeypatch.setenv("SCB_PUBLISHED", str(tmp_path / "nowhere"))
-    plan = {"bandits": [[PUBLISHED, "hopper", "generalized"]], "bandit_algorithms": ["ppo"]}
-    with pytest.raises(UserError, match="set SCB_PUBLISHED"):
-        experiment.measure(plan, {}, lambda: None)
+    plan = {
+        "bandits": [[PUBLISHED, "hopper", "generalized"]],
+        "bandit_algorithms": ["ppo"],
+        "environment_algorithms": ["ppo"],
+    }
+    found = {}
+    experiment.measure(plan, found, lambda: None)
+    assert found["left_out"] == ["hopper (generalized), published"]
+    assert found["bandits"] == found["environments"] == {}
