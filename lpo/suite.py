@@ -15,6 +15,7 @@ from gymnax.environments import environment
 
 from lpo.generalization import Comparison, check_names, compare, training_setting
 from lpo.objectives import Objective
+from scb.agents.settings import MINATAR
 from scb.environments.brax import BRAX_NAMES
 from scb.environments.registry import make
 from scb.errors import UserError, unknown_name
@@ -29,7 +30,7 @@ SUITES: dict[str, tuple[str, ...]] = {
         "MountainCarContinuous-v0",
         "Pendulum-v1",
     ),
-    "minatar": ("Asterix-MinAtar", "Breakout-MinAtar", "Freeway-MinAtar", "SpaceInvaders-MinAtar"),
+    "minatar": MINATAR,
     "brax": (
         "hopper",
         "walker2d",

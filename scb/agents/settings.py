@@ -12,6 +12,14 @@ from scb.agents.td3 import TD3, TD3Config, TD3Hyperparameters, ddpg_config
 from scb.curriculum import with_limit
 from scb.errors import unknown_name
 
+MINATAR = (
+    "Asterix-MinAtar",
+    "Breakout-MinAtar",
+    "Freeway-MinAtar",
+    "Seaquest-MinAtar",
+    "SpaceInvaders-MinAtar",
+)
+
 
 @dataclass(frozen=True)
 class Setting:
@@ -166,6 +174,21 @@ def environment_settings(algorithm: str = "ppo") -> dict[str, Setting]:
             PPOHyperparameters(learning_rate=1e-3, discount=0.995),
             source="a public tuned setting for Pendulum; network and minibatches as in the inner loop",
         )
+        # 400 entries an observation and thousands of steps to a first reward: large batches, few passes.
+        minatar = Setting(
+            PPOConfig(
+                num_envs=64,
+                num_steps=32,
+                num_epochs=4,
+                num_minibatches=8,
+                total_steps=1_000_000,
+                activation="relu",
+                anneal_learning_rate=True,
+            ),
+            PPOHyperparameters(learning_rate=1e-3, max_grad_norm=0.5),
+            source="usual values for games; annealing the learning rate earned a little more on Asterix, two agents",
+        )
+        settings |= dict.fromkeys(MINATAR, minatar)
     if algorithm == "sac":
         settings |= _classic_sac()
     if algorithm not in ("dqn", "ddqn"):

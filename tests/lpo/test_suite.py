@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lpo import commands, figures, suite
-from lpo.generalization import Comparison, LearningCurves
+from lpo.generalization import Comparison, LearningCurves, learning_curves, training_setting
 from lpo.objectives import load_objective
 from lpo.suite import RESAMPLES, SUITES, SuiteScores, random_return, run_suite, suite_scores
 from scb import plotting
@@ -176,3 +176,11 @@ def test_a_suite_and_an_environment_do_not_go_together():
 def test_scores_are_drawn(tmp_path):
     scores = scores_of(np.random.default_rng(0).uniform(0.0, 1.2, (2, 5, 10)))
     assert plotting.save(figures.suite_scores(scores), tmp_path / "x.png").stat().st_size > 10_000
+
+
+@pytest.mark.slow
+def test_minatars_setting_learns_breakout():
+    setting = training_setting("Breakout-MinAtar", 65_536)
+    curves = learning_curves("Breakout-MinAtar", load_objective("ppo"), [3, 4], setting, points=4)
+    assert curves.returns[:, 0].max() < 2.0  # random actions earn half a brick
+    assert curves.final.min() > 3.0
