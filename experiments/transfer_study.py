@@ -44,7 +44,6 @@ VARIATIONS: dict[str, dict[str, Any]] = {
     "no PPO base": {"base": "none"},
     "temporal": {"temporal": True},
     "no gate": {"gate": 0.0},
-    "gate 0.3": {"gate": 0.3},
     "no gate, xi 1e-4": {"gate": 0.0, "xi": 1e-4},
     "small steps": {"sigma": 0.01, "learning_rate": 0.003},
     "large steps": {"sigma": 0.1, "learning_rate": 0.03},

@@ -1,4 +1,9 @@
+import shutil
+from pathlib import Path
+
+import lpo
 from experiments import alignment
+from experiments.page import exit_status
 
 
 def stage(environment, correlations, bandit="Synthetic-Pendulum-v1"):
@@ -38,3 +43,15 @@ def test_the_recommendation_is_the_best_over_both_initialisations():
 
 def test_the_files_of_a_stage_have_no_spaces_in_their_names():
     assert alignment.figure_name(alignment.HELD_OUT) == "alignment_Pendulum-v1_held_out.png"
+
+
+def test_what_is_held_out_is_not_in_the_family_under_another_name(tmp_path, monkeypatch, capsys):
+    zoo = Path(lpo.__file__).parent / "zoo"
+    for suffix in ("npz", "json"):
+        shutil.copy(zoo / f"ta-lpo.{suffix}", tmp_path / f"other.{suffix}")
+    out = tmp_path / "alignment.json"
+    arguments = ["--held-out", str(tmp_path / "other.npz"), "--out", str(out)]
+    monkeypatch.setattr("sys.argv", ["alignment", *arguments])
+    assert exit_status("alignment", alignment.main) == 2
+    assert "the family has it as ta-lpo: leave it out" in capsys.readouterr().err
+    assert not out.exists()
