@@ -228,6 +228,7 @@ def run_suite(
     keep: Callable[[str, Comparison], None] = lambda name, comparison: None,
     steps: int | None = None,
     policy_output_scale: float | None = None,
+    points: int = 5,
     **arguments: Any,
 ) -> tuple[SuiteScores, dict[str, Comparison]]:
     """Trains PPO with every objective in every environment of a suite.
@@ -241,6 +242,8 @@ def run_suite(
       done: comparisons that are there already and are not run again.
       keep: is given every new comparison as it comes.
       steps, policy_output_scale: of every training; each environment's own setting where None.
+      points: about how many evaluations along a training. Only the last one is scored, and with
+        episodes of a thousand steps fifteen take longer than the training itself.
       arguments: further ones of `learning_curves`.
     """
     check_names(objectives)
@@ -261,6 +264,7 @@ def run_suite(
             seeds,
             setting=training_setting(environment_name, steps, policy_output_scale),
             backend=physics,
+            points=points,
             **arguments,
         )
         comparisons[environment_name] = comparison
