@@ -47,7 +47,8 @@ VARIATIONS: dict[str, dict[str, Any]] = {
     "no gate, xi 1e-4": {"gate": 0.0, "xi": 1e-4},
     "small steps": {"sigma": 0.01, "learning_rate": 0.003},
     "large steps": {"sigma": 0.1, "learning_rate": 0.03},
-    "90 contexts": {"contexts": 90},  # a training of 1350 steps: less than a hundredth of Pendulum's
+    # A training of 1350 steps, less than a hundredth of Pendulum's.
+    "90 contexts": {"contexts": 90},
     "stopped by validation": {"validate": True},
 }
 REFERENCES = ("ppo", "ppo-1", "dpo")
