@@ -163,6 +163,7 @@ def test_regimes_that_differ_in_traced_numbers_share_a_program_and_nothing_else(
     np.testing.assert_allclose(again, plain, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_the_report_holds_every_regime_and_is_drawn(monkeypatch, tmp_path):
     fixed = returns(**{"ppo-0.2": 1.0, "none": 2.0, "dpo (2, 0.6)": 3.0})
     family = [objective for objective in known_drifts() if objective.name in fixed]

@@ -254,6 +254,7 @@ def test_tasks_of_other_shapes_learn_one_objective(config):
 # -- validation ----------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_validation_judges_the_mean_on_the_environment_and_the_search_never_sees_it(
     config, monkeypatch
 ):

@@ -49,6 +49,7 @@ def start_of(brax_state) -> tuple[float, ...]:
     return tuple(np.asarray(brax_state.obs).tolist())
 
 
+@pytest.mark.slow
 def test_every_step_is_braxs_own(env, original):
     observation, state = env.reset(jax.random.key(7), env.default_params)
     expected = jax.jit(original.reset)(jax.random.key(7))

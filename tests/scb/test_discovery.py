@@ -267,6 +267,7 @@ def test_in_the_mode_all_every_agent_of_every_algorithm_is_a_task(trained_by_all
         assert judged[0] == pytest.approx((judged[1] + judged[2]) / 2, rel=1e-5)
 
 
+@pytest.mark.slow
 def test_the_first_algorithms_agents_are_the_same_whoever_else_is_trained(trained_by_all):
     problem, outcome = trained_by_all
     alone = BanditDiscovery(CONFIG)
@@ -467,6 +468,7 @@ def test_a_random_start_is_drawn_from_the_key():
     assert (flat(start) != flat(problem.initial_solution(jax.random.key(4)))).any()
 
 
+@pytest.mark.slow
 def test_an_expert_start_is_fitted_once_and_from_the_seed_alone(monkeypatch):
     setting = Setting(TINY, PPOHyperparameters(), source="this test")
     monkeypatch.setattr("scb.warm_start.environment_setting", lambda name, algorithm: setting)

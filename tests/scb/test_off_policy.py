@@ -731,7 +731,13 @@ def critics_and_policy(learner, name):
     return learner.params
 
 
-@each_program
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=pytest.mark.slow if name in ("td3", "discrete sac") else ())
+        for name in PROGRAMS
+    ],
+)
 def test_learning_in_a_one_step_environment_is_learning_from_terminated_steps(name):
     # Twenty gradient steps of both programs on the same batches. Where every step terminates the
     # targets are the rewards, whatever the target networks say. The norm of TD3's gradient has two

@@ -272,6 +272,7 @@ def test_a_ti_of_length_one_is_the_bandit(space, latent, promised):
     chex.assert_trees_all_equal(steps(*one), steps(*other))
 
 
+@pytest.mark.slow
 def test_ppo_learns_in_a_ti_of_length_one_as_in_the_bandit():
     config = PPOConfig(4, 8, 1, 2, total_steps=32, hidden_sizes=(4,))
     hyperparameters = PPOHyperparameters()
