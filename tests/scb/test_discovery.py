@@ -250,6 +250,7 @@ def trained_by_all():
     return discover(ALL, quiet=True)
 
 
+@pytest.mark.slow
 def test_in_the_mode_all_every_agent_of_every_algorithm_is_a_task(trained_by_all):
     problem, outcome = trained_by_all
     evaluate = jax.jit(problem.evaluate)

@@ -662,9 +662,8 @@ def bandit(space, kind=SyntheticBandit, key=3):
     return kind(3, space, config, weights=weights, name="Synthetic-Random")
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param("discrete sac", marks=pytest.mark.slow), "continuous sac"]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["discrete sac", "continuous sac"])
 def test_bandits_of_different_weights_train_together_as_they_do_alone(name):
     case = CASES[name]
     env = bandit(case.space)
