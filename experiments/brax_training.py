@@ -56,7 +56,8 @@ def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None
     """A learning curve at a time: those in bandits, then those in environments."""
     bandits = report.setdefault("bandits", {})
     environments = report.setdefault("environments", {})
-    left_out = [x for x in plan["bandits"] if x[0] == PUBLISHED and published_folder() is None]
+    at_hand = published_folder() is not None
+    left_out = [x for x in plan["bandits"] if x[0] == PUBLISHED and not at_hand]
     report["left_out"] = [task(*x) for x in left_out]
     measured = [x for x in plan["bandits"] if x not in left_out]
     for kind, environment, backend in measured:

@@ -174,7 +174,7 @@ def environment_settings(algorithm: str = "ppo") -> dict[str, Setting]:
             PPOHyperparameters(learning_rate=1e-3, discount=0.995),
             source="a public tuned setting for Pendulum; network and minibatches as in the inner loop",
         )
-        # 400 entries an observation and thousands of steps to a first reward: large batches, few passes.
+        # 400 to 1000 entries an observation and thousands of steps to a first reward: large batches, few passes.
         minatar = Setting(
             PPOConfig(
                 num_envs=64,
