@@ -14,7 +14,8 @@ import argparse
 import json
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -27,6 +28,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+    from lpo.objectives import Objective
+    from scb.agents.settings import Setting
     from scb.statistics import Estimate
 
 SOURCES = ("bandit", "environment")
@@ -55,7 +58,7 @@ PRESETS: dict[str, dict[str, Any]] = {
             # A generation takes forty times as long here: a candidate has one agent, and the search
             # is short.
             "environment": {
-                "seeds": 2,
+                "seeds": 5,
                 "settings": {
                     **_JUDGED,
                     "environment": "Pendulum-v1",
@@ -336,8 +339,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def measure(preset: str, runs: Path, out: Path, report: dict[str, Any]) -> None:
     """Does what the report lacks, and writes it after every part."""
-    from lpo.learning import objective_of_run
-    from lpo.objectives import Objective, load_objective
+    from lpo.generalization import training_setting
     from scb.artefacts import machine_description, package_versions
     from scb.errors import UserError
     from scb.runs import write_json
@@ -350,42 +352,68 @@ def measure(preset: str, runs: Path, out: Path, report: dict[str, Any]) -> None:
         "versions": package_versions(),
         "machine": machine_description(),
     }
-    report.setdefault("searches", {})
-    report.setdefault("evaluations", {})
+    found = report.setdefault("searches", {})
+    evaluations = report.setdefault("evaluations", {})
     out.parent.mkdir(parents=True, exist_ok=True)
-    learned: dict[str, list[Objective]] = {}
+    groups: dict[str, list[_Learned]] = {}
     for source, search in plan["searches"].items():
-        name = f"LPO ({source})"
-        folders = [runs / f"{source}-{seed}" for seed in range(search["seeds"])]
-        learned[name] = [
-            replace(
-                objective_of_run(
-                    {"command": "meta-train", "seed": seed, **search["settings"]}, folder
-                ),
-                name=f"{name} {seed}",
-            )
-            for seed, folder in enumerate(folders)
+        groups[f"LPO ({source})"] = group = [
+            _Learned(source, seed, search["settings"], runs) for seed in range(search["seeds"])
         ]
-        report["searches"][source] = {
-            "settings": search["settings"],
-            "curves": [_curve_of(folder) for folder in folders],
-            "steps_to_judge": learned[name][0].metadata["cost"]["environment_steps_validation"],
-        }
-        write_json(out, report)
-    for label, scale in SCALES.items():
-        name = f"Pendulum, {label}"
-        if name not in report["evaluations"]:
-            report["evaluations"][name] = _on_pendulum(plan, learned, scale)
+        entry = found.setdefault(source, {"settings": search["settings"], "curves": []})
+        if entry["settings"] != search["settings"]:
+            raise UserError(
+                f"{out} was measured when the preset {preset} was another one: choose another --out."
+            )
+        for learned in group[len(entry["curves"]) :]:
+            entry["steps_to_judge"] = learned.objective.metadata["cost"][
+                "environment_steps_validation"
+            ]
+            entry["curves"].append(_curve_of(learned.folder))
             write_json(out, report)
-    hopper = plan["hopper"]
-    name = f"Hopper, {hopper['backend']} physics, {hopper['steps']:,} steps"
-    if name not in report["evaluations"]:
-        objectives = {n: [load_objective(n)] for n in ("ppo", "dpo")}
-        objectives |= {n: group[: hopper["searches"]] for n, group in learned.items()}
-        report["evaluations"][name] = _judge(
-            "hopper", objectives, hopper["agents"], hopper["steps"], 1.0, hopper["backend"]
-        )
+    for label, scale in SCALES.items():
+        table = evaluations.setdefault(f"Pendulum, {label}", {})
+        setting = training_setting("Pendulum-v1", policy_output_scale=scale)
+        if "tuned" not in table:
+            table |= _tuned_clip(setting, plan["tuning_agents"])
+        compared = dict.fromkeys(("ppo", table["tuned"], "dpo"))
+        _judge(table, "Pendulum-v1", [*compared], groups, plan["agents"], setting)
         write_json(out, report)
+    hopper = plan["hopper"]
+    backend, steps = hopper["backend"], hopper["steps"]
+    first = {name: group[: hopper["searches"]] for name, group in groups.items()}
+    _judge(
+        evaluations.setdefault(f"Hopper, {backend} physics, {steps:,} steps", {}),
+        "hopper",
+        ["ppo", "dpo"],
+        first,
+        hopper["agents"],
+        training_setting("hopper", steps, 1.0),
+        backend,
+    )
+    write_json(out, report)
+
+
+@dataclass(frozen=True)
+class _Learned:
+    """A search's objective, loaded or searched for when it is asked for."""
+
+    source: str
+    seed: int
+    settings: Mapping[str, Any]
+    runs: Path
+
+    @property
+    def folder(self) -> Path:
+        return self.runs / f"{self.source}-{self.seed}"
+
+    @cached_property
+    def objective(self) -> "Objective":
+        from lpo.learning import objective_of_run
+
+        config = {"command": "meta-train", "seed": self.seed, **self.settings}
+        found = objective_of_run(config, self.folder)
+        return replace(found, name=f"LPO ({self.source}) {self.seed}")
 
 
 def _curve_of(folder: Path) -> dict[str, Any]:
@@ -396,63 +424,65 @@ def _curve_of(folder: Path) -> dict[str, Any]:
     return search_curve(lines[0], [line["seconds"] for line in lines[1]])
 
 
-def _on_pendulum(
-    plan: Mapping[str, Any], learned: Mapping[str, Any], scale: float
-) -> dict[str, Any]:
-    from lpo.generalization import compare, training_setting
+def _tuned_clip(setting: "Setting", agents: int) -> dict[str, Any]:
+    """{"tuned": the best of CLIPS on agents that report nothing, "sweep": what each earned}."""
+    from lpo.generalization import compare
     from lpo.objectives import load_objective
     from scb.statistics import iqm
 
-    tuning = compare(
+    curves = compare(
         "Pendulum-v1",
         [load_objective(clip) for clip in CLIPS],
-        list(range(TUNING_SEED, TUNING_SEED + plan["tuning_agents"])),
-        setting=training_setting("Pendulum-v1", policy_output_scale=scale),
+        list(range(TUNING_SEED, TUNING_SEED + agents)),
+        setting=setting,
         points=1,
-    )
-    sweep = {c.objective: float(iqm(c.final)) for c in tuning.curves}
-    tuned = max(sweep, key=lambda clip: sweep[clip])
-    objectives = {n: [load_objective(n)] for n in ("ppo", "dpo")}
-    if tuned != "ppo":
-        objectives = {"ppo": objectives["ppo"], tuned: [load_objective(tuned)], **objectives}
-    found = _judge("Pendulum-v1", objectives | dict(learned), plan["agents"], None, scale, None)
-    return {**found, "tuned": tuned, "sweep": sweep}
+    ).curves
+    sweep = {c.objective: float(iqm(c.final)) for c in curves}
+    return {"tuned": max(sweep, key=lambda clip: sweep[clip]), "sweep": sweep}
 
 
 def _judge(
+    table: dict[str, Any],
     environment: str,
-    objectives: Mapping[str, Sequence[Any]],
+    compared: Sequence[str],
+    groups: Mapping[str, Sequence[_Learned]],
     agents: int,
-    steps: int | None,
-    scale: float,
-    backend: str | None,
-) -> dict[str, Any]:
-    from lpo.generalization import compare, training_setting
+    setting: "Setting",
+    backend: str | None = None,
+) -> None:
+    """Trains agents with the objectives, and searches, that the table lacks, and adds them to it."""
+    from lpo.generalization import compare
+    from lpo.objectives import load_objective
 
-    setting = training_setting(environment, steps, scale)
+    finals, areas = table.setdefault("finals", {}), table.setdefault("areas", {})
+    lacking = {name: [load_objective(name)] for name in compared if name not in finals}
+    lacking |= {
+        name: [learned.objective for learned in group[len(finals.get(name, ())) :]]
+        for name, group in groups.items()
+    }
+    if not any(lacking.values()):
+        return
     seeds = list(range(REPORTING_SEED, REPORTING_SEED + agents))
     curves = compare(
         environment,
-        [objective for group in objectives.values() for objective in group],
+        [objective for group in lacking.values() for objective in group],
         seeds,
         setting=setting,
         backend=backend,
         points=15,
     ).curves
     of = {curve.objective: curve for curve in curves}
-    finals, areas = (
-        {
-            name: [np.round(getattr(of[o.name], kind), 2).tolist() for o in group]
-            for name, group in objectives.items()
-        }
-        for kind in ("final", "area")
-    )
+    for name, group in lacking.items():
+        for returns, kind in ((finals, "final"), (areas, "area")):
+            returns.setdefault(name, []).extend(
+                np.round(getattr(of[o.name], kind), 2).tolist() for o in group
+            )
     physics = "" if backend is None else f" on `{backend}` physics"
-    protocol = (
+    table["seeds"] = seeds
+    table["protocol"] = (
         f"{environment}{physics}: {agents} agents an objective (and search), {curves[0].steps[-1]:,} steps, policy's "
-        f"last layer times {scale:g} at initialisation."
+        f"last layer times {setting.hyperparameters.policy_output_scale:g} at initialisation."
     )
-    return {"protocol": protocol, "seeds": seeds, "finals": finals, "areas": areas}
 
 
 if __name__ == "__main__":

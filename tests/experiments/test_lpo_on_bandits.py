@@ -1,13 +1,17 @@
 """What the page and the figure of learned policy optimisation are made from."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from experiments import lpo_on_bandits as module
+from lpo.generalization import Comparison, LearningCurves
+from lpo.objectives import load_objective
 from scb import plotting
+from scb.errors import UserError
 
 DOCS = Path(__file__).parents[2] / "docs"
 
@@ -120,6 +124,93 @@ def test_the_page_says_costs_returns_and_differences(report, tmp_path):
     assert "The tuned clip is ppo-0.5: on other agents ppo −900, ppo-0.5 −400." in page
     path = plotting.save(module.draw(report), tmp_path / "figure.png")
     assert path.stat().st_size > 20_000
+
+
+@pytest.fixture
+def tiny(monkeypatch):
+    """A preset of a search on either, and what was searched and judged; neither takes time."""
+    asked = []
+
+    def objective_of_run(config, folder):
+        asked.append(folder.name)
+        folder.mkdir(parents=True)
+        (folder / "metrics.jsonl").write_text("\n".join(json.dumps(x) for x in METRICS))
+        (folder / "timing.jsonl").write_text("\n".join(['{"seconds": 2.0}'] * len(METRICS)))
+        return replace(
+            load_objective("dpo"), metadata={"cost": {"environment_steps_validation": 7}}
+        )
+
+    def compare(environment, objectives, seeds, setting, backend=None, points=15):
+        scale = setting.hyperparameters.policy_output_scale
+        asked.append((environment, scale, *(o.name for o in objectives)))
+        return Comparison(
+            [
+                LearningCurves(
+                    environment,
+                    backend,
+                    o.name,
+                    np.array([0, 100]),
+                    np.array([[-9.0, -float(len(o.name) + i)] for i in range(len(seeds))]),
+                    list(seeds),
+                    1,
+                    True,
+                )
+                for o in objectives
+            ]
+        )
+
+    monkeypatch.setattr("lpo.learning.objective_of_run", objective_of_run)
+    monkeypatch.setattr("lpo.generalization.compare", compare)
+    plan = {
+        "searches": {source: {"seeds": 1, "settings": {"of": source}} for source in module.SOURCES},
+        "agents": 2,
+        "tuning_agents": 2,
+        "hopper": {"backend": "spring", "steps": 100, "agents": 2, "searches": 1},
+    }
+    monkeypatch.setitem(module.PRESETS, "tiny", plan)
+    return plan, asked
+
+
+def test_what_a_report_has_is_not_measured_again(tiny, tmp_path):
+    plan, asked = tiny
+    out, report = tmp_path / "report.json", {}
+    module.measure("tiny", tmp_path / "runs", out, report)
+    both = ("LPO (bandit) 0", "LPO (environment) 0")
+    # The fake's returns are minus the length of the name: "ppo" is the clip that is best.
+    judged = [
+        ("Pendulum-v1", scale, *rest)
+        for scale in (1.0, 0.01)
+        for rest in (module.CLIPS, ("ppo", "dpo", *both))
+    ]
+    assert asked == ["bandit-0", "environment-0", *judged, ("hopper", 1.0, "ppo", "dpo", *both)]
+    table = report["evaluations"]["Pendulum, small last layer"]
+    assert table["finals"]["ppo"] == [[-3.0, -4.0]]
+    assert table["finals"]["LPO (bandit)"] == [[-14.0, -15.0]]
+
+    asked.clear()
+    module.measure("tiny", tmp_path / "runs", out, report)
+    assert asked == []
+
+    plan["searches"]["environment"]["seeds"] = 2
+    report = json.loads(out.read_text())
+    module.measure("tiny", tmp_path / "runs", out, report)
+    second = "LPO (environment) 1"
+    assert asked == ["environment-1", *(("Pendulum-v1", scale, second) for scale in (1.0, 0.01))]
+    assert report["evaluations"]["Pendulum, small last layer"]["finals"]["LPO (environment)"] == [
+        [-19.0, -20.0],
+        [-19.0, -20.0],
+    ]
+    assert [len(x["curves"]) for x in report["searches"].values()] == [1, 2]
+    assert json.loads(out.read_text()) == report
+
+
+def test_a_report_of_other_searches_is_refused(tiny, tmp_path):
+    plan, _ = tiny
+    report = {}
+    module.measure("tiny", tmp_path / "runs", tmp_path / "report.json", report)
+    plan["searches"]["bandit"]["settings"] = {"of": "something else"}
+    with pytest.raises(UserError, match="was measured when the preset tiny was another one"):
+        module.measure("tiny", tmp_path / "runs", tmp_path / "report.json", report)
 
 
 def test_the_settings_of_every_preset_are_those_of_the_command():
