@@ -6,6 +6,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import tyro
 from gymnax.environments import environment
 from rich.console import Console
 
@@ -97,7 +98,7 @@ def explain(
 
 
 def explain_command(
-    bandit: str = "Synthetic-Pendulum-v1",
+    bandit: tyro.conf.Positional[str],
     out: Path | None = None,
     evaluation_environment: str | None = None,
     backend: str | None = None,

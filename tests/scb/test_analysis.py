@@ -154,7 +154,7 @@ def test_a_jump_of_the_angle_is_not_drawn_as_a_line():
 
 
 def test_explain_writes_what_it_found(tmp_path, capsys):
-    arguments = ["explain", "--bandit", "Synthetic-MountainCar-v0", "--episodes", "8"]
+    arguments = ["explain", "Synthetic-MountainCar-v0", "--episodes", "8"]
     assert scb_main([*arguments, "--out", str(tmp_path / "a")]) == 0
     numbers = json.loads((tmp_path / "a" / "explain.json").read_text())
     # Random actions never reach the goal and earn -200.
@@ -166,13 +166,19 @@ def test_explain_writes_what_it_found(tmp_path, capsys):
     assert "of the reward's variance: velocity" in capsys.readouterr().out
 
 
+PENDULUM = "Synthetic-Pendulum-v1"
+
+
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["--bandit", "Synthetic-Pendulum"], "did you mean"),
-        (["--episodes", "0"], "episodes is 0"),
-        (["--seed", "-1"], "seed is -1"),
-        (["--evaluation-environment", "CartPole-v1"], "take the bandit of that environment"),
+        (["Synthetic-Pendulum"], "did you mean"),
+        ([PENDULUM, "--episodes", "0"], "episodes is 0"),
+        ([PENDULUM, "--seed", "-1"], "seed is -1"),
+        (
+            [PENDULUM, "--evaluation-environment", "CartPole-v1"],
+            "take the bandit of that environment",
+        ),
     ],
 )
 def test_explain_refuses_what_makes_no_sense(arguments, said, capsys, tmp_path):
