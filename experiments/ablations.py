@@ -138,7 +138,14 @@ def verdict(report: Mapping[str, Any]) -> str:
             f"{environment}: {described['what is learned']}",
             f"TI {_compared(learned['TI'], learned['T'])} T, I {_compared(learned['I'], learned['TI'])} TI",
         ]
-        if _never_reached(report, environment, name_of("T", "normal", NONE)):
+        all_of_it = searches_of(environment)
+        never = [x for x in all_of_it if _never_reached(report, environment, x)]
+        if len(never) == len(all_of_it):
+            said.append(
+                "no agent of any search reaches the goal after so few generations, which leaves the paper's claims "
+                "about it untested"
+            )
+        elif name_of("T", "normal", NONE) in never:
             said.append("with T no agent ever reaches the goal, as in the paper")
         said.append(f"latents: {described['latent']}")
         continuous = [x for label, x in found["latent"].items() if "categorical" not in label]

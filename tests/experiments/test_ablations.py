@@ -90,6 +90,12 @@ def test_the_verdict_follows_the_figures():
     assert "the continuous ones are clearly better" in ablations.verdict(report(**categorical))
 
 
+def test_searches_that_never_reach_the_goal_test_no_claim_about_it():
+    found = report(**dict.fromkeys(ablations.searches_of("MountainCar-v0"), -200.0))
+    said = ablations.verdict(found)
+    assert "no agent of any search reaches the goal" in said and "as in the paper" not in said
+
+
 def test_the_page_and_the_figure_show_every_search():
     found = report()
     rows = sum(len(x) for e in ablations.ENVIRONMENTS for x in ablations.rows(e).values())
