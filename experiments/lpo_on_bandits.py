@@ -230,6 +230,7 @@ def draw(report: Mapping[str, Any]) -> "Figure":
     from matplotlib.ticker import EngFormatter, LogLocator, NullFormatter, StrMethodFormatter
 
     from scb import plotting
+    from scb.statistics import estimate
 
     looks = {
         "bandit": plotting.Look(plotting.VERMILLION, "-", "o"),
@@ -246,21 +247,21 @@ def draw(report: Mapping[str, Any]) -> "Figure":
             per = curves[0]["steps_per_generation"]
             seconds = float(np.median([c["seconds_per_generation"] for c in curves]))
             generations = np.asarray(curves[0]["generations"], float)
-            axes: Sequence[tuple[Any, np.ndarray, str]] = (
-                (panels[0], generations, name),
-                (panels[1], generations * per["total"], "training + evaluation"),
-                (panels[2], generations * seconds / 60, name),
-            )
-            for panel, x, label in axes:
-                _band(panel, x, [c["returns"] for c in curves], look, label)
-            middle = np.mean([c["returns"] for c in curves], axis=0)
-            panels[1].plot(
-                generations[1:] * per["training"],
-                middle[1:],
-                ":",
-                color=look.color,
-                label="training alone",
-            )
+            returns = [c["returns"] for c in curves]
+            _band(panels[0], generations, returns, look, name)
+            # No step is taken and no time passes before generation 0, which a logarithm cannot show.
+            later, returns = generations[1:], [r[1:] for r in returns]
+            _band(panels[1], later * per["total"], returns, look, f"{source}: total")
+            _band(panels[2], later * seconds / 60, returns, look, name)
+            middle = [estimate(column).value for column in np.asarray(returns).T]
+            for kind, style in (("training", ":"), ("evaluation", "-.")):
+                panels[1].plot(
+                    later * per[kind],
+                    middle,
+                    linestyle=style,
+                    color=look.color,
+                    label=f"{source}: {kind}",
+                )
         titles = ("(i) over generations", "(ii) over environment steps", "(ii) over wall-clock")
         labels = ("generation", "environment steps of the search", "minutes of the search")
         for panel, title, label in zip(panels, titles, labels, strict=True):
@@ -272,6 +273,7 @@ def draw(report: Mapping[str, Any]) -> "Figure":
             panel.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
             panel.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
             panel.xaxis.set_minor_formatter(NullFormatter())
+        panels[1].xaxis.set_major_locator(LogLocator())
         panels[1].xaxis.set_major_formatter(EngFormatter(sep=""))
         panels[0].set_ylabel("return on Pendulum of agents\ntrained with the search's mean")
         below = bottom.subplots(1, len(report["evaluations"]), squeeze=False)[0]
