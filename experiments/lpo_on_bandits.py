@@ -213,6 +213,8 @@ def markdown(report: Mapping[str, Any]) -> str:
                 for clip, value in table["sweep"].items()
             )
             lines += ["", f"The tuned clip is {table['tuned']}: on other agents {sweep}."]
+        elif any(clip in finals for clip in CLIPS if clip != "ppo"):
+            lines += ["", "The clip other than 0.2 is the one that was tuned on Pendulum."]
     machine = report["machine"]
     lines += [
         "",
@@ -384,10 +386,12 @@ def measure(preset: str, runs: Path, out: Path, report: dict[str, Any]) -> None:
     hopper = plan["hopper"]
     backend, steps = hopper["backend"], hopper["steps"]
     first = {name: group[: hopper["searches"]] for name, group in groups.items()}
+    # The clip is tuned on Pendulum, from whose bandit the objectives are carried over too.
+    carried = evaluations["Pendulum, Flax's initialisation"]["tuned"]
     _judge(
         evaluations.setdefault(f"Hopper, {backend} physics, {steps:,} steps", {}),
         "hopper",
-        ["ppo", "dpo"],
+        [*dict.fromkeys(("ppo", carried, "dpo"))],
         first,
         hopper["agents"],
         training_setting("hopper", steps, 1.0),
@@ -457,7 +461,7 @@ def _judge(
     from lpo.objectives import load_objective
 
     finals, areas = table.setdefault("finals", {}), table.setdefault("areas", {})
-    lacking = {name: [load_objective(name)] for name in compared if name not in finals}
+    lacking = {name: [] if name in finals else [load_objective(name)] for name in compared}
     lacking |= {
         name: [learned.objective for learned in group[len(finals.get(name, ())) :]]
         for name, group in groups.items()
@@ -479,6 +483,8 @@ def _judge(
             returns.setdefault(name, []).extend(
                 np.round(getattr(of[o.name], kind), 2).tolist() for o in group
             )
+    for kind in ("finals", "areas"):
+        table[kind] = {name: table[kind][name] for name in lacking}
     physics = "" if backend is None else f" on `{backend}` physics"
     table["seeds"] = seeds
     table["protocol"] = (

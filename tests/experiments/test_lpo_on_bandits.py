@@ -130,6 +130,7 @@ def test_the_page_says_costs_returns_and_differences(report, tmp_path):
 def tiny(monkeypatch):
     """A preset of a search on either, and what was searched and judged; neither takes time."""
     asked = []
+    worth = {"ppo": -9.0, "ppo-0.5": -3.0}  # the best clip
 
     def objective_of_run(config, folder):
         asked.append(folder.name)
@@ -150,7 +151,7 @@ def tiny(monkeypatch):
                     backend,
                     o.name,
                     np.array([0, 100]),
-                    np.array([[-9.0, -float(len(o.name) + i)] for i in range(len(seeds))]),
+                    np.array([[-9.0, worth.get(o.name, -14.0) - i] for i in range(len(seeds))]),
                     list(seeds),
                     1,
                     True,
@@ -176,15 +177,11 @@ def test_what_a_report_has_is_not_measured_again(tiny, tmp_path):
     out, report = tmp_path / "report.json", {}
     module.measure("tiny", tmp_path / "runs", out, report)
     both = ("LPO (bandit) 0", "LPO (environment) 0")
-    # The fake's returns are minus the length of the name: "ppo" is the clip that is best.
-    judged = [
-        ("Pendulum-v1", scale, *rest)
-        for scale in (1.0, 0.01)
-        for rest in (module.CLIPS, ("ppo", "dpo", *both))
-    ]
-    assert asked == ["bandit-0", "environment-0", *judged, ("hopper", 1.0, "ppo", "dpo", *both)]
+    compared = ("ppo", "ppo-0.5", "dpo", *both)
+    judged = [("Pendulum-v1", scale, *x) for scale in (1.0, 0.01) for x in (module.CLIPS, compared)]
+    assert asked == ["bandit-0", "environment-0", *judged, ("hopper", 1.0, *compared)]
     table = report["evaluations"]["Pendulum, small last layer"]
-    assert table["finals"]["ppo"] == [[-3.0, -4.0]]
+    assert table["finals"]["ppo-0.5"] == [[-3.0, -4.0]]
     assert table["finals"]["LPO (bandit)"] == [[-14.0, -15.0]]
 
     asked.clear()
@@ -196,10 +193,9 @@ def test_what_a_report_has_is_not_measured_again(tiny, tmp_path):
     module.measure("tiny", tmp_path / "runs", out, report)
     second = "LPO (environment) 1"
     assert asked == ["environment-1", *(("Pendulum-v1", scale, second) for scale in (1.0, 0.01))]
-    assert report["evaluations"]["Pendulum, small last layer"]["finals"]["LPO (environment)"] == [
-        [-19.0, -20.0],
-        [-19.0, -20.0],
-    ]
+    finals = report["evaluations"]["Pendulum, small last layer"]["finals"]
+    assert finals["LPO (environment)"] == [[-14.0, -15.0]] * 2
+    assert list(finals) == ["ppo", "ppo-0.5", "dpo", "LPO (bandit)", "LPO (environment)"]
     assert [len(x["curves"]) for x in report["searches"].values()] == [1, 2]
     assert json.loads(out.read_text()) == report
 
