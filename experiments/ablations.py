@@ -276,7 +276,7 @@ def _presets() -> dict[str, dict[str, Any]]:
                     "generations": 30,
                     "population_size": 16,
                     "agents_per_candidate": 1,
-                    "seeds": 2,
+                    "seeds": 1,
                 },
             },
         },
