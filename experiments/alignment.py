@@ -15,6 +15,7 @@ an interrupted one.
 import argparse
 import json
 import sys
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -156,6 +157,16 @@ def same_drift(one: "Objective", other: "Objective") -> bool:
     )
 
 
+def measuring(arguments: Sequence[str]) -> list[str]:
+    """The command line without where it writes: what is measured does not depend on that."""
+    kept = list(arguments)
+    for flag in ("--out", "--page"):
+        while flag in kept:
+            at = kept.index(flag)
+            del kept[at : at + 2]
+    return kept
+
+
 def figure_name(stage: str) -> str:
     """The file name of a stage's heat map."""
     return f"alignment_{stage.replace(', ', '_').replace(' ', '_')}.png"
@@ -215,7 +226,7 @@ def main() -> int:
                 f"{objective.name} is to be held out, and the family has it as {twins[0]}: leave it out of --held-out."
             )
     report: dict[str, Any] = {
-        "command": " ".join(["python -m experiments.alignment", *sys.argv[1:]]),
+        "command": " ".join(["python -m experiments.alignment", *measuring(sys.argv[1:])]),
         "stages": {},
     }
     if arguments.out.exists():

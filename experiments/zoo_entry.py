@@ -16,9 +16,13 @@ from experiments.page import exit_status
 
 
 def _short(name: str, file: Path, zoo_name: str) -> str:
-    """What a comparison calls an objective: this one by its name in the zoo, another file by its stem."""
-    stem = Path(name).stem if name.endswith(".npz") else name
-    return zoo_name if stem == file.stem else stem
+    """What a comparison calls an objective: this file's by its name in the zoo, a run's by its folder."""
+    path = Path(name)
+    if path.suffix != ".npz":
+        return name
+    if path.resolve() == file.resolve():
+        return zoo_name
+    return path.parent.name if path.stem == "objective" else path.stem
 
 
 def main() -> int:

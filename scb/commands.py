@@ -147,7 +147,7 @@ def discover_command(
         instead of the paper's lists.
       fixed_hyperparameters: keep the inner agents' hyperparameters fixed instead of drawing them
         from the paper's lists.
-      init: expert (fit the bandit to an expert first, in seconds) or random (as the paper).
+      init: expert (fit the bandit to an expert first, in a minute) or random (as the paper).
       expert: what finds the expert: evolution, ppo, sac, dqn, ddpg, td3, or auto.
       expert_steps: environment steps that each agent trains for to become the expert.
       expert_generations: of the evolution that finds the expert.

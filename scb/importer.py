@@ -12,6 +12,7 @@ from typing import Any, cast
 import jax
 import jax.numpy as jnp
 import numpy as np
+import tyro
 
 from scb.artefacts import read_arrays, unflatten
 from scb.environments.registry import make
@@ -98,7 +99,9 @@ def import_published(source: str | Path, out: str | Path) -> list[Path]:
     ]
 
 
-def import_published_command(directory: Path, out: Path = Path("runs/published")) -> None:
+def import_published_command(
+    directory: tyro.conf.Positional[Path], out: Path = Path("runs/published")
+) -> None:
     """Import the bandits that the paper's authors published, so that every command takes them by file.
 
     Args:

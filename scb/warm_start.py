@@ -1,7 +1,7 @@
 """Fit a bandit to an expert before evolving it.
 
 The paper's lemma: a bandit whose reward is the expert's Q-function, on contexts that cover the
-expert's states, has the expert's policy as its optimum. Regression finds such a bandit in seconds;
+expert's states, has the expert's policy as its optimum. Regression finds such a bandit in a minute;
 what it cannot know is which of them *trains* well, and that is what evolution is for.
 """
 

@@ -1,3 +1,4 @@
+import json
 import shutil
 from pathlib import Path
 
@@ -43,6 +44,17 @@ def test_the_recommendation_is_the_best_over_both_initialisations():
 
 def test_the_files_of_a_stage_have_no_spaces_in_their_names():
     assert alignment.figure_name(alignment.HELD_OUT) == "alignment_Pendulum-v1_held_out.png"
+
+
+def test_a_reports_command_says_what_is_measured_and_not_where_it_is_written():
+    measured = ["--agents", "8", "--held-out", "a.npz"]
+    assert alignment.measuring(["--out", "x.json", *measured, "--page", "x.md"]) == measured
+
+
+def test_the_committed_page_is_that_of_the_committed_report():
+    docs = Path(alignment.__file__).parents[1] / "docs"
+    report = json.loads((docs / "data" / "alignment.json").read_text())
+    assert (docs / "alignment.md").read_text() == alignment.markdown(report)
 
 
 def test_what_is_held_out_is_not_in_the_family_under_another_name(tmp_path, monkeypatch, capsys):
