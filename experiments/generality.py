@@ -69,17 +69,25 @@ def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None
 
     found, random = report.setdefault("environments", {}), report.setdefault("random", {})
     failed, digests = report.setdefault("failed", {}), report.setdefault("sha256", {})
+    generations = report.setdefault("generation", {})
     for environment in plan["environments"]:
         if environment not in random:
             random[environment] = round(random_return(*scb.make(environment)), 2)
             digests[environment] = bandit_metadata(f"Synthetic-{environment}")["sha256"]
         entry = found.setdefault(environment, {source: {} for source in SOURCES})
+        chosen = generations.setdefault(environment, {})
         for source in SOURCES:
-            trainer: _Trainer | None = None
-            for agent in agents_of(environment):
-                if agent in entry[source] or (agent == OPTIMAL and source == ENVIRONMENT):
-                    continue
-                trainer = trainer or _Trainer(environment, source, plan)
+            lacking = [
+                agent
+                for agent in agents_of(environment)
+                if agent not in entry[source] and (agent, source) != (OPTIMAL, ENVIRONMENT)
+            ]
+            if not lacking and source in chosen:
+                continue
+            trainer = _Trainer(environment, source, plan)
+            chosen[source] = trainer.generation
+            save()
+            for agent in lacking:
                 returns = trainer.returns(agent)
                 entry[source][agent], number = finite(returns, random[environment])
                 if number:
@@ -113,6 +121,7 @@ class _Trainer:
         self.environment, self.plan = environment, plan
         self.env, self.env_params = scb.make(environment)
         self.space = self.env.action_space(self.env_params)
+        self.generation: int | None = None  # of a search, at which its mean was judged best
         self.trained_in: Any = self.env
         self.trained_in_params: Any = self.env_params
         if source == ZOO:
@@ -123,6 +132,7 @@ class _Trainer:
             problem, outcome = searches.search(
                 config_of(environment, source, plan), f"{plan['runs']}/{environment}-{kind}"
             )
+            self.generation = outcome.best_mean_generation
             self.trained_in = problem.bandit
             self.trained_in_params = problem.bandit.params(outcome.best_mean)
 
@@ -302,6 +312,15 @@ def body(report: Mapping[str, Any]) -> list[str]:
         "agents' hyperparameters are drawn or the paper's underlined ones. What the zoo's bandits were found with "
         "stands in their commands (`scb list`). Interquartile means with 95 % intervals. Agents whose return was no "
         f"number, counted as a random policy: {failed}.",
+    ]
+    generations = ", ".join(
+        f"{name} {chosen[DRAWN]} and {chosen[FIXED]}"
+        for name, chosen in report["generation"].items()
+    )
+    lines += [
+        "",
+        "A search gives the mean that was judged best, of these generations (drawn and fixed hyperparameters; 0 is the "
+        f"start, which both have in common): {generations}.",
     ]
     for name, entry in report["environments"].items():
         by_source = {source: columns(entry[source]) for source in SOURCES}

@@ -61,6 +61,7 @@ def report(**returns):
         "random": {"CartPole-v1": 20.0},
         "failed": {},
         "environments": {"CartPole-v1": entry},
+        "generation": {"CartPole-v1": {ZOO: None, DRAWN: 15, FIXED: 0, ENVIRONMENT: None}},
     }
 
 
@@ -120,7 +121,9 @@ def test_the_verdict_follows_the_figures():
 
 def test_the_page_and_the_figure_show_every_kind_of_agent():
     found = report()
-    assert sum(line.startswith("| ") for line in generality.body(found)) == 7 + 2
+    lines = generality.body(found)
+    assert sum(line.startswith("| ") for line in lines) == 7 + 2
+    assert any(line.endswith("CartPole-v1 15 and 0.") for line in lines)
     axes = generality.draw(found).axes[0]
     assert [t.get_text().replace("\n", " ") for t in axes.get_xticklabels()] == [
         "PPO",
@@ -163,7 +166,8 @@ def test_agents_from_a_bandit_and_from_the_environment(tmp_path, monkeypatch):
     assert 10.0 < found["random"]["CartPole-v1"] < 40.0
     number = len(saved)
     generality.measure(plan, found, lambda: saved.append(1))
-    assert len(saved) == number == 2 * 4 - 1
+    # A source's search, and each kind of agent in it, but for the optimum of what is no bandit.
+    assert len(saved) == number == 2 * (1 + 4) - 1
 
 
 @pytest.mark.slow
@@ -174,6 +178,7 @@ def test_agents_from_a_search(tmp_path, monkeypatch):
     generality.measure({**TINY, "runs": str(tmp_path)}, found, lambda: None)
     entry = found["environments"]["CartPole-v1"]
     # One generation from random weights teaches next to nothing, and both searches start alike.
+    assert all(found["generation"]["CartPole-v1"][source] in (0, 1) for source in (DRAWN, FIXED))
     assert all(8.0 <= x <= 500.0 for source in entry.values() for y in source.values() for x in y)
 
 
