@@ -169,7 +169,7 @@ EXPERIMENT = Experiment(
             "evaluation_episodes": 4,
             "mean_evaluations": 8,
             "evaluate_mean_every": 5,
-            "seeds": {NONE: 3, "linear": 1, "exponential": 1, "step": 1},
+            "seeds": {NONE: 3, "linear": 3, "exponential": 3, "step": 3},
         },
         "paper": {
             "runs": "runs/brax_curriculum/paper",
