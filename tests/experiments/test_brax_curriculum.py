@@ -51,6 +51,8 @@ def test_the_verdict_follows_the_figures():
     said = experiment.verdict(report(linear=300.0, step=150.0))
     assert "linear ends above the best of them, step not" in said
     assert "205 [200, 210] without" in said and "the best ends at 210" in said
+    assert "None of them earns what standing still does (1000)" in said
+    assert "None of them" not in experiment.verdict(report(none=1000.0))
 
 
 def test_the_page_and_the_figure_show_every_curriculum():
