@@ -84,8 +84,8 @@ def verdict(report: Mapping[str, Any]) -> str:
         + ", ".join(f"{shape} {text(found[shape])}" for shape in shapes)
         + f". Of the searches without one the best ends at {best:.0f}: {said}."
         + (
-            f" None of them earns what standing still does ({STANDING:.0f}), the local optimum that the claim is about: "
-            "so few generations do not test it."
+            f" None of them earns what standing still does ({STANDING:.0f}), the local optimum that the claim is "
+            "about: so few generations do not test it."
             if best < STANDING
             else ""
         )
