@@ -39,6 +39,13 @@ WIDE, SWISH = "1 x 512 network", "swish"
 EVOLVED, OPTIMAL = "neuroevolution", "CB-optimal policy"
 # Not in the paper's inner loop: what it calls out of distribution.
 UNSEEN = (WIDE, SWISH, EVOLVED, OPTIMAL)
+TICKS = {
+    TOGETHER: "all\nalgorithms",
+    WIDE: "1 x 512",
+    SWISH: SWISH,
+    EVOLVED: "neuro-\nevolution",
+    OPTIMAL: "optimal\npolicy",
+}
 REPORTING_SEED = 10_000
 
 
@@ -261,7 +268,8 @@ def verdict(report: Mapping[str, Any]) -> str:
         + ("are" if _sign(robust) > 0 else "are not")
         + f" more robust to hyperparameters than the environments (difference {text(robust, 2, sign=True)}). Drawing "
         f"them in the search (one search each) changes {text(drawn, 2, sign=True)}: "
-        + {1: "it helps.", 0: "no clear difference.", -1: "it harms here."}[_sign(drawn)]
+        + {1: "it helps", 0: "no clear difference", -1: "it harms here"}[_sign(drawn)]
+        + f" ({_by_environment(report)})."
     ]
     own = stratified_estimate(together[ZOO])
     unseen = {name: stratified_estimate(normalized(report, ZOO, name)) for name in UNSEEN}
@@ -281,6 +289,25 @@ def verdict(report: Mapping[str, Any]) -> str:
         )
     )
     return " ".join(parts)
+
+
+def _by_environment(report: Mapping[str, Any]) -> str:
+    """Where drawing hyperparameters in the search helps or harms, and where neither search left its start."""
+    from scb.statistics import paired_difference
+
+    found: dict[str, list[str]] = {}
+    for name, entry in report["environments"].items():
+        chosen = report["generation"][name]
+        if chosen[DRAWN] == chosen[FIXED] == 0:
+            said = "the common start is still the best in"
+        else:
+            # The same seeds and the same drawn hyperparameters in both.
+            drawn, fixed = (columns(entry[source])[TOGETHER] for source in (DRAWN, FIXED))
+            said = {1: "clearly better in", 0: "not clearly apart in", -1: "clearly worse in"}[
+                _sign(paired_difference(drawn, fixed))
+            ]
+        found.setdefault(said, []).append(name)
+    return "; ".join(f"{said} {' and '.join(names)}" for said, names in found.items())
 
 
 def _sign(difference: "Estimate") -> int:
@@ -378,7 +405,7 @@ def draw(report: Mapping[str, Any]) -> "Figure":
             )
             axes.set_xticks(
                 range(len(shown)),
-                [x.upper() if len(x) < 5 else x.replace(" ", "\n", 1) for x in shown],
+                [TICKS.get(x, x.upper()) for x in shown],
                 fontsize=8,
             )
             axes.set_ylabel("return")
