@@ -4,9 +4,7 @@
 
 Populations train for 10 000 steps with the paper's inner-loop configuration at its fixed (underlined)
 hyperparameters: PPO, SAC, TD3 and DDPG in the Pendulum bandit, DQN and discrete SAC in the CartPole
-bandit. Where the bandit is a discovered one, every agent is then evaluated for 20 episodes in the
-real environment; a randomly initialised bandit, which stands in for CartPole's while none ships, says
-nothing about the real one and is timed only.
+bandit that ship. Every agent is then evaluated for 20 episodes in the environment itself.
 
 rejax needs an older gymnax, so it runs in a virtual environment of its own (`make bench` makes it)
 and evaluates in that gymnax's Pendulum-v1 and CartPole-v1: same dynamics, start states and episode
@@ -62,21 +60,11 @@ TASKS = {
 }
 
 
-def bandit_of(environment: str) -> tuple[Any, bool]:
-    """The environment's bandit, and whether it is a discovered one or only randomly initialised."""
-    import jax
+def bandit_of(task: Task) -> Any:
+    """The bandit that ships for the task's environment."""
+    from scb.environments.zoo import PREFIX, open_bandit
 
-    import scb
-    from scb.environments.synthetic import BanditConfig, SyntheticBandit, bandit_for
-    from scb.environments.zoo import PREFIX, open_bandit, zoo_names
-
-    name = PREFIX + environment
-    if name in zoo_names():
-        return open_bandit(name), True
-    shapes = bandit_for(*scb.make(environment), BanditConfig(), name)
-    weights = shapes.init_weights(jax.random.key(0))
-    space = shapes.action_space()
-    return SyntheticBandit(shapes.observation_size, space, shapes.config, weights, name), False
+    return open_bandit(PREFIX + task.environment)
 
 
 def inner_loop_of(task: Task, bandit: Any, steps: int) -> Any:
@@ -99,7 +87,7 @@ def measure_this_project(task: Task, steps: int) -> dict[str, list[float]]:
     import scb
     from scb.evolution import map_population
 
-    bandit, discovered = bandit_of(task.environment)
+    bandit = bandit_of(task)
     params = bandit.default_params
     inner = inner_loop_of(task, bandit, steps)
     agent = inner.agent(bandit)
@@ -125,9 +113,8 @@ def measure_this_project(task: Task, steps: int) -> dict[str, list[float]]:
         if repeat == 0:
             continue
         seconds.append((time.perf_counter() - start) / task.population)
-        if discovered:
-            keys = jax.random.split(jax.random.fold_in(jax.random.key(repeat), 1), task.population)
-            returns += evaluate_all(states, keys).tolist()
+        keys = jax.random.split(jax.random.fold_in(jax.random.key(repeat), 1), task.population)
+        returns += evaluate_all(states, keys).tolist()
     return {"seconds": seconds, "returns": returns}
 
 
@@ -136,7 +123,7 @@ def write_rejax_job(folder: Path, task: Task, steps: int) -> Path:
     from scb.artefacts import flatten
     from scb.environments.zoo import space_description
 
-    bandit, discovered = bandit_of(task.environment)
+    bandit = bandit_of(task)
     inner = inner_loop_of(task, bandit, steps)
     algorithm, settings = rejax_settings(task.algorithm, inner, bandit.action_space())
     weights = folder / "bandit.npz"
@@ -155,7 +142,7 @@ def write_rejax_job(folder: Path, task: Task, steps: int) -> Path:
         "settings": settings,
         "population": task.population,
         "repeats": task.repeats,
-        "environment": task.environment if discovered else None,
+        "environment": task.environment,
         "episodes": EPISODES,
     }
     path = folder / "job.json"
@@ -225,15 +212,12 @@ def rejax_settings(algorithm: str, inner: Any, space: Any) -> tuple[str, dict[st
     }
 
 
-def summary(
-    task: Task, discovered: bool, measured: dict[str, dict[str, list[float]]]
-) -> dict[str, Any]:
+def summary(task: Task, measured: dict[str, dict[str, list[float]]]) -> dict[str, Any]:
     """What is written for an algorithm. Agents whose return is no number are counted and left out."""
     from scb.statistics import estimate
 
     result: dict[str, Any] = {
         "environment": task.environment,
-        "bandit": "discovered" if discovered else "randomly initialised",
         "population": task.population,
         "seconds_per_agent": {who: values["seconds"] for who, values in measured.items()},
         "return": {},
@@ -241,9 +225,8 @@ def summary(
     for who, values in measured.items():
         returns = np.asarray(values["returns"])
         finite = returns[np.isfinite(returns)]
-        if returns.size:
-            iqm = estimate(finite).as_dict() if finite.size else None
-            result["return"][who] = {"iqm": iqm, "diverged": returns.size - finite.size}
+        iqm = estimate(finite).as_dict() if finite.size else None
+        result["return"][who] = {"iqm": iqm, "diverged": returns.size - finite.size}
     if PEER in measured:
         medians = {who: float(np.median(values["seconds"])) for who, values in measured.items()}
         result["ratio"] = medians[PEER] / medians[THIS]
@@ -292,6 +275,8 @@ def main() -> int:
     names = arguments.algorithms.split(",")
     if unknown := [name for name in names if name not in TASKS]:
         parser.error(f"unknown algorithm {', '.join(unknown)}: choose from {', '.join(TASKS)}.")
+    from scb.artefacts import machine_description, package_versions
+
     arguments.out.parent.mkdir(parents=True, exist_ok=True)
     print(f"Training for {arguments.steps} steps in the bandit; median seconds an agent.")
     print(f"Return in the real environment: IQM [95 %] of agents, {EPISODES} episodes each.\n")
@@ -305,12 +290,17 @@ def main() -> int:
                 job = write_rejax_job(Path(folder), TASKS[name], arguments.steps)
                 peer = [str(arguments.rejax_python), str(PEER_SCRIPT), str(job)]
                 measured[PEER] = _json_of(peer)
-        _, discovered = bandit_of(TASKS[name].environment)
-        results[name] = summary(TASKS[name], discovered, measured)
+        results[name] = summary(TASKS[name], measured)
         print(row(name, results[name]), flush=True)
     if arguments.rejax_python is None:
         print("\nrejax was not measured: `make bench` does that.")
-    report = {"steps": arguments.steps, "episodes": EPISODES, "algorithms": results}
+    report = {
+        "steps": arguments.steps,
+        "episodes": EPISODES,
+        "versions": package_versions(),
+        "machine": machine_description(),
+        "algorithms": results,
+    }
     arguments.out.write_text(json.dumps(report, indent=2) + "\n")
     return 0
 

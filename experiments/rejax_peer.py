@@ -2,8 +2,8 @@
 
     python rejax_peer.py JOB.json
 
-It imports nothing of this project, and prints as JSON the seconds an agent of each repeat and, where
-the job names a real environment, every agent's mean return there.
+It imports nothing of this project, and prints as JSON the seconds an agent of each repeat and every
+agent's mean return in the job's environment.
 """
 
 # mypy: ignore-errors
@@ -127,25 +127,22 @@ def main() -> None:
     algorithm = algorithm.replace(eval_callback=lambda *_: ())
     keys = jax.random.split(jax.random.PRNGKey(0), job["population"])
     train = jax.jit(jax.vmap(algorithm.train)).lower(keys).compile()
-    evaluate_all = None
-    if job["environment"] is not None:
-        real, real_params = gymnax.make(job["environment"])
+    real, real_params = gymnax.make(job["environment"])
 
-        def mean_return(state, key):
-            act = make_act(algorithm, state)
-            return evaluate(act, key, real, real_params, job["episodes"])[1].mean()
+    def mean_return(state, key):
+        act = make_act(algorithm, state)
+        return evaluate(act, key, real, real_params, job["episodes"])[1].mean()
 
-        evaluate_all = jax.jit(jax.vmap(mean_return))
+    evaluate_all = jax.jit(jax.vmap(mean_return))
     seconds, returns = [], []
     for repeat in range(1, job["repeats"] + 1):
         keys = jax.random.split(jax.random.PRNGKey(repeat), job["population"])
         start = time.perf_counter()
         states, _ = jax.block_until_ready(train(keys))
         seconds.append((time.perf_counter() - start) / job["population"])
-        if evaluate_all is not None:
-            key = jax.random.fold_in(jax.random.PRNGKey(repeat), 1)
-            keys = jax.random.split(key, job["population"])
-            returns += evaluate_all(states, keys).tolist()
+        key = jax.random.fold_in(jax.random.PRNGKey(repeat), 1)
+        keys = jax.random.split(key, job["population"])
+        returns += evaluate_all(states, keys).tolist()
     print(json.dumps({"seconds": seconds, "returns": returns}))
 
 

@@ -332,7 +332,7 @@ def test_what_cannot_be_parsed_is_a_mistake_too(arguments, capsys):
         ("scb", "discover", ["--algorithms", "--mode", "--parameterization", "--curriculum"]),
         ("scb", "discover", ["--expert", "--min-spread", "--hyperparameters", "--mode-actions"]),
         ("scb", "train", ["--bandit", "--evaluation-environment", "--agents", "--algorithm"]),
-        ("scb", "import-published", ["--directory", "--out"]),
+        ("scb", "import-published", ["PATH", "--out"]),
         ("scb", "list", ["--help"]),
     ],
 )

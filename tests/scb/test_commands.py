@@ -427,7 +427,7 @@ def test_listing_names_every_bandit_of_the_zoo():
         ("discover --min-spread nan", "min_spread is nan: it must be 0 or larger, and finite"),
         ("discover --judge-agents -1", "judge_agents is -1: give 0 for no judgement, or more"),
         ("discover --judge-episodes 0", "judge_episodes is 0: give at least 1"),
-        ("import-published --directory nowhere", "nowhere does not exist: give the published"),
+        ("import-published nowhere", "nowhere does not exist: give the published"),
         ("discover --out FOLDER", "already exists and is not empty"),
         ("discover --out FILE/run", "cannot write to"),
         ("discover --resume FOLDER", "is not a run"),
@@ -502,10 +502,10 @@ def test_an_import_of_pickles_is_refused_and_writes_nothing(tmp_path, monkeypatc
     (tmp_path / "published").mkdir()
     (tmp_path / "published" / "pendulum.pkl").write_bytes(b"\x80")
     message = "published holds no .npz file, only pickles, which run code when they are opened"
-    refused(["import-published", "--directory", "published", "--out", "out"], message)
+    refused(["import-published", "published", "--out", "out"], message)
     (tmp_path / "published" / "pendulum.npz").write_bytes(b"\x80\x05N.")
     message = "pendulum.npz holds pickled objects, which run code when they are opened"
-    refused(["import-published", "--directory", "published", "--out", "out"], message)
+    refused(["import-published", "published", "--out", "out"], message)
     assert [path.name for path in tmp_path.iterdir()] == ["published"]
 
 
