@@ -3,8 +3,9 @@
     python -m experiments --list
     python -m experiments --preset quick
 
-The second runs every experiment of the paper with a preset, continues what was interrupted, and
-writes docs/experiments.md, which says of each what the paper claims and what was found.
+The second runs every experiment of the paper with a preset, continues what was interrupted, keeps what
+has the paper's size already, and writes docs/experiments.md, which says of each what the paper claims
+and what was found.
 """
 
 import argparse
@@ -75,6 +76,16 @@ def overview(experiments: Sequence[Experiment], data: Path) -> str:
     return "\n".join(lines)
 
 
+def _is_whole_paper(out: Path) -> bool:
+    from scb.errors import UserError
+
+    try:
+        report = page.read(out, missing_is_new=True)
+    except UserError:
+        return False  # the experiment says so itself
+    return report.get("preset") == "paper" and page.complete(report)
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """The command."""
     parser = argparse.ArgumentParser(
@@ -97,9 +108,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         out = arguments.data / f"{name}.json"
         if arguments.only_render and not out.exists():
             continue
-        print(f"{name} ...", flush=True)
+        # What was measured at the paper's size is worth more than the quick preset.
+        kept = arguments.preset == "quick" and _is_whole_paper(out)
+        print(f"{name} ..." + (" kept: it has the paper's size" if kept else ""), flush=True)
         flags = ["--preset", arguments.preset, "--out", str(out), "--docs", str(arguments.docs)]
-        if arguments.only_render:
+        if arguments.only_render or kept:
             flags.append("--only-render")
         if page.main(experiment, flags):
             failed.append(name)

@@ -98,6 +98,18 @@ def test_all_experiments_in_one_go_leave_one_page(tmp_path, monkeypatch):
     assert everything.main([*flags, "--preset", "paper"]) == 2
 
 
+def test_the_quick_presets_in_one_go_keep_a_report_of_the_papers_size(
+    tmp_path, monkeypatch, capsys
+):
+    monkeypatch.setattr(everything, "found", lambda: {"counting": counting()})
+    flags = ["--data", str(tmp_path / "data"), "--docs", str(tmp_path / "docs")]
+    assert everything.main([*flags, "--preset", "paper"]) == 0
+    measured = (tmp_path / "data" / "counting.json").read_bytes()
+    assert everything.main(flags) == 0
+    assert "kept: it has the paper's size" in capsys.readouterr().out
+    assert (tmp_path / "data" / "counting.json").read_bytes() == measured
+
+
 def test_a_report_that_is_not_complete_makes_no_page(tmp_path, capsys):
     flags = ["--out", str(tmp_path / "counting.json"), "--docs", str(tmp_path / "docs")]
     with pytest.raises(KeyboardInterrupt):
