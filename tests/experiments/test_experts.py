@@ -50,7 +50,7 @@ def test_the_committed_experts_are_near_optimal(report):
     best = {name: float(iqm(x["returns"])) for name, x in report["environments"].items()}
     assert best["CartPole-v1"] == 500.0
     assert best["MountainCar-v0"] > -120.0 and best["MountainCarContinuous-v0"] > 94.0
-    assert best["Acrobot-v1"] > -90.0 and best["Pendulum-v1"] > -155.0
+    assert best["Acrobot-v1"] > -80.0 and best["Pendulum-v1"] > -155.0
     assert all(len(x["returns"]) == 200 for x in report["environments"].values())
 
 
