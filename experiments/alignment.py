@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from experiments.page import exit_status
+from experiments.page import exit_status, run_name
 from lpo.cli import configure_jax
 
 if TYPE_CHECKING:
@@ -209,9 +209,7 @@ def main() -> int:
     arguments.out.parent.mkdir(parents=True, exist_ok=True)
 
     def named(path: Path) -> "Objective":
-        # Every run's file is called objective.npz; its folder tells runs apart.
-        name = path.parent.name if path.stem == "objective" else path.stem
-        return replace(load_objective(path), name=name)
+        return replace(load_objective(path), name=run_name(path))
 
     family = [
         *known_drifts(),

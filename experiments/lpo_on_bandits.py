@@ -232,7 +232,7 @@ def draw(report: Mapping[str, Any]) -> "Figure":
     from matplotlib.ticker import EngFormatter, LogLocator, NullFormatter, StrMethodFormatter
 
     from scb import plotting
-    from scb.statistics import estimate
+    from scb.statistics import iqm
 
     looks = {
         "bandit": plotting.Look(plotting.VERMILLION, "-", "o"),
@@ -255,7 +255,7 @@ def draw(report: Mapping[str, Any]) -> "Figure":
             later, returns = generations[1:], [r[1:] for r in returns]
             _band(panels[1], later * per["total"], returns, look, f"{source}: total")
             _band(panels[2], later * seconds / 60, returns, look, name)
-            middle = [estimate(column).value for column in np.asarray(returns).T]
+            middle = iqm(np.asarray(returns), axis=0)
             for kind, style in (("training", ":"), ("evaluation", "-.")):
                 panels[1].plot(
                     later * per[kind],
@@ -380,8 +380,7 @@ def measure(preset: str, runs: Path, out: Path, report: dict[str, Any]) -> None:
         setting = training_setting("Pendulum-v1", policy_output_scale=scale)
         if "tuned" not in table:
             table |= _tuned_clip(setting, plan["tuning_agents"])
-        compared = dict.fromkeys(("ppo", table["tuned"], "dpo"))
-        _judge(table, "Pendulum-v1", [*compared], groups, plan["agents"], setting)
+        _judge(table, "Pendulum-v1", table["tuned"], groups, plan["agents"], setting)
         write_json(out, report)
     hopper = plan["hopper"]
     backend, steps = hopper["backend"], hopper["steps"]
@@ -391,7 +390,7 @@ def measure(preset: str, runs: Path, out: Path, report: dict[str, Any]) -> None:
     _judge(
         evaluations.setdefault(f"Hopper, {backend} physics, {steps:,} steps", {}),
         "hopper",
-        [*dict.fromkeys(("ppo", carried, "dpo"))],
+        carried,
         first,
         hopper["agents"],
         training_setting("hopper", steps, 1.0),
@@ -450,18 +449,19 @@ def _tuned_clip(setting: "Setting", agents: int) -> dict[str, Any]:
 def _judge(
     table: dict[str, Any],
     environment: str,
-    compared: Sequence[str],
+    tuned: str,
     groups: Mapping[str, Sequence[_Learned]],
     agents: int,
     setting: "Setting",
     backend: str | None = None,
 ) -> None:
-    """Trains agents with the objectives, and searches, that the table lacks, and adds them to it."""
+    """Trains agents with PPO, the tuned clip, DPO and searches that the table lacks, and adds them to it."""
     from lpo.generalization import compare
     from lpo.objectives import load_objective
 
     finals, areas = table.setdefault("finals", {}), table.setdefault("areas", {})
-    lacking = {name: [] if name in finals else [load_objective(name)] for name in compared}
+    closed_forms = ("ppo", tuned, "dpo")
+    lacking = {name: [] if name in finals else [load_objective(name)] for name in closed_forms}
     lacking |= {
         name: [learned.objective for learned in group[len(finals.get(name, ())) :]]
         for name, group in groups.items()

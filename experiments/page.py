@@ -115,6 +115,11 @@ def finite(returns: Any, instead: float) -> tuple[list[float], int]:
     return np.round(np.where(bad, instead, values), 2).tolist(), int(bad.sum())
 
 
+def run_name(file: Path) -> str:
+    """What to call an objective's file: every run's is objective.npz, and its folder tells runs apart."""
+    return file.parent.name if file.stem == "objective" else file.stem
+
+
 def span(numbers: Iterable[int]) -> str:
     """Such as "30 to 60", or "30" where all are alike."""
     low, high = min(found := list(numbers)), max(found)

@@ -12,7 +12,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from experiments.page import exit_status
+from experiments.page import exit_status, run_name
 
 
 def _short(name: str, file: Path, zoo_name: str) -> str:
@@ -22,7 +22,7 @@ def _short(name: str, file: Path, zoo_name: str) -> str:
         return name
     if path.resolve() == file.resolve():
         return zoo_name
-    return path.parent.name if path.stem == "objective" else path.stem
+    return run_name(path)
 
 
 def main() -> int:
