@@ -30,14 +30,12 @@ if TYPE_CHECKING:
 
     from lpo.objectives import Objective
     from scb.agents.settings import Setting
-    from scb.statistics import Estimate
 
 SOURCES = ("bandit", "environment")
 BANDIT = "LPO (bandit)"
 CLIPS = ("ppo-0.1", "ppo", "ppo-0.3", "ppo-0.5", "ppo-1")
 TUNING_SEED = 22_000  # the clip is chosen on these agents, and reported on others
 REPORTING_SEED = 10_000
-RESAMPLES = 5000
 SCALES = {"Flax's initialisation": 1.0, "small last layer": 0.01}
 
 _JUDGED = {"validate": True, "mean_evaluations": 16}
@@ -98,43 +96,6 @@ PRESETS: dict[str, dict[str, Any]] = {
 }
 
 
-def pooled(
-    returns: Sequence[Sequence[float]], reference: Sequence[Sequence[float]] | None = None
-) -> "Estimate":
-    """The interquartile mean over searches and agents, or its difference to a reference on the same agents.
-
-    The interval draws searches, and agents within them: what one search would find, and what one
-    agent would earn, are both uncertain.
-
-    Args:
-      returns: [searches][agents].
-      reference: [other searches][agents] of the same seeds.
-    """
-    from scb.statistics import Estimate, iqm
-
-    values = np.asarray(returns)
-    others = None if reference is None else np.asarray(reference)
-    agents = values.shape[1]
-    rng = np.random.default_rng(0)
-
-    def middle(of: np.ndarray, search: np.ndarray, agent: np.ndarray) -> np.ndarray:
-        """[N, searches], [N, agents] indices -> [N]."""
-        return iqm(of[search[:, :, None], agent[:, None, :]].reshape(len(search), -1), axis=1)
-
-    def statistic(number: int, drawn: bool) -> np.ndarray:
-        """[number] of resamples, or once of all that there is."""
-
-        def indices(size: int) -> np.ndarray:
-            return rng.integers(0, size, (number, size)) if drawn else np.arange(size)[None]
-
-        agent = indices(agents)
-        found = middle(values, indices(len(values)), agent)
-        return found if others is None else found - middle(others, indices(len(others)), agent)
-
-    low, high = np.percentile(statistic(RESAMPLES, drawn=True), [2.5, 97.5])
-    return Estimate(float(statistic(1, drawn=False)[0]), float(low), float(high), values.size)
-
-
 def search_curve(metrics: Sequence[Mapping[str, Any]], seconds: Sequence[float]) -> dict[str, Any]:
     """What a search's log says: the judged mean over generations, steps and minutes.
 
@@ -162,6 +123,8 @@ def search_curve(metrics: Sequence[Mapping[str, Any]], seconds: Sequence[float])
 
 def markdown(report: Mapping[str, Any]) -> str:
     """The page."""
+    from scb.statistics import pooled_estimate
+
     lines = [
         "# Learned policy optimisation on synthetic contextual bandits",
         "",
@@ -196,13 +159,16 @@ def markdown(report: Mapping[str, Any]) -> str:
         lines += [
             "| objective | final return, IQM [95 %] | area under the curve |",
             "| --- | --- | --- |",
-            *(f"| {o} | {text(pooled(finals[o]))} | {text(pooled(areas[o]))} |" for o in finals),
+            *(
+                f"| {o} | {text(pooled_estimate(finals[o]))} | {text(pooled_estimate(areas[o]))} |"
+                for o in finals
+            ),
             "",
             f"| {BANDIT} against | final return | area under the curve |",
             "| --- | --- | --- |",
             *(
-                f"| {o} | {text(pooled(finals[BANDIT], finals[o]), sign=True)} "
-                f"| {text(pooled(areas[BANDIT], areas[o]), sign=True)} |"
+                f"| {o} | {text(pooled_estimate(finals[BANDIT], finals[o]), sign=True)} "
+                f"| {text(pooled_estimate(areas[BANDIT], areas[o]), sign=True)} |"
                 for o in finals
                 if o != BANDIT
             ),
@@ -307,11 +273,12 @@ def _band(
 
 def _dots(axes: "Axes", table: Mapping[str, Any]) -> None:
     from scb import plotting
+    from scb.statistics import pooled_estimate
 
     for position, (objective, finals) in enumerate(table["finals"].items()):
         learned = objective.startswith("LPO")
         color = plotting.VERMILLION if learned else plotting.BLUE
-        plotting.estimate_row(axes, position, np.ravel(finals), pooled(finals), color)
+        plotting.estimate_row(axes, position, np.ravel(finals), pooled_estimate(finals), color)
     axes.set_yticks(range(len(table["finals"])), list(table["finals"]))
     axes.invert_yaxis()
     axes.set_xlabel("final return")

@@ -197,6 +197,59 @@ def stratified_estimate(
     return Estimate(float(statistic(False)[0]), float(low), float(high), size)
 
 
+def pooled_estimate(
+    groups: ArrayLike,
+    minus: ArrayLike | None = None,
+    paired_groups: bool = False,
+    confidence: float = 0.95,
+    num_resamples: int = 5000,
+    seed: int = 0,
+) -> Estimate:
+    """The interquartile mean over groups and their runs, with an interval that resamples both.
+
+    For groups that are drawn themselves: what one search would find, or one expert teach, is as
+    uncertain as what one agent would earn. Runs of the same position in all groups share a seed and are
+    drawn together.
+
+    Args:
+      groups: [G, N] N runs of each of G groups (searches, experts).
+      minus: [G', N] runs on the same seeds; the estimate is then that of the difference, paired by run.
+      paired_groups: whether groups of the same position in both belong together too.
+
+    Raises:
+      UserError: another shape; groups of other numbers to pair; NaN or infinity.
+    """
+    first = _groups("the groups", groups)
+    second = None if minus is None else _groups("the groups to subtract", minus)
+    if second is not None and (
+        first.shape[1] != second.shape[1] or (paired_groups and len(first) != len(second))
+    ):
+        raise UserError(
+            f"groups of shape {first.shape} and {second.shape} can't be compared: pair run by run"
+            + (" and group by group." if paired_groups else ".")
+        )
+    generator = np.random.default_rng(seed)
+
+    def statistic(resampled: bool) -> NDArray[np.floating]:
+        def indices(size: int) -> NDArray[np.integer]:
+            shape = (num_resamples, size)
+            return generator.integers(0, size, shape) if resampled else np.arange(size)[None]
+
+        def middle(of: NDArray[np.floating], group: NDArray[np.integer]) -> NDArray[np.floating]:
+            return iqm(of[group[:, :, None], run[:, None, :]].reshape(len(group), -1), axis=1)
+
+        run = indices(first.shape[1])
+        group = indices(len(first))
+        found = middle(first, group)
+        if second is None:
+            return found
+        return found - middle(second, group if paired_groups else indices(len(second)))
+
+    tail = 50.0 * (1.0 - confidence)
+    low, high = np.percentile(statistic(True), [tail, 100.0 - tail])
+    return Estimate(float(statistic(False)[0]), float(low), float(high), first.size)
+
+
 def normalized_score(
     returns: ArrayLike, random: ArrayLike, expert: ArrayLike
 ) -> NDArray[np.floating]:
@@ -272,6 +325,15 @@ def _runs(name: str, x: ArrayLike) -> NDArray[np.floating]:
         raise UserError(
             f"{name} has shape {values.shape}: give a vector with one number per run, averaged "
             "over episodes first."
+        )
+    return values
+
+
+def _groups(name: str, x: ArrayLike) -> NDArray[np.floating]:
+    values = _finite(name, x)
+    if values.ndim != 2:
+        raise UserError(
+            f"{name} have shape {values.shape}: give a row for each, with a run a column."
         )
     return values
 

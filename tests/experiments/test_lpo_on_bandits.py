@@ -43,36 +43,6 @@ def test_a_searchs_curve_is_its_judged_means_and_the_time_of_what_judged_nothing
     assert curve["seconds_per_generation"] == 3.0
 
 
-def test_pooled_is_the_interquartile_mean_over_searches_and_agents():
-    x = module.pooled([[1.0, 2.0, 3.0, 4.0], [5.0, 6.0, 7.0, 8.0]])
-    # Of eight values the two lowest and the two highest are left out.
-    assert (x.value, x.n) == (4.5, 8)
-    assert 1.0 <= x.low < 4.5 < x.high <= 8.0
-
-
-def test_searches_that_differ_widen_the_interval_beyond_that_of_their_agents():
-    rng = np.random.default_rng(0)
-    agents = rng.normal(size=(4, 20))
-    alike = module.pooled(agents.tolist())
-    apart = module.pooled((agents + np.array([[-30.0], [-10.0], [10.0], [30.0]])).tolist())
-    assert apart.high - apart.low > 5 * (alike.high - alike.low)
-
-
-def test_a_difference_is_paired_by_agent():
-    # Every agent is 10 better than the reference's: a difference of exactly 10, whoever is drawn.
-    reference = [0.0, 100.0, -300.0, 50.0]
-    x = module.pooled([[r + 10.0 for r in reference]], [reference])
-    assert (x.value, x.low, x.high) == pytest.approx((10.0, 10.0, 10.0))
-
-
-def test_a_difference_to_searches_that_disagree_is_uncertain():
-    reference = [50.0] * 4
-    others = [[50.0 + shift] * 4 for shift in (-30.0, -10.0, 10.0, 30.0)]
-    x = module.pooled([reference], others)
-    assert x.value == pytest.approx(0.0, abs=1e-9)
-    assert x.low < -15.0 and x.high > 15.0
-
-
 @pytest.fixture
 def report():
     curve = module.search_curve(METRICS, [50.0, 2.0, 9.0, 4.0])

@@ -12,6 +12,7 @@ from scb.statistics import (
     iqm,
     normalized_score,
     paired_difference,
+    pooled_estimate,
     spearman,
     stratified_estimate,
 )
@@ -221,3 +222,53 @@ def test_paired_differences_of_groups_cancel_what_is_common():
 def test_groups_that_cannot_be_compared_are_refused(groups, minus, message):
     with pytest.raises(UserError, match=message):
         stratified_estimate(groups, minus)
+
+
+def test_pooled_is_the_interquartile_mean_over_groups_and_runs():
+    x = pooled_estimate([[1.0, 2.0, 3.0, 4.0], [5.0, 6.0, 7.0, 8.0]])
+    # Of eight values the two lowest and the two highest are left out.
+    assert (x.value, x.n) == (4.5, 8)
+    assert 1.0 <= x.low < 4.5 < x.high <= 8.0
+
+
+def test_groups_that_differ_widen_the_interval_beyond_that_of_their_runs():
+    rng = np.random.default_rng(0)
+    agents = rng.normal(size=(4, 20))
+    alike = pooled_estimate(agents.tolist())
+    apart = pooled_estimate((agents + np.array([[-30.0], [-10.0], [10.0], [30.0]])).tolist())
+    assert apart.high - apart.low > 5 * (alike.high - alike.low)
+
+
+def test_a_pooled_difference_is_paired_by_run():
+    # Every run is 10 better than the reference's: a difference of exactly 10, whoever is drawn.
+    reference = [0.0, 100.0, -300.0, 50.0]
+    x = pooled_estimate([[r + 10.0 for r in reference]], [reference])
+    assert (x.value, x.low, x.high) == pytest.approx((10.0, 10.0, 10.0))
+
+
+def test_a_difference_to_groups_that_disagree_is_uncertain():
+    reference = [50.0] * 4
+    others = [[50.0 + shift] * 4 for shift in (-30.0, -10.0, 10.0, 30.0)]
+    x = pooled_estimate([reference], others)
+    assert x.value == pytest.approx(0.0, abs=1e-9)
+    assert x.low < -15.0 and x.high > 15.0
+
+
+def test_a_difference_of_paired_groups_cancels_what_is_common_to_a_group():
+    rng = np.random.default_rng(0)
+    both = rng.normal(size=(5, 20)) + rng.normal(scale=50.0, size=(5, 1))
+    paired = pooled_estimate(both + 1.0, both, paired_groups=True)
+    assert (paired.value, paired.low, paired.high) == pytest.approx((1.0, 1.0, 1.0))
+    alone = pooled_estimate(both + 1.0, both)
+    assert alone.high - alone.low > 20.0
+
+
+def test_a_pooled_estimate_refuses_what_it_cannot_pair():
+    with pytest.raises(UserError, match=r"shape \(3,\): give a row for each"):
+        pooled_estimate([1.0, 2.0, 3.0])
+    with pytest.raises(UserError, match="pair run by run\\."):
+        pooled_estimate([[1.0, 2.0]], [[1.0]])
+    with pytest.raises(UserError, match="group by group"):
+        pooled_estimate([[1.0]], [[1.0], [2.0]], paired_groups=True)
+    with pytest.raises(UserError, match="1 NaN"):
+        pooled_estimate([[1.0, np.nan]])
