@@ -3,7 +3,8 @@
     python -m experiments.component_replacement
 
 Four ways to learn (the bandit's reward, online behavioural cloning of a SAC expert, its action as the
-reward, its Q-function as the reward) on two distributions of states (the bandit's, the expert's).
+reward, its Q-function as the reward) on two distributions of states (the bandit's, the expert's). What
+is learned depends on the expert, so there are several.
 """
 
 import sys
@@ -26,6 +27,13 @@ BANDIT, CLONING, ACTION, Q = REWARDS = (
     "Q of the expert",
 )
 SYNTHETIC, EXPERT = STATES = ("contexts of the bandit", "states of the expert")
+# Every combination that an expert has a part in.
+REPLACED = tuple((r, s) for r in REWARDS for s in STATES if (r, s) != (BANDIT, SYNTHETIC))
+WITH = {
+    BANDIT: "the bandit's reward",
+    CLONING: "cloning",
+    ACTION: "closeness to the expert's action",
+}
 EXPERT_SEED, REPORTING_SEED = 40_000, 10_000
 
 
@@ -35,11 +43,14 @@ def cell(reward: str, states: str) -> str:
 
 
 def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None:
-    """The expert, which is trained again where the experiment goes on, then a combination at a time."""
-    missing = [
-        (r, s) for r in REWARDS for s in STATES if cell(r, s) not in report.get("returns", {})
+    """The bandit itself, then an expert at a time: each is trained again where the experiment goes on."""
+    found = report.setdefault("experts", {})
+    unfinished = [
+        number
+        for number in range(plan["experts"])
+        if len(found.get(str(number), {}).get("returns", ())) < len(REPLACED)
     ]
-    if not missing:
+    if not unfinished:
         return
     import jax
     import jax.numpy as jnp
@@ -54,130 +65,164 @@ def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None
     env, env_params = scb.make(ENVIRONMENT)
     space = env.action_space(env_params)
     bandit = open_bandit(f"Synthetic-{ENVIRONMENT}")
-    key_train, key_follow, key_judge, key_random = jax.random.split(jax.random.key(EXPERT_SEED), 4)
-    expert = components.train_sac_expert(ENVIRONMENT, env, env_params, key_train, plan["experts"])
-    visited = follow(env, env_params, expert.policy(), key_follow, plan["expert_episodes"])
-    random = follow(
-        env, env_params, lambda _, key: space.sample(key), key_random, plan["expert_episodes"]
-    )
-    judged = follow(env, env_params, expert.policy(), key_judge, 200)
-    report["sha256"] = bandit_metadata(bandit.name)["sha256"]
-    report["expert"] = np.round(judged.returns(), 2).tolist()
-    report["random"] = float(np.round(random.returns().mean(), 2))
-    report["agents"], report["episodes"] = plan["agents"], plan["episodes"]
-    states = jnp.asarray(visited.states())
     inner = inner_loop("ppo", ENVIRONMENT, space)
-    rewards = {
-        BANDIT: None,
-        ACTION: components.action_reward(expert, space),
-        Q: components.q_reward(expert, space),
-    }
-    for reward, kind in missing:
-        shown = None if kind == SYNTHETIC else states
-        if reward == CLONING:
-            source = components.ReplacedBandit(bandit, states=shown)
-            key_draw, key_agents = jax.random.split(jax.random.key(REPORTING_SEED))
-            rates = inner.sample(key_draw, plan["agents"]).learning_rate
+    key_random, key_experts = jax.random.split(jax.random.key(EXPERT_SEED))
 
-            def contexts(key: Any, source: Any = source) -> Any:
-                return source.reset_env(key, source.default_params)[0]
+    def learn(reward: Any, states: Any) -> list[float]:
+        """Returns of agents trained in the bandit with these parts replaced."""
+        replaced = components.ReplacedBandit(bandit, reward, states)
+        training = SyntheticTraining(replaced, env, env_params, inner)
+        weights = bandit.default_params.weights
+        (returns,) = judge(
+            training, weights, REPORTING_SEED, plan["agents"], plan["episodes"], mode=True
+        ).values()
+        return np.round(returns, 2).tolist()
 
-            returns = components.judge_cloning(
-                expert,
-                contexts,
-                env,
-                env_params,
-                key_agents,
-                rates,
-                plan["episodes"],
-                inner.config.activation,
-            )
-        else:
-            replaced = components.ReplacedBandit(bandit, rewards[reward], shown)
-            training = SyntheticTraining(replaced, env, env_params, inner)
-            weights = bandit.default_params.weights
-            (returns,) = judge(
-                training, weights, REPORTING_SEED, plan["agents"], plan["episodes"], mode=True
-            ).values()
-        report.setdefault("returns", {})[cell(reward, kind)] = np.round(returns, 2).tolist()
+    def imitate(expert: Any, states: Any) -> list[float]:
+        """Returns of policies cloned from the expert in these states."""
+        source = components.ReplacedBandit(bandit, states=states)
+        key_draw, key_agents = jax.random.split(jax.random.key(REPORTING_SEED))
+        returns = components.judge_cloning(
+            expert,
+            lambda key: source.reset_env(key, source.default_params)[0],
+            env,
+            env_params,
+            key_agents,
+            inner.sample(key_draw, plan["agents"]).learning_rate,
+            plan["episodes"],
+            inner.config.activation,
+        )
+        return np.round(returns, 2).tolist()
+
+    if "bandit" not in report:
+        random = follow(
+            env, env_params, lambda _, key: space.sample(key), key_random, plan["expert_episodes"]
+        )
+        report["sha256"] = bandit_metadata(bandit.name)["sha256"]
+        report["random"] = float(np.round(random.returns().mean(), 2))
+        report["bandit"] = learn(None, None)
         save()
+    for number in unfinished:
+        key_train, key_follow, key_judge = jax.random.split(
+            jax.random.fold_in(key_experts, number), 3
+        )
+        expert = components.train_sac_expert(
+            ENVIRONMENT, env, env_params, key_train, plan["candidates"]
+        )
+        visited = follow(env, env_params, expert.policy(), key_follow, plan["expert_episodes"])
+        judged = follow(env, env_params, expert.policy(), key_judge, plan["expert_episodes"])
+        entry = found.setdefault(str(number), {"returns": {}})
+        entry["own"] = np.round(judged.returns(), 2).tolist()
+        rewards = {
+            BANDIT: None,
+            ACTION: components.action_reward(expert, space),
+            Q: components.q_reward(expert, space),
+        }
+        for reward, kind in REPLACED:
+            name = cell(reward, kind)
+            if name in entry["returns"]:
+                continue
+            states = None if kind == SYNTHETIC else jnp.asarray(visited.states())
+            entry["returns"][name] = (
+                imitate(expert, states) if reward == CLONING else learn(rewards[reward], states)
+            )
+            save()
 
 
-def scores(report: Mapping[str, Any]) -> dict[str, Any]:
-    """{combination: Estimate of the normalised score}: 0 is the random policy, 1 the expert."""
-    from scb.statistics import estimate, iqm, normalized_score
+def returns_of(report: Mapping[str, Any], reward: str, states: str) -> np.ndarray:
+    """[experts, agents] of a combination; no expert has a part in the bandit itself."""
+    if (reward, states) == (BANDIT, SYNTHETIC):
+        return np.tile(report["bandit"], (len(report["experts"]), 1))
+    return np.array([x["returns"][cell(reward, states)] for x in report["experts"].values()])
 
-    ceiling = float(iqm(report["expert"]))
-    return {
-        name: estimate(normalized_score(returns, report["random"], ceiling))
-        for name, returns in report["returns"].items()
-    }
+
+def scores_of(report: Mapping[str, Any], reward: str, states: str) -> np.ndarray:
+    """[experts, agents] normalised scores: 0 is the random policy, 1 the agent's expert."""
+    from scb.statistics import iqm, normalized_score
+
+    ceilings = np.array([[iqm(x["own"])] for x in report["experts"].values()])
+    return normalized_score(returns_of(report, reward, states), report["random"], ceilings)
 
 
 def verdict(report: Mapping[str, Any]) -> str:
     """Each part of the claim, with its figures; "less" where the paired difference's interval excludes zero."""
-    from scb.statistics import paired_difference
-
-    found = scores(report)
+    from scb.statistics import pooled_estimate
 
     def of(reward: str, states: str) -> str:
-        return text(found[cell(reward, states)], 2)
+        return text(pooled_estimate(scores_of(report, reward, states)), 2)
 
-    def worse(reward: str) -> bool:
-        """Whether the same agents learn less from it than from the bandit itself."""
-        both = (report["returns"][cell(r, SYNTHETIC)] for r in (reward, BANDIT))
-        difference = paired_difference(*both)
+    def less(combination: tuple[str, str], than: tuple[str, str]) -> bool:
+        difference = pooled_estimate(
+            scores_of(report, *combination), scores_of(report, *than), paired_groups=True
+        )
         return difference.high is not None and difference.high < 0
 
-    needed = all(
-        found[cell(r, EXPERT)].value < found[cell(r, SYNTHETIC)].value
-        for r in (BANDIT, CLONING, ACTION)
-    )
+    itself = (BANDIT, SYNTHETIC)
+    needing = [r for r in (BANDIT, CLONING, ACTION) if less((r, EXPERT), (r, SYNTHETIC))]
     return (
-        "Normalised scores (0 a random policy, 1 the expert). On the expert's states instead of the bandit's "
-        f"contexts: {of(BANDIT, EXPERT)} instead of {of(BANDIT, SYNTHETIC)} with the bandit's reward, "
-        f"{of(CLONING, EXPERT)} instead of {of(CLONING, SYNTHETIC)} with cloning; the contexts "
-        f"{'are' if needed else 'are not always'} what matters. "
-        f"The expert's Q-function as the reward gives {of(Q, SYNTHETIC)}: "
-        f"{'it does work badly' if worse(Q) else 'it is not clearly worse here'}. "
-        f"Closeness to its action gives {of(ACTION, SYNTHETIC)}, which is "
-        f"{'less than' if worse(ACTION) else 'not clearly less than'} the bandit's own reward does, and cloning is "
-        f"{'worse than' if worse(CLONING) else 'as good as'} the bandit's reward."
+        f"Normalised scores (0 a random policy, 1 the expert) with {len(report['experts'])} experts; intervals over "
+        "experts and agents. On the expert's states instead of the bandit's contexts: "
+        + ", ".join(
+            f"{of(r, EXPERT)} instead of {of(r, SYNTHETIC)} with {WITH[r]}"
+            for r in (BANDIT, CLONING, ACTION)
+        )
+        + "; "
+        + (
+            "the contexts are what matters. "
+            if len(needing) == 3
+            else f"clearly less with {' and '.join(WITH[r] for r in needing)} only. "
+            if needing
+            else "clearly less with none of them. "
+        )
+        + f"The expert's Q-function as the reward gives {of(Q, SYNTHETIC)}: "
+        f"{'it does work badly' if less((Q, SYNTHETIC), itself) else 'it is not clearly worse here'}. "
+        "On the bandit's contexts, cloning is "
+        f"{'worse than' if less((CLONING, SYNTHETIC), itself) else 'not clearly worse than'}, and closeness to the "
+        f"expert's action {'worse than' if less((ACTION, SYNTHETIC), itself) else 'not clearly worse than'}, the "
+        f"bandit's own reward ({of(*itself)})."
     )
 
 
 def body(report: Mapping[str, Any]) -> list[str]:
-    """The table."""
-    from scb.statistics import estimate
+    """The table: pooled, and expert by expert."""
+    from scb.statistics import iqm, pooled_estimate
 
-    found = scores(report)
-    rows = [
-        [name.split(" | ")[0], name.split(" | ")[1], text(estimate(returns)), text(found[name], 2)]
-        for name, returns in report["returns"].items()
-    ]
+    plan = report["plan"]
+    rows = []
+    for reward in REWARDS:
+        for states in STATES:
+            scores = scores_of(report, reward, states)
+            rows.append(
+                [
+                    reward,
+                    states,
+                    text(pooled_estimate(returns_of(report, reward, states))),
+                    text(pooled_estimate(scores), 2),
+                    ", ".join(f"{x:.2f}" for x in iqm(scores, axis=1)).replace("-", "\u2212"),
+                ]
+            )
+    owns = ", ".join(f"{iqm(x['own']):.0f}" for x in report["experts"].values())
     return [
-        f"{report['agents']} PPO agents (ReLU, hyperparameters drawn from the paper's lists, 10 000 steps) a "
-        f"combination, the same draws for each; {report['episodes']} episodes of most likely actions; reporting seed "
-        "10 000. Cloning takes as many states and as many gradient steps, with PPO's learning rates. The expert is "
-        "SAC, trained on the environment, "
-        f"the best of several on other episodes: {text(estimate(report['expert']))} over 200 episodes; a random policy "
-        f"earns {report['random']:.0f}. Interquartile means with 95 % intervals.".replace(
-            "earns -", "earns \u2212"
-        ),
+        f"{plan['agents']} PPO agents (ReLU, hyperparameters drawn from the paper's lists, 10 000 steps) a combination "
+        f"and expert, the same draws for each; {plan['episodes']} episodes of most likely actions; reporting seed "
+        "10 000. Cloning takes as many states and as many gradient steps, with PPO's learning rates. "
+        f"{len(report['experts'])} experts, each the best of {plan['candidates']} SAC agents trained on the "
+        f"environment, by other episodes; they earn {owns} over {plan['expert_episodes']} episodes, a random policy "
+        f"{report['random']:.0f}. Interquartile means with 95 % intervals that draw experts, and agents; the last "
+        "column is the score with each expert.".replace("-", "\u2212"),
         "",
-        *table(["learning from", "states", "return", "normalised score"], rows),
+        *table(["learning from", "states", "return", "normalised score", "expert by expert"], rows),
     ]
 
 
 def draw(report: Mapping[str, Any]) -> "Figure":
-    """A line a combination: the score with its interval, each agent a dot."""
+    """A line a combination: the score with its interval, each expert a dot."""
     from matplotlib.figure import Figure
 
     from scb import plotting
-    from scb.statistics import iqm, normalized_score
+    from scb.statistics import iqm, pooled_estimate
 
-    found = scores(report)
-    ceiling = float(iqm(report["expert"]))
+    number = len(report["experts"])
     with plotting.figure_style():
         figure = Figure(figsize=(plotting.WIDTH, 3.6))
         axes = figure.subplots()
@@ -186,15 +231,18 @@ def draw(report: Mapping[str, Any]) -> "Figure":
                 (SYNTHETIC, -0.15, plotting.VERMILLION),
                 (EXPERT, 0.15, plotting.BLUE),
             ):
-                name = cell(reward, states)
-                values = normalized_score(report["returns"][name], report["random"], ceiling)
-                plotting.estimate_row(axes, i + offset, values, found[name], color)
+                scores = scores_of(report, reward, states)
+                plotting.estimate_row(
+                    axes, i + offset, iqm(scores, axis=1), pooled_estimate(scores), color
+                )
         axes.axvline(1.0, color=plotting.BLACK, linestyle=":", linewidth=1.2)
         axes.set_yticks(range(len(REWARDS)), list(REWARDS))
         axes.invert_yaxis()
         axes.set_xlabel("normalised score on Pendulum (0: random policy, 1: the SAC expert)")
         plotting.figure_title(
-            figure, f"Learning in a bandit with replaced parts: {report['agents']} agents each"
+            figure,
+            f"Learning in a bandit with replaced parts: {number} experts (dots), "
+            f"{report['plan']['agents']} agents each",
         )
         handles: list[Any] = [
             axes.plot([], [], "o", color=color)[0] for color in (plotting.VERMILLION, plotting.BLUE)
@@ -211,10 +259,22 @@ EXPERIMENT = Experiment(
     "the reward does not work well; cloning the expert, or rewarding closeness to its action, on the bandit's contexts "
     "does as well as the bandit's reward.",
     presets={
-        "quick": {"experts": 4, "expert_episodes": 64, "agents": 20, "episodes": 20},
-        "paper": {"experts": 10, "expert_episodes": 256, "agents": 20, "episodes": 50},
+        "quick": {
+            "experts": 3,
+            "candidates": 2,
+            "expert_episodes": 64,
+            "agents": 20,
+            "episodes": 20,
+        },
+        "paper": {
+            "experts": 10,
+            "candidates": 4,
+            "expert_episodes": 256,
+            "agents": 20,
+            "episodes": 50,
+        },
     },
-    minutes={"quick": "3", "paper": "6"},
+    minutes={"quick": "5", "paper": "18"},
     measure=measure,
     verdict=verdict,
     body=body,

@@ -1,13 +1,8 @@
-from types import SimpleNamespace
-
-import jax
 import numpy as np
 import pytest
 
 from experiments import episode_lengths as experiment
-from experiments import searches
 from experiments.episode_lengths import BINS, OWN
-from scb.discovery import BanditDiscovery
 
 TINY = {
     "seed": 0,
@@ -61,35 +56,21 @@ def test_the_page_and_the_figure_show_every_limit():
     assert [t.get_text() for t in right.get_xticklabels()] == TINY["limits"]
 
 
-def unsearched(config, folder):
-    """A search of no generations: the random weights that it would start from."""
-    problem = BanditDiscovery(config)
-    return problem, SimpleNamespace(mean=problem.bandit.init_weights(jax.random.key(0)))
-
-
-def test_a_limit_of_one_step_is_kept_and_many_are_counted(monkeypatch):
+def test_a_limit_of_one_step_is_kept_and_many_are_counted(tmp_path, monkeypatch):
     monkeypatch.setattr(experiment, "CLASSIC_CONTROL", ("MountainCar-v0",))
-    monkeypatch.setattr(searches, "search", unsearched)
     found, saved = {}, []
-    plan = {**TINY, "runs": "nowhere"}
+    plan = {**TINY, "runs": str(tmp_path)}
     experiment.measure(plan, found, lambda: saved.append(1))
+    # Each limit's MDP is searched before it is judged.
+    assert {x.name for x in tmp_path.iterdir()} == {"MountainCar-v0-max", "MountainCar-v0-1"}
     entry = found["environments"]["MountainCar-v0"]
     assert len(saved) == 2 and entry["limit"] == 200 and entry["random"] == -200.0
     assert sum(entry["lengths"]["ppo"].values()) == 2 * 3
-    assert all(
-        -200.0 <= x <= -80.0 for limit in TINY["limits"] for x in entry["returns"][limit]["ppo"]
-    )
+    for limit in TINY["limits"]:
+        returns = entry["returns"][limit]["ppo"]
+        assert len(returns) == 2 and all(-200.0 <= x <= -80.0 for x in returns)
     experiment.measure(plan, found, lambda: saved.append(1))
     assert len(saved) == 2
-
-
-@pytest.mark.slow
-def test_an_mdp_is_searched_before_it_is_judged(tmp_path, monkeypatch):
-    monkeypatch.setattr(experiment, "CLASSIC_CONTROL", ("MountainCar-v0",))
-    found = {}
-    experiment.measure({**TINY, "runs": str(tmp_path)}, found, lambda: None)
-    assert {x.name for x in tmp_path.iterdir()} == {"MountainCar-v0-max", "MountainCar-v0-1"}
-    assert len(found["environments"]["MountainCar-v0"]["returns"]["1"]["ppo"]) == 2
 
 
 @pytest.mark.parametrize("preset", ["quick", "paper"])
