@@ -23,7 +23,11 @@ def modules() -> list[str]:
     """Names of the modules that are commands."""
     folder = Path(__file__).parent
     names = (m.name for m in pkgutil.iter_modules([str(folder)]))
-    return [n for n in names if n not in ("__main__", "page", "rejax_peer", "searches")]
+    return [
+        n
+        for n in names
+        if n not in ("__main__", "page", "rejax_peer", "searches", "zoo_table_page")
+    ]
 
 
 def found() -> dict[str, Experiment]:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from experiments import zoo_table
+from experiments import zoo_table, zoo_table_page
 from experiments.page import Experiment, Save, table, text
 from experiments.page import main as run
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 OURS, PUBLISHED = "ours", "published"
 REPORTING_SEED = 10_000
 # Final returns of agents trained in the environment, Liesen et al. (2024), table of Brax results, columns EE;
-# those of agents trained in bandits are `zoo_table.PAPER`.
+# those of agents trained in bandits are `zoo_table_page.PAPER`.
 PAPER: dict[str, dict[str, float]] = {
     "hopper": {"ppo": 2521.9, "sac": 3119.4, "ddpg": 1536.0, "td3": 3325.8},
     "walker2d": {"ppo": 2039.6, "sac": 4140.1, "ddpg": 698.3, "td3": 4605.8},
@@ -254,7 +254,7 @@ def body(report: Mapping[str, Any]) -> list[str]:
                     algorithm.upper(),
                     text(estimate(finals(curves))),
                     text(estimate(finals(own[algorithm]))) if algorithm in own else "",
-                    "" if paper is None else f"{zoo_table.PAPER[environment][algorithm]:.0f}",
+                    "" if paper is None else f"{zoo_table_page.PAPER[environment][algorithm]:.0f}",
                     "" if paper is None else f"{paper:.0f}",
                     f"{curves['seconds'] / len(curves['returns']):.1f}",
                     f"{own[algorithm]['seconds'] / len(own[algorithm]['returns']):.0f}"

@@ -16,7 +16,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from experiments.page import exit_status
-from experiments.zoo_table import ENVIRONMENTS, TARGETS, label, read_report
+from experiments.zoo_table import read_report
+from experiments.zoo_table_page import ENVIRONMENTS, TARGETS, label
 from lpo.cli import configure_jax
 
 if TYPE_CHECKING:
