@@ -198,7 +198,7 @@ def body(report: Mapping[str, Any]) -> list[str]:
                     states,
                     text(pooled_estimate(returns_of(report, reward, states))),
                     text(pooled_estimate(scores), 2),
-                    ", ".join(f"{x:.2f}" for x in iqm(scores, axis=1)).replace("-", "\u2212"),
+                    ", ".join(f"{x:z.2f}" for x in iqm(scores, axis=1)).replace("-", "\u2212"),
                 ]
             )
     owns = ", ".join(f"{iqm(x['own']):.0f}" for x in report["experts"].values())
