@@ -58,12 +58,18 @@ def listing() -> str:
 
 def overview(experiments: Sequence[Experiment], data: Path) -> str:
     """The page with all verdicts, from the reports that there are."""
+    from scb.errors import UserError
+
     lines = ["# The paper's experiments", "", "`python -m experiments --preset quick`", ""]
     for experiment in experiments:
         path = data / f"{experiment.name}.json"
         if not path.exists():
             continue
-        report = page.read(path)
+        try:
+            report = page.read(path)
+        except UserError:
+            lines += [f"## {experiment.title}", "", "Its report cannot be read.", ""]
+            continue
         if not page.complete(report):
             lines += [f"## {experiment.title}", "", "Measured in part only.", ""]
             continue

@@ -14,15 +14,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from experiments import searches
-from experiments.page import Experiment, Save, table, text
+from experiments.page import Experiment, Save, table
 from experiments.page import main as run
-from experiments.searches import NONE, PAPER_SIZES
+from experiments.searches import ENOUGH, NONE, PAPER_SIZES, Final
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from scb.discovery import DiscoveryConfig
-    from scb.statistics import Estimate
 
 ENVIRONMENTS = ("Pendulum-v1", "MountainCar-v0")
 # The paper finds no curriculum for Pendulum.
@@ -94,8 +93,8 @@ def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None
                 save()
 
 
-def finals(report: Mapping[str, Any], environment: str, search: str) -> "Estimate | None":
-    """The last judgement, the mean over searches; None where every one failed."""
+def finals(report: Mapping[str, Any], environment: str, search: str) -> Final:
+    """The last judgement, the mean over searches."""
     return searches.final(report["environments"][environment][search], np.mean)
 
 
@@ -109,14 +108,7 @@ def _never_reached(report: Mapping[str, Any], environment: str, search: str) -> 
     """Whether no agent of any judgement earned more than one that never reaches the goal."""
     curves = report["environments"][environment][search].values()
     means = [x for c in curves for x in c["mean"] if x is not None]
-    return environment in WORST and max(means) <= WORST[environment]
-
-
-def _clearly(a: "Estimate | None", b: "Estimate | None") -> bool:
-    """Whether a's interval lies above b's; failing altogether is worse than anything."""
-    if a is None or b is None:
-        return a is not None
-    return a.low is not None and b.high is not None and a.low > b.high
+    return environment in WORST and bool(means) and max(means) <= WORST[environment]
 
 
 def verdict(report: Mapping[str, Any]) -> str:
@@ -128,9 +120,7 @@ def verdict(report: Mapping[str, Any]) -> str:
             for row, labels in rows(environment).items()
         }
         described = {
-            row: ", ".join(
-                f"{label} {text(x) if x else 'all failed'}" for label, x in estimates.items()
-            )
+            row: ", ".join(f"{label} {x.text()}" for label, x in estimates.items())
             for row, estimates in found.items()
         }
         learned = found["what is learned"]
@@ -142,8 +132,11 @@ def verdict(report: Mapping[str, Any]) -> str:
                 "paper's claims about it untested."
             )
             continue
+        few = report["plan"]["environments"][environment]["seeds"] < ENOUGH
         said = [
-            f"{environment}: {described['what is learned']}",
+            f"{environment}"
+            + (" (too few searches to tell anything clearly apart)" if few else "")
+            + f": {described['what is learned']}",
             f"TI {_compared(learned['TI'], learned['T'])} T, I {_compared(learned['I'], learned['TI'])} TI",
         ]
         if name_of("T", "normal", NONE) in never:
@@ -151,23 +144,23 @@ def verdict(report: Mapping[str, Any]) -> str:
         said.append(f"latents: {described['latent']}")
         continuous = [x for label, x in found["latent"].items() if "categorical" not in label]
         categorical = [x for label, x in found["latent"].items() if "categorical" in label]
-        every = all(_clearly(x, y) for x in continuous for y in categorical)
+        every = all(x.clearly_above(y) for x in continuous for y in categorical)
         said.append(
             "the continuous ones are " + ("clearly better" if every else "not all clearly better")
         )
         if "curriculum" in found:
             none = found["curriculum"][NONE]
-            better = [x for x, e in found["curriculum"].items() if x != NONE and _clearly(e, none)]
+            better = [x for x, e in found["curriculum"].items() if e.clearly_above(none)]
             said.append(f"curricula: {described['curriculum']}")
             said.append(f"clearly better than none: {', '.join(better) or 'no shape'}")
         parts.append("; ".join(said) + ".")
     return " ".join(parts)
 
 
-def _compared(a: "Estimate | None", b: "Estimate | None") -> str:
-    if _clearly(a, b):
+def _compared(a: Final, b: Final) -> str:
+    if a.clearly_above(b):
         return "is clearly better than"
-    return "is clearly worse than" if _clearly(b, a) else "is not clearly apart from"
+    return "is clearly worse than" if b.clearly_above(a) else "is not clearly apart from"
 
 
 def body(report: Mapping[str, Any]) -> list[str]:
@@ -192,7 +185,7 @@ def body(report: Mapping[str, Any]) -> list[str]:
                         environment,
                         row,
                         label,
-                        "all failed" if found is None else text(found, 1),
+                        found.text(1),
                         f"{_worst_failing(report, environment, search):.0%}",
                         f"{np.mean(seconds):.0f}",
                     ]

@@ -6,6 +6,7 @@ Searches from random weights that differ in the curriculum's shape alone; run fo
 runs/brax_curriculum and are resumed.
 """
 
+import math
 import sys
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
@@ -13,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from experiments import searches
-from experiments.page import Experiment, Save, table, text
+from experiments.page import Experiment, Save, table
 from experiments.page import main as run
 from experiments.searches import NONE, curriculum_of
 
@@ -21,7 +22,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from scb.discovery import DiscoveryConfig
-    from scb.statistics import Estimate
 
 ENVIRONMENT = "hopper"
 # What standing still earns in an episode of 1000 steps, the local optimum of searches without a curriculum.
@@ -54,20 +54,24 @@ def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None
             save()
 
 
-def finals(report: Mapping[str, Any]) -> dict[str, "Estimate"]:
-    """{shape: the last judgement, over searches}; those that failed altogether are left out."""
+def finals(report: Mapping[str, Any]) -> dict[str, searches.Final]:
+    """{shape: the last judgement, over searches}."""
     from scb.statistics import iqm
 
-    found = {shape: searches.final(curves, iqm) for shape, curves in report["curves"].items()}
-    return {shape: x for shape, x in found.items() if x is not None}
+    return {shape: searches.final(curves, iqm) for shape, curves in report["curves"].items()}
 
 
 def verdict(report: Mapping[str, Any]) -> str:
     """Every curriculum against every search without one."""
     found = finals(report)
     without = [c["fitness"][-1] for c in report["curves"][NONE].values()]
-    best = max(x for x in without if x is not None)
-    above = [shape for shape, x in found.items() if shape != NONE and x.value > best]
+    best = max((x for x in without if x is not None), default=-math.inf)
+    # A failed search is worse than any.
+    above = [
+        shape
+        for shape, x in found.items()
+        if shape != NONE and x.estimate is not None and not x.failed and x.estimate.value > best
+    ]
     shapes = [shape for shape in found if shape != NONE]
     said = (
         "every curriculum ends above the best of them"
@@ -79,10 +83,14 @@ def verdict(report: Mapping[str, Any]) -> str:
     )
     generations = report["plan"]["generations"]
     return (
-        f"after {generations} generations (the paper's searches take 2000) the agents earn {text(found[NONE])} without "
-        f"a curriculum, over {found[NONE].n} searches; with one: "
-        + ", ".join(f"{shape} {text(found[shape])}" for shape in shapes)
-        + f". Of the searches without one the best ends at {best:.0f}: {said}."
+        f"after {generations} generations (the paper's searches take 2000) the agents earn {found[NONE].text()} "
+        f"without a curriculum, over {found[NONE].searches} searches; with one: "
+        + ", ".join(f"{shape} {found[shape].text()}" for shape in shapes)
+        + (
+            f". Of the searches without one the best ends at {best:.0f}: {said}."
+            if math.isfinite(best)
+            else ". Every search without one failed."
+        )
         + (
             f" None of them earns what standing still does ({STANDING:.0f}), the local optimum that the claim is "
             "about: so few generations do not test it."
@@ -99,8 +107,8 @@ def body(report: Mapping[str, Any]) -> list[str]:
     rows = [
         [
             shape,
-            str(found.n),
-            text(found),
+            str(found.searches),
+            found.text(),
             f"{np.mean([c['seconds'] for c in report['curves'][shape].values()]) / 60:.1f}",
         ]
         for shape, found in finals(report).items()

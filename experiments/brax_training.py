@@ -57,8 +57,14 @@ def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None
     bandits = report.setdefault("bandits", {})
     environments = report.setdefault("environments", {})
     at_hand = published_folder() is not None
-    left_out = [x for x in plan["bandits"] if x[0] == PUBLISHED and not at_hand]
+
+    def there(of: list[Any]) -> bool:
+        return set(plan["bandit_algorithms"]) <= set(bandits.get(task(*of), ()))
+
+    left_out = [x for x in plan["bandits"] if x[0] == PUBLISHED and not at_hand and not there(x)]
     report["left_out"] = [task(*x) for x in left_out]
+    for name in report["left_out"]:
+        bandits.pop(name, None)  # a part of its algorithms can't be shown
     measured = [x for x in plan["bandits"] if x not in left_out]
     for kind, environment, backend in measured:
         entry = bandits.setdefault(task(kind, environment, backend), {})
@@ -160,11 +166,15 @@ def _curves(
 
     start = time.monotonic()
     keys = jax.random.split(jax.random.key(REPORTING_SEED), number)
-    returns = map_population(train, number, (0,))(keys)
+    returns = np.asarray(map_population(train, number, (0,))(keys))
+    seconds = time.monotonic() - start
+    # What is no number counts as the agent before its training.
+    usable = np.isfinite(returns)
     return {
         "steps": [agent.config.steps_after(n) for n in range(0, iterations + 1, every)],
-        "returns": np.round(returns, 1).tolist(),
-        "seconds": round(time.monotonic() - start, 1),
+        "returns": np.round(np.where(usable, returns, returns[:, :1]), 1).tolist(),
+        "failed": int((~usable).any(axis=1).sum()),
+        "seconds": round(seconds, 1),
     }
 
 
@@ -180,7 +190,10 @@ def finals(curves: Mapping[str, Any]) -> np.ndarray:
 
 
 def steps_to_match(curves: Mapping[str, Any], level: float) -> list[int | None]:
-    """For each agent the steps of its first evaluation that reaches the level; None where it never does."""
+    """For each agent the steps of its first evaluation that reaches the level; None where it never does.
+
+    What lies between two evaluations isn't seen: an agent may be there up to their distance earlier.
+    """
     reached = np.asarray(curves["returns"]) >= level
     return [int(curves["steps"][int(np.argmax(row))]) if row.any() else None for row in reached]
 
@@ -209,6 +222,7 @@ def matches(report: Mapping[str, Any]) -> list[dict[str, Any]]:
                     "agents": len(steps),
                     "steps": median if np.isfinite(median) else None,
                     "trained": curves["steps"][-1],
+                    "spacing": curves["steps"][1] - curves["steps"][0],
                 }
             )
     return rows
@@ -226,8 +240,8 @@ def verdict(report: Mapping[str, Any]) -> str:
         said += (
             f"in the median not within {row['trained']} steps, {most:.0f} times the bandit's"
             if row["steps"] is None
-            else f"after {row['steps']:.0f} steps in the median, {row['steps'] / row['bandit_steps']:.0f} times the "
-            "bandit's"
+            else f"by {row['steps']:.0f} steps in the median (evaluations are {row['spacing']} apart), "
+            f"{row['steps'] / row['bandit_steps']:.0f} times the bandit's"
         )
         if most < 100:
             said += (
@@ -269,12 +283,15 @@ def body(report: Mapping[str, Any]) -> list[str]:
             f"{row['level']:.0f}",
             f"{row['reached']} of {row['agents']}",
             f"more than {row['trained']}" if row["steps"] is None else f"{row['steps']:.0f}",
+            str(row["spacing"]),
             f"more than {row['trained'] / row['bandit_steps']:.0f}"
             if row["steps"] is None
             else f"{row['steps'] / row['bandit_steps']:.0f}",
         ]
         for row in matches(report)
     ]
+    of_all = [report["bandits"], report["environments"]]
+    failed = sum(x.get("failed", 0) for by in of_all for y in by.values() for x in y.values())
     return [
         f"In bandits: {plan['bandit_agents']} agents of each algorithm with the paper's fixed inner-loop "
         f"hyperparameters, 10 000 steps. In environments: {plan['environment_agents']} agents of "
@@ -287,6 +304,11 @@ def body(report: Mapping[str, Any]) -> list[str]:
         + (
             f" Left out, since SCB_PUBLISHED names no folder that holds them: {'; '.join(report['left_out'])}."
             if report["left_out"]
+            else ""
+        )
+        + (
+            f" Agents with returns that are no number, counted as untrained: {failed}."
+            if failed
             else ""
         ),
         "",
@@ -304,7 +326,8 @@ def body(report: Mapping[str, Any]) -> list[str]:
             rows,
         ),
         "",
-        "Steps in the environment until an agent's evaluation reaches what the bandit's agents earn:",
+        "Steps in the environment until an agent's evaluation reaches what the bandit's agents earn; it may have been "
+        "there as much earlier as evaluations are apart:",
         "",
         *table(
             [
@@ -313,6 +336,7 @@ def body(report: Mapping[str, Any]) -> list[str]:
                 "level",
                 "agents that reach it",
                 "steps (median)",
+                "evaluations apart",
                 "times the bandit's",
             ],
             matched,

@@ -273,11 +273,16 @@ def verdict(report: Mapping[str, Any]) -> str:
     ]
     own = stratified_estimate(together[ZOO])
     unseen = {name: stratified_estimate(normalized(report, ZOO, name)) for name in UNSEEN}
-    worse = [
-        name
-        for name, x in unseen.items()
-        if x.high is not None and own.low is not None and x.high < own.low
-    ]
+
+    def clearly_worse(name: str) -> bool:
+        """Networks differ from the paper's agent by agent; other agents are compared by intervals that lie apart."""
+        if name in (WIDE, SWISH):
+            difference = stratified_estimate(normalized(report, ZOO, name), together[ZOO])
+            return difference.high is not None and difference.high < 0
+        high = unseen[name].high
+        return high is not None and own.low is not None and high < own.low
+
+    worse = [name for name in unseen if clearly_worse(name)]
     parts.append(
         "Agents that are not in the paper's inner loop, in the zoo's bandits: "
         + ", ".join(f"{name} {text(x, 2)}" for name, x in unseen.items())

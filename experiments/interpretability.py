@@ -45,10 +45,11 @@ def _examine(name: str, plan: Mapping[str, Any]) -> dict[str, Any]:
     env, env_params = scb.make(name)
     numbers, parts = explain(bandit, env, env_params, name, plan["episodes"], plan["seed"])
     keys = jax.random.split(jax.random.key(plan["seed"] + 1), plan["repetitions"])
-    shares = [
-        np.asarray(reward_variance(bandit, jnp.asarray(bandit_states(bandit, k, 2000)), k))
-        for k in keys
-    ]
+    shares = []
+    for key in keys:
+        key_contexts, key_vary = jax.random.split(key)
+        contexts = jnp.asarray(bandit_states(bandit, key_contexts, 2000))
+        shares.append(np.asarray(reward_variance(bandit, contexts, key_vary)))
     plane = parts["plane"]
     _, _, nodes = plane.grid(POINTS)
     actions = parts["best"](nodes)
@@ -99,6 +100,8 @@ def verdict(report: Mapping[str, Any]) -> str:
             if max(position, angle) < HARDLY
             else "holds for the position only."
             if position < HARDLY
+            else "holds for the angle only."
+            if angle < HARDLY
             else "does not hold in this bandit."
         ),
         f"MountainCar's best action is to do nothing in {idle:.1%} of the plane, and the continuous one's next to "
@@ -108,6 +111,8 @@ def verdict(report: Mapping[str, Any]) -> str:
             if idle < 0.01 and idle_continuous > 0.1
             else "the first half holds."
             if idle < 0.01
+            else "the second half holds."
+            if idle_continuous > 0.1
             else "does not hold."
         ),
     ]
@@ -130,8 +135,8 @@ def body(report: Mapping[str, Any]) -> list[str]:
         "they are continuous; the line is an episode of that policy in the environment. Where an observation has more "
         "than two entries, the two that matter most span the plane and the others are at their median (Pendulum: angle "
         "and angular velocity). Bottom: the share of the reward's variance that an entry of the observation causes "
-        "when it alone takes other values (Sobol's total-effect index over 2000 of the bandit's contexts, several "
-        "draws).",
+        "when it alone takes other values (Sobol's total-effect index, each entry drawn from 2000 of the bandit's "
+        "contexts apart from the others; several draws).",
         "",
         f"What the best-action policy earns in the environment, with no training at all: {returns}.",
         "",

@@ -94,8 +94,8 @@ def random_mdp(rng: np.random.Generator, states: int, actions: int) -> MDP:
     return replace(mdp, reward=reward)
 
 
-# What the bandit's reward may be: the same maximisers as Q*, in the paper's three forms, and two that
-# the lemma does not cover.
+# What the bandit's reward may be: the same maximisers as Q* in three forms, and two that the lemma does
+# not cover.
 def _q(mdp: MDP, q: Floats) -> Floats:
     return q
 
@@ -168,13 +168,13 @@ def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None
             key = f"{construction} | {contexts}"
             if key in report.setdefault("regrets", {}):
                 continue
-            # The same MDPs for each.
-            rng = np.random.default_rng(plan["seed"])
+            # The same MDPs for each, however many numbers their policies take.
             regrets = []
-            for _ in range(plan["mdps"]):
+            for number in range(plan["mdps"]):
+                rng, rng_policies = np.random.default_rng([plan["seed"], number]).spawn(2)
                 states, actions = int(rng.integers(3, 30)), int(rng.integers(2, 6))
-                mdp = random_mdp(np.random.default_rng(rng.integers(2**31)), states, actions)
-                regrets.append(regret(mdp, construction, contexts, rng, POLICIES))
+                mdp = random_mdp(rng, states, actions)
+                regrets.append(regret(mdp, construction, contexts, rng_policies, POLICIES))
             optimal = float(np.mean(np.asarray(regrets) < 1e-6))
             report["regrets"][key] = {"optimal": optimal, "largest": max(regrets)}
             save()
@@ -192,8 +192,8 @@ def verdict(report: Mapping[str, Any]) -> str:
     lost = 1.0 - found[f"Q* | {ONE}"]["optimal"]
     text = (
         f"{'it holds' if holds else 'it fails'} where the bandit shows the states of every optimal policy, or "
-        f"where its reward singles out one: all of {report['policies']} policies drawn from the optima of each of "
-        f"{report['mdps']:,} bandits are optimal in their MDP."
+        f"where its reward singles out one: {'all' if holds else 'not all'} of {report['policies']} policies drawn "
+        f"from the optima of each of {report['mdps']:,} bandits are optimal in their MDP."
     )
     if lost > 0:
         text += (

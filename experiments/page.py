@@ -196,7 +196,7 @@ def render(experiment: Experiment, report: Mapping[str, Any], docs: Path) -> Non
     if not complete(report):
         raise UserError(
             f"the report of {experiment.name} is not complete: run python -m experiments.{experiment.name} "
-            f"--preset {report['preset']}, which goes on where it was."
+            f"--preset {report.get('preset', 'quick')}, which goes on where it was."
         )
 
     docs.mkdir(parents=True, exist_ok=True)
@@ -208,7 +208,7 @@ def render(experiment: Experiment, report: Mapping[str, Any], docs: Path) -> Non
 
 def complete(report: Mapping[str, Any]) -> bool:
     """Whether everything that the report is about was measured."""
-    return bool(report.get("complete", True))
+    return bool(report.get("complete"))
 
 
 def _measure(experiment: Experiment, preset: str, report: dict[str, Any], out: Path) -> None:
@@ -226,22 +226,21 @@ def _measure(experiment: Experiment, preset: str, report: dict[str, Any], out: P
             f"{out} was measured when the preset {preset} was another one: choose another --out."
         )
     before, start = report.get("seconds", 0.0), time.monotonic()
-    report |= {
-        "preset": preset,
-        "plan": plan,
-        "complete": False,
-        "versions": package_versions(),
-        "machine": machine_description(),
-    }
+    # What measures nothing leaves the report to the machine that made it.
+    here = {"versions": package_versions(), "machine": machine_description()}
+    report |= {"preset": preset, "plan": plan, "complete": False}
 
-    def save() -> None:
-        report["seconds"] = round(before + time.monotonic() - start, 1)
+    def write() -> None:
         out.parent.mkdir(parents=True, exist_ok=True)
         write_json(out, report)
 
+    def save() -> None:
+        report.update(here, seconds=round(before + time.monotonic() - start, 1))
+        write()
+
     experiment.measure(plan, report, save)
     report["complete"] = True
-    save()
+    write()
 
 
 def read(path: Path, missing_is_new: bool = False) -> dict[str, Any]:

@@ -2,8 +2,11 @@
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from experiments.page import text
 
 if TYPE_CHECKING:
     from scb.curriculum import CurriculumConfig
@@ -12,6 +15,8 @@ if TYPE_CHECKING:
     from scb.statistics import Estimate
 
 NONE = "none"  # the curriculum that is none
+# Of two searches the bootstrap's interval is their range: two such lie apart by chance in every third comparison.
+ENOUGH = 5
 
 # The paper's tables of the outer loop, classic control.
 PAPER_SIZES: dict[str, dict[str, int]] = {
@@ -121,25 +126,62 @@ def curve(metrics: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]:
         if "mean/fitness" in line:
             generations.append(line["generation"])
             fitness.append(_rounded(line.get("mean/fitness_iqm")))
-            mean.append(_rounded(line["mean/fitness"]))
+            mean.append(_rounded(line["mean/fitness"], 4))
             failed.append(round(sum(since) / len(since), 3) if since else 0.0)
             since = []
         since.append(line["failed"])
         if "final_mean/fitness" in line:
             generations.append(line["generation"] + 1)
             fitness.append(_rounded(line.get("final_mean/fitness_iqm")))
-            mean.append(_rounded(line["final_mean/fitness"]))
+            mean.append(_rounded(line["final_mean/fitness"], 4))
             failed.append(round(sum(since) / len(since), 3))
     return {"generation": generations, "fitness": fitness, "mean": mean, "failed": failed}
 
 
-def final(curves: Mapping[str, Mapping[str, Any]], statistic: Any) -> "Estimate | None":
-    """The last judgement, over the searches of {seed: curve}; None where every one failed."""
+@dataclass(frozen=True)
+class Final:
+    """What several searches were worth at their end.
+
+    Attributes:
+      estimate: over those that didn't fail; None where every one failed.
+      failed: searches whose last judgement is no number.
+    """
+
+    estimate: "Estimate | None"
+    failed: int
+
+    @property
+    def searches(self) -> int:
+        """How many there were."""
+        return self.failed + (0 if self.estimate is None else self.estimate.n)
+
+    def text(self, places: int = 0) -> str:
+        """Such as "12 [9, 14]", with the failures where there are some."""
+        if self.estimate is None:
+            return "all failed"
+        found = text(self.estimate, places)
+        return f"{found} ({self.failed} of {self.searches} failed)" if self.failed else found
+
+    def clearly_above(self, other: "Final") -> bool:
+        """Whether the interval lies above the other's; a failure is worse than any return.
+
+        Never of fewer than five searches.
+        """
+        if self.estimate is None or self.failed or min(self.searches, other.searches) < ENOUGH:
+            return False
+        if other.estimate is None:
+            return True
+        low, high = self.estimate.low, other.estimate.high
+        return low is not None and high is not None and low > high
+
+
+def final(curves: Mapping[str, Mapping[str, Any]], statistic: Any) -> Final:
+    """The last judgement, over the searches of {seed: curve}."""
     from scb.statistics import estimate
 
     last = [c["fitness"][-1] for c in curves.values() if c["fitness"][-1] is not None]
-    return estimate(last, statistic) if last else None
+    return Final(estimate(last, statistic) if last else None, len(curves) - len(last))
 
 
-def _rounded(value: float | None) -> float | None:
-    return None if value is None or not math.isfinite(value) else round(float(value), 2)
+def _rounded(value: float | None, digits: int = 2) -> float | None:
+    return None if value is None or not math.isfinite(value) else round(float(value), digits)

@@ -252,7 +252,7 @@ EXPERIMENT = Experiment(
             "entries": _ENTRIES,
         },
     },
-    minutes={"quick": "7", "paper": "13"},
+    minutes={"quick": "7", "paper": "15"},
     measure=measure,
     verdict=verdict,
     body=body,

@@ -28,10 +28,13 @@ VIEWER = Path("runs/visualize/hopper.html")
 
 def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None:
     """An environment at a time: train, choose, record."""
+    found = report.setdefault("environments", {})
     for name in (*CLASSIC_CONTROL, HOPPER):
-        if name not in report.setdefault("environments", {}):
-            report["environments"][name] = _show(name, plan)
+        if name not in found:
+            found[name] = _show(name, plan)
             save()
+        elif name == HOPPER and not VIEWER.exists():
+            _show(name, plan)  # for its page, which no report holds
 
 
 def _show(name: str, plan: Mapping[str, Any]) -> dict[str, Any]:
@@ -42,6 +45,7 @@ def _show(name: str, plan: Mapping[str, Any]) -> dict[str, Any]:
     from scb.analysis import animation
     from scb.analysis.states import follow
     from scb.environments.zoo import open_bandit
+    from scb.errors import UserError
     from scb.statistics import estimate
 
     brax = name == HOPPER
@@ -61,6 +65,8 @@ def _show(name: str, plan: Mapping[str, Any]) -> dict[str, Any]:
         return state, found.returns.mean()
 
     states, returns = train(jax.random.split(key_train, plan["agents"]))
+    if not np.isfinite(returns).all():
+        raise UserError(f"an agent of {name} has no finite return: choose another seed.")
     best = int(np.argmax(returns))
     state = jax.tree.map(lambda x: x[best], states)
 
@@ -120,7 +126,7 @@ def body(report: Mapping[str, Any]) -> list[str]:
         if name != HOPPER
     ]
     rows = [
-        [name, text(entry["agents"]), _number(entry["shown"], 1)]
+        [name, text(entry["agents"]), _number(entry["shown"], 1), str(entry["steps"])]
         for name, entry in report["environments"].items()
     ]
     return [
@@ -130,7 +136,13 @@ def body(report: Mapping[str, Any]) -> list[str]:
         "viewer.",
         "",
         *table(
-            ["environment", "return of the agents, IQM [95 %]", "return of what is shown"], rows
+            [
+                "environment",
+                "return of the agents, IQM [95 %]",
+                "return of what is shown",
+                "its steps",
+            ],
+            rows,
         ),
         "",
         "PPO with the paper's fixed hyperparameters; the agent shown is the best of them by other episodes. Most "

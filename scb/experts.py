@@ -19,6 +19,7 @@ from scb.agents.agent import Agent
 from scb.agents.normalization import RunningStatistics, normalize, update_statistics
 from scb.agents.settings import Setting
 from scb.curriculum import CurriculumConfig, horizon, with_limit
+from scb.errors import UserError
 from scb.evaluation import evaluate
 from scb.evolution import EnvironmentSteps, EvolutionConfig, evolve
 from scb.neuroevolution import network_action, policy_network
@@ -66,7 +67,11 @@ def best_agent(
     num_agents: int,
     num_episodes: int,
 ) -> tuple[Any, float]:
-    """(the state of the best of several agents trained alike, its mean return), by episodes of mode actions."""
+    """(the state of the best of several agents trained alike, its mean return), by episodes of mode actions.
+
+    Raises:
+      UserError: no agent has a finite return.
+    """
     training_params = setting.training_params(env_params)
 
     @jax.jit
@@ -79,7 +84,11 @@ def best_agent(
         return state, episodes.returns.mean()
 
     states, returns = jax.vmap(train)(jax.random.split(key, num_agents))
-    best = int(jnp.argmax(returns))
+    if not bool(jnp.isfinite(returns).any()):
+        raise UserError(
+            f"none of {num_agents} agents has a finite return: lower the setting's learning rate."
+        )
+    best = int(jnp.argmax(jnp.where(jnp.isfinite(returns), returns, -jnp.inf)))
     return jax.tree.map(lambda x: x[best], states), float(returns[best])
 
 

@@ -162,7 +162,8 @@ def stratified_estimate(
 ) -> Estimate:
     """The mean over groups of their interquartile means, with an interval that resamples within every group.
 
-    Every group (the runs of an environment) counts alike, however many runs it has.
+    Every group (the runs of an environment) counts alike, however many runs it has. There is no
+    interval where a group has a single run, which cannot tell.
 
     Args:
       groups: [N_g] one number per run, for each group.
@@ -191,10 +192,13 @@ def stratified_estimate(
                 total -= iqm(second[i][rows], axis=1)
         return total / len(first)
 
+    size = sum(group.size for group in first)
+    value = float(statistic(False)[0])
+    if min(group.size for group in first) < 2:
+        return Estimate(value, None, None, size)
     tail = 50.0 * (1.0 - confidence)
     low, high = np.percentile(statistic(True), [tail, 100.0 - tail])
-    size = sum(group.size for group in first)
-    return Estimate(float(statistic(False)[0]), float(low), float(high), size)
+    return Estimate(value, float(low), float(high), size)
 
 
 def pooled_estimate(
@@ -209,7 +213,7 @@ def pooled_estimate(
 
     For groups that are drawn themselves: what one search would find, or one expert teach, is as
     uncertain as what one agent would earn. Runs of the same position in all groups share a seed and are
-    drawn together.
+    drawn together. Of a single group the interval is that of its runs; with a single run there is none.
 
     Args:
       groups: [G, N] N runs of each of G groups (searches, experts).
@@ -245,9 +249,12 @@ def pooled_estimate(
             return found
         return found - middle(second, group if paired_groups else indices(len(second)))
 
+    value = float(statistic(False)[0])
+    if first.shape[1] < 2:
+        return Estimate(value, None, None, first.size)
     tail = 50.0 * (1.0 - confidence)
     low, high = np.percentile(statistic(True), [tail, 100.0 - tail])
-    return Estimate(float(statistic(False)[0]), float(low), float(high), first.size)
+    return Estimate(value, float(low), float(high), first.size)
 
 
 def normalized_score(

@@ -17,12 +17,13 @@ def reward_variance(
 
     Observation and action are fixed but for one entry, which takes other observations' values; the
     variance of the reward, averaged over observations and uniform actions, is divided by its
-    variance over everything. That is Sobol's total-effect index where entries are independent: 0 for
-    an entry that the reward ignores, and the entries' sum exceeds 1 where they interact.
+    variance over everything. Every entry is drawn from its values in `observations` apart from the
+    others, so this is Sobol's total-effect index: 0 for an entry that the reward ignores, at most 1
+    but for sampling, and the entries' sum exceeds 1 where they interact.
 
     Args:
       bandit: whose noiseless reward is examined.
-      observations: [N, O]; also where an entry's other values come from.
+      observations: [N, O], from which the entries' values come.
       key: decides actions and values.
       params: the bandit's parameters; its own where None.
       num_values: that an entry takes in each observation.
@@ -32,7 +33,14 @@ def reward_variance(
     """
     params = bandit.default_params if params is None else params
     number, size = observations.shape
-    key_action, key_value = jax.random.split(key)
+    key_action, key_value, key_entries = jax.random.split(key, 3)
+    independent = jnp.stack(
+        [
+            observations[jax.random.permutation(k, number), i]
+            for i, k in enumerate(jax.random.split(key_entries, size))
+        ],
+        axis=1,
+    )
     actions = jax.vmap(bandit.action_space().sample)(jax.random.split(key_action, number))
     reward = jax.vmap(bandit.mean_reward, in_axes=(0, 0, None))
     picked = jax.random.randint(key_value, (number, num_values), 0, number)
@@ -40,18 +48,10 @@ def reward_variance(
     @jax.jit
     def entry_variance(entry: jax.Array) -> jax.Array:
         def varied(value: jax.Array) -> jax.Array:
-            return reward(observations.at[:, entry].set(value), actions, params)
+            return reward(independent.at[:, entry].set(value), actions, params)
 
         rewards = jax.vmap(varied, in_axes=1)(observations[picked, entry])
         return jnp.var(rewards, axis=0, ddof=1).mean()
 
     shares = jax.lax.map(entry_variance, jnp.arange(size))
-    # Entries are drawn apart from each other in the numerator, and so they are here.
-    independent = jnp.stack(
-        [
-            observations[jax.random.permutation(k, number), i]
-            for i, k in enumerate(jax.random.split(key, size))
-        ],
-        axis=1,
-    )
     return shares / (jnp.var(reward(independent, actions, params)) + 1e-12)

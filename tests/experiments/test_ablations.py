@@ -2,6 +2,7 @@ import pytest
 
 from experiments import ablations
 from experiments.ablations import LATENTS, NONE, SHAPES, name_of
+from experiments.searches import ENOUGH
 
 TINY = {
     "algorithms": ["ppo"],
@@ -19,8 +20,8 @@ TINY = {
 }
 
 
-def report(**finals):
-    """A report in which every search ends as said here, by environment and search, and else at -150."""
+def report(seeds=5, **finals):
+    """A report in which every search ends as said here, by search, and else at -150."""
     environments = {}
     for environment in ablations.ENVIRONMENTS:
         environments[environment] = {
@@ -32,11 +33,12 @@ def report(**finals):
                     "failed": [0.0, 4.0],
                     "seconds": 60.0,
                 }
-                for seed in range(2)
+                for seed in range(seeds)
             }
             for search in ablations.searches_of(environment)
         }
-    return {"environments": environments, "plan": ablations.EXPERIMENT.presets["quick"]}
+    preset = "quick" if seeds < ENOUGH else "paper"
+    return {"environments": environments, "plan": ablations.EXPERIMENT.presets[preset]}
 
 
 def test_every_search_of_the_papers_rows_is_there_once():
@@ -87,7 +89,24 @@ def test_the_verdict_follows_the_figures():
         for latent in ("categorical", "softmax_categorical")
         for curriculum in (NONE, "linear")
     }
-    assert "the continuous ones are clearly better" in ablations.verdict(report(**categorical))
+    said = ablations.verdict(report(**categorical))
+    assert "the continuous ones are clearly better" in said and "too few" not in said
+    # Two searches tell nothing apart.
+    said = ablations.verdict(report(seeds=2, **worse))
+    assert "Pendulum-v1 (too few searches to tell anything clearly apart)" in said
+    assert "I is not clearly apart from TI" in said
+
+
+def test_a_line_says_how_many_of_its_searches_failed():
+    search = name_of("TI", "normal", NONE)
+    found = report(**{search: -100.0})
+    for environment in found["environments"].values():
+        environment[search]["3"]["fitness"][-1] = None
+    said = ablations.verdict(found)
+    assert "TI −100 [−100, −100] (1 of 5 failed)" in said
+    # The four others are better than all of T's, and yet a failure is worse than any return.
+    assert "TI is not clearly apart from T" in said
+    assert any("(1 of 5 failed)" in line for line in ablations.body(found))
 
 
 def test_searches_that_never_reach_the_goal_test_no_claim_about_it():
@@ -101,7 +120,7 @@ def test_the_page_and_the_figure_show_every_search():
     rows = sum(len(x) for e in ablations.ENVIRONMENTS for x in ablations.rows(e).values())
     lines = ablations.body(found)
     assert sum(line.startswith("| ") for line in lines) == rows + 2
-    assert any("| 25% | 60 |" in line for line in lines)  # 4 of 16 candidates failed
+    assert any("| 3% | 60 |" in line for line in lines)  # 4 of 128 candidates failed
     axes = ablations.draw(found).axes
     assert sum(len(a.lines) for a in axes) == rows
 

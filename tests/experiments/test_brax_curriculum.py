@@ -55,6 +55,19 @@ def test_the_verdict_follows_the_figures():
     assert "None of them" not in experiment.verdict(report(none=1000.0))
 
 
+def test_failed_searches_are_worse_than_any():
+    found = report(linear=300.0, step=250.0)
+    found["curves"]["linear"]["0"]["fitness"][-1] = None
+    said = experiment.verdict(found)
+    assert "step ends above the best of them, linear not" in said and "linear all failed" in said
+    found["curves"]["step"]["0"]["fitness"][-1] = None
+    assert "no curriculum ends above" in experiment.verdict(found)
+    for curve in found["curves"][NONE].values():
+        curve["fitness"][-1] = None
+    assert "all failed without a curriculum" in experiment.verdict(found)
+    assert "Every search without one failed." in experiment.verdict(found)
+
+
 def test_the_page_and_the_figure_show_every_curriculum():
     found = report()
     assert sum(line.startswith("| ") for line in experiment.body(found)) == 3 + 2
@@ -109,7 +122,7 @@ def test_every_search_is_measured_once(monkeypatch):
     experiment.measure(plan, found, lambda: None)
     # First seeds first, so that an interrupted measurement has every curriculum.
     assert [(c and c.shape, seed) for c, seed in asked] == [(None, 0), ("step", 0), (None, 1)]
-    assert {shape: x.value for shape, x in experiment.finals(found).items()} == {
+    assert {shape: x.estimate.value for shape, x in experiment.finals(found).items()} == {
         NONE: 8.0,
         "step": 8.0,
     }

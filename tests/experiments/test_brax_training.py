@@ -41,7 +41,8 @@ def test_steps_to_match_are_of_the_first_evaluation_that_reaches_the_level():
 def test_the_verdict_follows_the_figures(report):
     said = experiment.verdict(report)
     assert (
-        "2 of 2 agents reach the bandit's 200, after 600000 steps in the median, 60 times" in said
+        "2 of 2 agents reach the bandit's 200, by 600000 steps in the median (evaluations are 400000 apart), 60 times"
+        in said
     )
     assert "0 of 2 agents reach the bandit's 200, in the median not within 800000 steps, 80" in said
     assert "two orders of magnitude are not tested" in said
@@ -100,3 +101,23 @@ def test_without_the_published_bandits_ours_are_measured_alone(monkeypatch, tmp_
     experiment.measure(plan, found, lambda: None)
     assert found["left_out"] == ["hopper (generalized), published"]
     assert found["bandits"] == found["environments"] == {}
+
+
+def test_published_bandits_that_are_in_the_report_need_no_folder(monkeypatch, tmp_path):
+    monkeypatch.setenv("SCB_PUBLISHED", str(tmp_path / "nowhere"))
+    published = [PUBLISHED, "Pendulum-v1", None]
+    plan = {
+        "bandits": [published],
+        "bandit_algorithms": ["ppo", "sac"],
+        "environment_algorithms": ["ppo"],
+    }
+    name = task(*published)
+    whole = curves([0, 10_000], [0.0, 1.0])
+    monkeypatch.setattr(experiment, "_in_environment", lambda *_: whole)
+    found = {"bandits": {name: {"ppo": whole, "sac": whole}}}
+    experiment.measure(plan, found, lambda: None)
+    assert found["left_out"] == [] and found["environments"] == {"Pendulum-v1": {"ppo": whole}}
+    # A part of its algorithms can't be completed, and makes no row of the figure.
+    found = {"bandits": {name: {"ppo": whole}}}
+    experiment.measure(plan, found, lambda: None)
+    assert found["left_out"] == [name] and found["bandits"] == {}

@@ -124,6 +124,19 @@ def test_the_verdict_follows_the_figures():
     assert "the common start is still the best in CartPole-v1" in generality.verdict(changed)
 
 
+def test_another_network_is_compared_agent_by_agent():
+    # Each agent earns ten less with it, far less than agents differ from each other.
+    found = report()
+    entry = found["environments"]["CartPole-v1"][ZOO]
+    for algorithm in ("ppo", "sac"):
+        entry[algorithm] = [500.0, 400.0, 300.0, 200.0]
+        entry[f"{algorithm}, {SWISH}"] = [490.0, 390.0, 290.0, 190.0]
+        entry[f"{algorithm}, {WIDE}"] = [500.0, 400.0, 300.0, 200.0]
+    entry[EVOLVED] = [340.0, 440.0, 240.0, 340.0]
+    said = generality.verdict(found)
+    assert f"clearly worse than those that are: {SWISH}." in said
+
+
 def test_the_page_and_the_figure_show_every_kind_of_agent():
     found = report()
     lines = generality.body(found)

@@ -83,3 +83,19 @@ def test_the_experiment_finds_the_lemma_and_its_gap(tmp_path):
     assert lemma.verdict(report).startswith("it fails")
     assert any("immediate reward" in line for line in lemma.body(report))
     assert len(lemma.draw(report).axes[0].patches) == len(regrets)
+
+
+def test_every_construction_and_set_of_contexts_meets_the_same_mdps(monkeypatch):
+    met = []
+
+    def drawing(mdp, construction, contexts, rng, policies):
+        met.append(mdp.reward)
+        rng.random(len(met))  # as different policies take different numbers
+        return 0.0
+
+    monkeypatch.setattr(lemma, "regret", drawing)
+    lemma.measure({"mdps": 3, "seed": 1}, {}, lambda: None)
+    assert len(met) == 3 * len(lemma.REWARDS) * len(lemma.CONTEXTS)
+    for i, reward in enumerate(met):
+        np.testing.assert_array_equal(reward, met[i % 3])
+    assert met[0].shape != met[1].shape or not np.array_equal(met[0], met[1])

@@ -51,6 +51,24 @@ def test_an_interrupted_experiment_measures_only_what_is_missing(tmp_path):
     assert (tmp_path / "docs" / "figures" / "counting.png").exists()
 
 
+def test_a_report_stays_with_the_machine_that_measured_it(tmp_path):
+    out = tmp_path / "c.json"
+    flags = ["--out", str(out), "--docs", str(tmp_path)]
+    assert page.main(counting(), flags) == 0
+    here = json.loads(out.read_text())
+    other = {"processor": "another processor", "cores": 96, "accelerator": "a GPU"}
+    elsewhere = {**here, "machine": other, "versions": {"jax": "0.0"}}
+    out.write_text(json.dumps(elsewhere))
+    assert page.main(counting(), flags) == 0
+    assert json.loads(out.read_text()) == elsewhere
+    assert "96 cores, another processor" in (tmp_path / "counting.md").read_text()
+    # What is measured here is this machine's.
+    del elsewhere["parts"]["b"]
+    out.write_text(json.dumps(elsewhere))
+    assert page.main(counting(), flags) == 0
+    assert json.loads(out.read_text())["machine"] == here["machine"]
+
+
 def test_another_preset_does_not_continue_a_report(tmp_path, capsys):
     flags = ["--out", str(tmp_path / "c.json"), "--docs", str(tmp_path)]
     assert page.main(counting(), flags) == 0
@@ -96,6 +114,9 @@ def test_all_experiments_in_one_go_leave_one_page(tmp_path, monkeypatch):
     overview = (tmp_path / "docs" / "experiments.md").read_text()
     assert "[Counting](counting.md)" in overview and "2 measured." in overview
     assert everything.main([*flags, "--preset", "paper"]) == 2
+    (tmp_path / "data" / "counting.json").write_text("{")
+    assert everything.main(flags) == 2
+    assert "Its report cannot be read." in (tmp_path / "docs" / "experiments.md").read_text()
 
 
 def test_the_quick_presets_in_one_go_keep_a_report_of_the_papers_size(
@@ -118,6 +139,10 @@ def test_a_report_that_is_not_complete_makes_no_page(tmp_path, capsys):
     assert (
         "not complete: run python -m experiments.counting --preset quick" in capsys.readouterr().err
     )
+    (tmp_path / "empty.json").write_text("{}")
+    empty = ["--out", str(tmp_path / "empty.json"), "--docs", str(tmp_path), "--only-render"]
+    assert page.main(counting(), empty) == 2
+    assert "not complete" in capsys.readouterr().err
     assert "Measured in part only" in everything.overview([counting()], tmp_path)
     assert page.main(counting(), flags) == 0
     assert "2 measured." in everything.overview([counting()], tmp_path)

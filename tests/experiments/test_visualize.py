@@ -39,7 +39,8 @@ def test_the_page_says_what_the_shown_episodes_earn(report):
 
 def test_an_agent_is_trained_in_its_bandit_and_shown(monkeypatch):
     monkeypatch.setattr(visualize, "CLASSIC_CONTROL", ("CartPole-v1",))
-    # As if the run had been interrupted with Hopper done.
+    # As if the run had been interrupted with Hopper done, whose page is there.
+    monkeypatch.setattr(visualize, "VIEWER", COMMITTED)
     found, saved = {"environments": {visualize.HOPPER: {}}}, []
     plan = {"agents": 2, "episodes": 2, "seed": 1, "every": 50}
     visualize.measure(plan, found, lambda: saved.append(1))

@@ -98,6 +98,21 @@ def test_reward_variance_is_zero_for_entries_that_the_reward_ignores():
     assert float(importance[0]) == pytest.approx(r.var(axis=1).mean() / r.var(), abs=0.1)
 
 
+def test_reward_variance_draws_entries_apart_from_each_other():
+    # -|a - x_0 - x_1 - x_2|, where x_1 + x_2 = 0 in every observation, and not where they are drawn apart.
+    bandit = tent()
+    weights = jax.tree.map(np.array, bandit.default_params.weights)
+    kernel = weights["reward"]["Dense_0"]["kernel"]
+    kernel[1] = kernel[2] = kernel[0]
+    mixed = SyntheticBandit(3, bandit.action_space(), bandit.config, weights, "mixed")
+    x, y = jax.random.normal(jax.random.key(2), (2, 4000))
+    shares = reward_variance(mixed, jnp.stack([x, y, -y], axis=1), jax.random.key(1))
+    rng = np.random.default_rng(0)
+    a, others = rng.uniform(-1, 1, (20_000, 1)), rng.normal(scale=np.sqrt(2), size=(20_000, 1))
+    r = -np.abs(a - others - rng.normal(size=(20_000, 64)))
+    np.testing.assert_allclose(shares, r.var(axis=1).mean() / r.var(), atol=0.06)
+
+
 def test_follow_earns_what_evaluate_earns():
     env, env_params = scb.make("CartPole-v1")
 

@@ -1,6 +1,7 @@
 """Experts: policies that are evolved, trained or handed over, what they earn and what they cost."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -11,8 +12,9 @@ from scb.agents.dqn import DQNConfig, DQNHyperparameters
 from scb.agents.settings import Setting
 from scb.curriculum import CurriculumConfig
 from scb.environments.registry import make
+from scb.errors import UserError
 from scb.evolution import EvolutionConfig
-from scb.experts import PolicySearchConfig, evolve_expert, judged, train_expert
+from scb.experts import PolicySearchConfig, best_agent, evolve_expert, judged, train_expert
 from tests.scb.probes import ContinuousCorridor, Corridor, CorridorParams
 
 EVOLUTION = EvolutionConfig(
@@ -163,3 +165,34 @@ def test_any_agent_can_be_the_expert():
     assert actions(expert) == BEST
     # Two agents of 480 steps, each judged by 20 episodes of 4.
     assert expert.environment_steps == 2 * (480 + 20 * 4)
+
+
+# -- the best of several
+# -------------------------------------------------------------------------
+
+
+class Ranked:
+    """Agents that earn what their key draws: no number for some."""
+
+    def __init__(self, failing):
+        self.failing = failing
+
+    def train(self, key, hyperparameters, env_params):
+        return jax.random.uniform(key)
+
+    def evaluate(self, state, key, num_episodes, env_params, mode):
+        returns = jnp.where(state > self.failing, jnp.nan, state)
+        return SimpleNamespace(returns=jnp.full(num_episodes, returns))
+
+
+SETTING = SimpleNamespace(hyperparameters=None, training_params=lambda env_params: env_params)
+
+
+def test_an_agent_without_a_finite_return_is_not_the_best():
+    state, best = best_agent(Ranked(0.5), SETTING, None, jax.random.key(0), 20, 3)
+    assert 0.0 < float(state) == best <= 0.5
+
+
+def test_agents_of_which_none_has_a_finite_return_are_refused():
+    with pytest.raises(UserError, match="none of 4 agents has a finite return"):
+        best_agent(Ranked(-1.0), SETTING, None, jax.random.key(0), 4, 3)

@@ -272,3 +272,8 @@ def test_a_pooled_estimate_refuses_what_it_cannot_pair():
         pooled_estimate([[1.0]], [[1.0], [2.0]], paired_groups=True)
     with pytest.raises(UserError, match="1 NaN"):
         pooled_estimate([[1.0, np.nan]])
+
+
+def test_a_single_run_of_a_group_has_no_interval():
+    assert stratified_estimate([[1.0], [3.0, 3.0]]) == Estimate(2.0, None, None, 3)
+    assert pooled_estimate([[1.0], [2.0]]) == Estimate(1.5, None, None, 2)
