@@ -46,7 +46,7 @@ def listing() -> str:
         )
         lines += [
             f"  {name}: {experiment.title}",
-            f"    {experiment.paper}; {minutes} on two cores; needs {experiment.needs or 'nothing more'}",
+            f"    {experiment.paper}; on two cores {minutes}; {experiment.needs or 'needs nothing more'}",
         ]
     lines += ["", "Others (--help says what they take):", ""]
     for name in modules():
@@ -112,7 +112,18 @@ def main(argv: Sequence[str] | None = None) -> int:
     if arguments.list:
         print(listing())
         return 0
+    return page.exit_status("experiments", lambda: _all(arguments))
+
+
+def _all(arguments: argparse.Namespace) -> int:
+    from scb.errors import UserError
+    from scb.runs import make_folder
+
     experiments = found()
+    reports = [arguments.data / f"{name}.json" for name in experiments]
+    if arguments.only_render and not any(path.exists() for path in reports):
+        raise UserError(f"{arguments.data} holds no report of an experiment: measure first.")
+    make_folder(arguments.docs, "--docs")
     failed = []
     for name, experiment in experiments.items():
         out = arguments.data / f"{name}.json"
@@ -126,7 +137,6 @@ def main(argv: Sequence[str] | None = None) -> int:
             flags.append("--only-render")
         if page.main(experiment, flags):
             failed.append(name)
-    arguments.docs.mkdir(parents=True, exist_ok=True)
     text = overview(list(experiments.values()), arguments.data)
     (arguments.docs / "experiments.md").write_text(text)
     print(f"written: {arguments.docs / 'experiments.md'}")

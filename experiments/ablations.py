@@ -302,7 +302,7 @@ EXPERIMENT = Experiment(
     verdict=verdict,
     body=body,
     draw=draw,
-    needs="run folders under runs/ablations",
+    needs="keeps its searches under runs/ablations",
 )
 
 

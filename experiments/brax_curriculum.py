@@ -213,7 +213,7 @@ EXPERIMENT = Experiment(
     verdict=verdict,
     body=body,
     draw=draw,
-    needs="run folders under runs/brax_curriculum",
+    needs="keeps its searches under runs/brax_curriculum",
 )
 
 

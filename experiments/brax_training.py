@@ -238,7 +238,7 @@ def verdict(report: Mapping[str, Any]) -> str:
             f"bandit's {row['level']:.0f}, "
         )
         said += (
-            f"in the median not within {row['trained']} steps, {most:.0f} times the bandit's"
+            f"in the median not within {row['trained']} steps, more than {most:.0f} times the bandit's"
             if row["steps"] is None
             else f"by {row['steps']:.0f} steps in the median (evaluations are {row['spacing']} apart), "
             f"{row['steps'] / row['bandit_steps']:.0f} times the bandit's"
@@ -429,7 +429,7 @@ EXPERIMENT = Experiment(
     verdict=verdict,
     body=body,
     draw=draw,
-    needs="for the published bandits their arrays, beside the checkout or in SCB_PUBLISHED",
+    needs="needs for the published bandits their arrays, beside the checkout or in SCB_PUBLISHED",
 )
 
 

@@ -331,7 +331,7 @@ EXPERIMENT = Experiment(
     verdict=verdict,
     body=body,
     draw=draw,
-    needs="run folders under runs/episode_lengths",
+    needs="keeps its searches under runs/episode_lengths",
 )
 
 

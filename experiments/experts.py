@@ -178,7 +178,7 @@ EXPERIMENT = Experiment(
             "evaluations": 200,
         },
     },
-    minutes={"quick": "6", "paper": "12"},
+    minutes={"quick": "8", "paper": "12"},
     measure=measure,
     verdict=verdict,
     body=body,

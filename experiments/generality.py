@@ -470,12 +470,12 @@ EXPERIMENT = Experiment(
             "episodes": 50,
         },
     },
-    minutes={"quick": "60", "paper": "days; for a GPU"},
+    minutes={"quick": "60 to 120 min", "paper": "days; for a GPU"},
     measure=measure,
     verdict=verdict,
     body=body,
     draw=draw,
-    needs="run folders under runs/generality",
+    needs="keeps its searches under runs/generality",
 )
 
 

@@ -94,7 +94,8 @@ def verdict(report: Mapping[str, Any]) -> str:
         f"Acrobot's reward depends less on its angles (no more than {angles:.0%} of the variance each) than on its "
         f"angular velocities (at least {speeds:.0%}): "
         + ("holds." if angles < speeds else "does not hold."),
-        f"CartPole's position causes {position:.0%} and its angle {angle:.0%}: the near-invariance "
+        f"CartPole's position causes {position:.1%} and its angle {angle:.1%}: the near-invariance (less than "
+        f"{HARDLY:.0%}) "
         + (
             "holds for both."
             if max(position, angle) < HARDLY

@@ -246,7 +246,7 @@ def draw(report: Mapping[str, Any]) -> "Figure":
             positions = np.arange(len(REWARDS)) + (i - 1.5) * 0.2
             axes.barh(positions, shares, height=0.18, color=colors[contexts], label=contexts)
             for x, y in zip(shares, positions, strict=True):
-                axes.text(x + 0.01, y, f"{x:.0%}", va="center", fontsize=7)
+                axes.text(x + 0.01, y, f"{x:.1%}", va="center", fontsize=7)
         axes.set_yticks(range(len(REWARDS)), list(REWARDS))
         axes.invert_yaxis()
         axes.set_xlim(0, 1.1)

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from experiments.page import exit_status, text
+from experiments.page import exit_status, read, text
 from lpo.cli import configure_jax
 
 if TYPE_CHECKING:
@@ -297,9 +297,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     configure_jax()
     from scb import plotting
 
-    report: dict[str, Any] = {}
-    if arguments.out.exists():
-        report = json.loads(arguments.out.read_text())
+    keys = ("preset", "searches", "evaluations")
+    report = read(arguments.out, missing_is_new=not arguments.only_render, keys=keys)
     if not arguments.only_render:
         measure(arguments.preset, arguments.runs / arguments.preset, arguments.out, report)
     arguments.page.write_text(markdown(report))

@@ -48,7 +48,7 @@ class Experiment:
       claim: what the paper says, in a sentence.
       presets: {"quick": {...}, "paper": {...}}; what they hold is the experiment's own.
       minutes: {preset: roughly how long it takes on two cores}.
-      needs: what it needs beyond the library; empty for nothing.
+      needs: what it needs beyond the library or keeps beside its report, in words; empty for nothing.
       measure: (plan, report, save) fills the report in, and saves after every part.
       verdict: report -> does the claim hold here, in one or two sentences with figures.
       body: report -> the lines of the page below the figure.
@@ -156,18 +156,31 @@ def main(experiment: Experiment, argv: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("--preset", choices=sorted(experiment.presets), default="quick")
     parser.add_argument("--out", type=Path, help="the report; docs/data/NAME.json")
-    parser.add_argument("--docs", type=Path, default=DOCS, help="for the page and the figure")
+    parser.add_argument(
+        "--docs", type=Path, help="for the page and the figure; docs, or the folder of --out"
+    )
     parser.add_argument("--only-render", action="store_true", help="measure nothing")
     arguments = parser.parse_args(argv)
     configure_jax()
 
     out = DATA / f"{experiment.name}.json" if arguments.out is None else arguments.out
+    docs = arguments.docs
+    if docs is None:
+        # What is measured elsewhere leaves the documentation's page as it is.
+        docs = DOCS if arguments.out is None else out.parent
 
     def measure_and_render() -> int:
+        from scb.errors import UserError
+        from scb.runs import make_folder
+
+        make_folder(docs, "--docs")
         report = read(out, missing_is_new=not arguments.only_render)
+        if report and report.get("experiment") != experiment.name:
+            raise UserError(f"{out} is no report of {experiment.name}: choose another --out.")
         if not arguments.only_render:
+            make_folder(out.parent)
             _measure(experiment, arguments.preset, report, out)
-        render(experiment, report, arguments.docs)
+        render(experiment, report, docs)
         return 0
 
     return exit_status(experiment.name, measure_and_render)
@@ -199,7 +212,6 @@ def render(experiment: Experiment, report: Mapping[str, Any], docs: Path) -> Non
             f"--preset {report.get('preset', 'quick')}, which goes on where it was."
         )
 
-    docs.mkdir(parents=True, exist_ok=True)
     (docs / f"{experiment.name}.md").write_text(page(experiment, report))
     plotting.save(experiment.draw(report), docs / "figures" / f"{experiment.name}.png")
     if experiment.extras is not None:
@@ -218,7 +230,8 @@ def _measure(experiment: Experiment, preset: str, report: dict[str, Any], out: P
 
     if report.get("preset", preset) != preset:
         raise UserError(
-            f"{out} holds the preset {report['preset']}: choose another --out for the preset {preset}."
+            f"{out} holds the preset {report['preset']}: choose another --out for the preset {preset}; "
+            "its page is then written beside it."
         )
     plan = json.loads(json.dumps(dict(experiment.presets[preset])))
     if report.get("plan", plan) != plan:
@@ -228,30 +241,29 @@ def _measure(experiment: Experiment, preset: str, report: dict[str, Any], out: P
     before, start = report.get("seconds", 0.0), time.monotonic()
     # What measures nothing leaves the report to the machine that made it.
     here = {"versions": package_versions(), "machine": machine_description()}
-    report |= {"preset": preset, "plan": plan, "complete": False}
-
-    def write() -> None:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        write_json(out, report)
+    report |= {"experiment": experiment.name, "preset": preset, "plan": plan, "complete": False}
 
     def save() -> None:
         report.update(here, seconds=round(before + time.monotonic() - start, 1))
-        write()
+        write_json(out, report)
 
     experiment.measure(plan, report, save)
     report["complete"] = True
-    write()
+    write_json(out, report)
 
 
-def read(path: Path, missing_is_new: bool = False) -> dict[str, Any]:
-    """A report from its file; a UserError where there is none."""
+def read(path: Path, missing_is_new: bool = False, keys: Iterable[str] = ()) -> dict[str, Any]:
+    """A report from its file, with these keys at least; a UserError where there is none."""
     from scb.errors import UserError
 
     if missing_is_new and not path.exists():
         return {}
     try:
-        return dict(json.loads(path.read_text()))
+        report = dict(json.loads(path.read_text()))
+        if lacking := [key for key in keys if key not in report]:
+            raise ValueError(f"it lacks {', '.join(lacking)}")
     except (OSError, TypeError, ValueError) as error:
         raise UserError(
             f"{path} is no report of this command ({error}): measure first, or choose another --out."
         ) from error
+    return report

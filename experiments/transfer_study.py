@@ -11,7 +11,6 @@ page and figure from --out.
 """
 
 import argparse
-import json
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -20,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from experiments.page import exit_status, text
+from experiments.page import exit_status, read, text
 from lpo.cli import configure_jax
 
 if TYPE_CHECKING:
@@ -218,6 +217,7 @@ def markdown(report: Mapping[str, Any]) -> str:
 def draw(report: Mapping[str, Any]) -> "Figure":
     """One panel an evaluation, one line an objective: interquartile mean with its interval, each agent a dot."""
     from matplotlib.figure import Figure
+    from matplotlib.ticker import MaxNLocator
 
     from scb.plotting import BLUE, GREY, VERMILLION, estimate_row, figure_style
 
@@ -238,6 +238,7 @@ def draw(report: Mapping[str, Any]) -> "Figure":
                 estimate_row(axes, position, agents, row[evaluation], color)
             axes.set_title(evaluation)
             axes.set_xlabel("final return")
+            axes.xaxis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10]))
         panels[0].set_yticks(range(len(rows)), [row["name"] for row in rows])
         panels[0].invert_yaxis()
         figure.suptitle("Interquartile mean with its 95 % interval, each agent a dot")
@@ -262,9 +263,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         "generations": arguments.generations,
         "population_size": arguments.population_size,
     }
-    report: dict[str, Any] = {}
-    if arguments.out.exists():
-        report = json.loads(arguments.out.read_text())
+    keys = ("searches", "objectives")
+    report = read(arguments.out, missing_is_new=not arguments.only_render, keys=keys)
     if not arguments.only_render:
         _measure(arguments, report, searches)
     from scb import plotting

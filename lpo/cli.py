@@ -46,6 +46,11 @@ def _run(
             args=list(arguments),
             sort_subcommands=False,
         )
+        sys.stdout.flush()
+    except BrokenPipeError:
+        # Whoever read the output, such as `head`, has enough; Python would complain at its exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
     except UserError as error:
         print(f"{program}: {error}", file=sys.stderr)
         return 2

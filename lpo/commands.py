@@ -2,7 +2,6 @@
 
 import itertools
 import json
-import os
 import shlex
 import sys
 from collections.abc import Mapping, Sequence
@@ -12,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import tyro
-from rich.console import Console
 from rich.table import Table
 
 from lpo import figures, learning
@@ -34,9 +32,10 @@ from lpo.suite import run_suite
 from lpo.suite import suite as suite_environments
 from scb import plotting
 from scb.artefacts import machine_description, package_versions
+from scb.console import console
 from scb.environments.zoo import home_of
 from scb.errors import UserError
-from scb.runs import Run, settle, write_json
+from scb.runs import Run, make_folder, settle, write_json
 from scb.statistics import estimate
 
 
@@ -80,7 +79,7 @@ def run(
     chosen = {name: settings[name] for name in ("preset", "seed", "objective")}
     flags = [f"--{name}={value}" for name, value in chosen.items() if value is not None]
     report = run_pipeline(folder, settings, shlex.join(["lpo", "run", *flags]))
-    Console().print(f"report: {report}", soft_wrap=True)
+    console().print(f"report: {report}", soft_wrap=True)
 
 
 def meta_train_command(
@@ -187,9 +186,9 @@ def meta_train_command(
         resume,
     )
     path, certificate = learning.learn_objective(settings, resume or out, resume is not None, wandb)
-    console = Console()
-    console.print(f"objective: {path}", soft_wrap=True)
-    console.print(f"it {certificate}")
+    printer = console()
+    printer.print(f"objective: {path}", soft_wrap=True)
+    printer.print(f"it {certificate}")
 
 
 def train(
@@ -299,7 +298,7 @@ def evaluate(
     for row in comparison.table():
         difference = "" if row["difference"] is None else str(row["difference"])
         table.add_row(row["objective"], str(row["final"]), str(row["area"]), difference)
-    Console().print(table)
+    console().print(table)
     if out is not None:
         _write_comparison(out, comparison)
 
@@ -317,13 +316,13 @@ def _evaluate_suite(
         if out is not None:
             write_json(out / "comparisons" / f"{environment}.json", comparison.as_dict())
 
-    console = Console()
+    printer = console()
     scores, comparisons = run_suite(
         name,
         objectives,
         settings["seeds"],
         settings["backend"],
-        tell=console.print,
+        tell=printer.print,
         done=done,
         keep=keep,
         steps=settings["steps"],
@@ -339,14 +338,14 @@ def _evaluate_suite(
     )
     for environment, comparison in comparisons.items():
         table.add_row(environment, *(str(estimate(c.final)) for c in comparison.curves))
-    console.print(table)
+    printer.print(table)
     aggregate = Table("objective", "normalised score, IQM [95 %]", f"difference to {reference}")
     differences = scores.differences()
     for i, (objective, score) in enumerate(zip(scores.objectives, scores.aggregate(), strict=True)):
         aggregate.add_row(objective, str(score), str(differences[i]) if i else "")
-    console.print(aggregate)
+    printer.print(aggregate)
     if scores.left_out:
-        console.print(f"left out, nobody beat random actions: {', '.join(scores.left_out)}")
+        printer.print(f"left out, nobody beat random actions: {', '.join(scores.left_out)}")
     if out is not None:
         write_json(
             out / "suite.json",
@@ -445,15 +444,15 @@ def align(
     seeds = seed_list(agents, seed)
     if out is not None:
         _make_folder(out)
-    console = Console()
+    printer = console()
     report = measure_alignment(
-        regimes, family, target, seeds, steps, backend, policy_output_scale, console.print
+        regimes, family, target, seeds, steps, backend, policy_output_scale, printer.print
     )
     table = Table("regime", *FITNESSES, title=f"Spearman's correlation with {target} [95 %]")
     for row in report["regimes"]:
         cells = (row["alignment"][fitness] for fitness in FITNESSES)
         table.add_row(row["name"], *(correlation_text(cell) for cell in cells))
-    console.print(table)
+    printer.print(table)
     if out is not None:
         write_json(out / "alignment.json", report)
         plotting.save(figures.alignment_heatmap(report), out / "alignment.png")
@@ -543,17 +542,9 @@ def _named_apart(names: Sequence[str]) -> list[Objective]:
 
 def _make_folder(out: Path) -> None:
     # Before the training and not after it, which may take hours.
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        taken = any(out.iterdir())
-    except OSError as error:
-        raise UserError(
-            f"cannot write to {out} ({error.strerror}): choose an --out folder that you may write to."
-        ) from error
-    if taken:
+    make_folder(out)
+    if any(out.iterdir()):
         raise UserError(f"{out} already exists and is not empty: choose another --out.")
-    if not os.access(out, os.W_OK):
-        raise UserError(f"cannot write to {out}: choose an --out folder that you may write to.")
 
 
 def _write_comparison(out: Path, comparison: Comparison) -> None:

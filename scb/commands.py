@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 from gymnax.environments import environment as environments
-from rich.console import Console
 from rich.table import Column, Table
 
 from scb.agents.hyperparameters import ALGORITHMS, algorithms_for, inner_loop
 from scb.artefacts import machine_description
+from scb.console import console
 from scb.curriculum import CurriculumConfig, paper_curriculum
 from scb.discovery import (
     BanditDiscovery,
@@ -268,7 +268,7 @@ def discover_command(
         path = save_bandit(path, problem.bandit, weights, metadata)
     else:
         path = save_synthetic_mdp(path, problem.bandit, weights, metadata)
-    Console().print(f"bandit: {path}", soft_wrap=True)
+    console().print(f"bandit: {path}", soft_wrap=True)
 
 
 def judge_all(
@@ -300,7 +300,7 @@ def judge_all(
         line = "; ".join(
             f"{actions.replace('_', ' ')} IQM {estimate(x)}" for actions, x in returns.items()
         )
-        Console().print(f"{algorithm.upper()} on {name}: {line}")
+        console().print(f"{algorithm.upper()} on {name}: {line}")
     return results
 
 
@@ -493,10 +493,12 @@ def list_command() -> None:
     """List the bandits that ship with the library, with what they are worth and what they cost."""
     algorithms = [name.upper() for name in ALGORITHMS if name != "ddqn"]
     table = Table(
-        Column("bandit", no_wrap=True),
-        *algorithms,
-        "minutes",
-        title="IQM of 20 agents with sampled hyperparameters in the environment: most likely actions (sampled)",
+        # In a narrow terminal names are broken, and numbers are not.
+        Column("bandit", overflow="fold"),
+        *(Column(name, min_width=8) for name in algorithms),
+        Column("minutes", min_width=7),
+        title="IQM of 20 agents with drawn hyperparameters (Brax: the paper's fixed ones) in the environment: most "
+        "likely actions (sampled)",
     )
     for name in zoo_names():
         metadata = bandit_metadata(name)
@@ -506,9 +508,7 @@ def list_command() -> None:
             cells.append("" if result is None else _cell(result))
         minutes = f"{metadata['cost']['seconds'] / 60:.0f}"
         table.add_row(name, *cells, minutes)
-    console = Console()
-    # A file or a pipe is given the whole table; a terminal what fits into it.
-    console.print(table, width=None if console.is_terminal else 120)
+    console().print(table)
     for name in zoo_names():
         print(f"{name}: {bandit_metadata(name)['command']}")
 

@@ -26,6 +26,27 @@ from tensorboardX import SummaryWriter
 from scb.errors import UserError, unknown_name
 
 
+def make_folder(folder: Path, flag: str = "--out") -> None:
+    """Makes a folder for what a command will write, so that it fails before the work and not after it.
+
+    Raises:
+      UserError: nothing can be written there; `flag` says where.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise _cannot_write(folder, flag, error.strerror) from error
+    if not os.access(folder, os.W_OK):
+        raise _cannot_write(folder, flag)
+
+
+def _cannot_write(folder: Path, flag: str, reason: str | None = None) -> UserError:
+    said = f" ({reason})" if reason else ""
+    return UserError(
+        f"cannot write to {folder}{said}: choose another {flag}, a folder that you may write to."
+    )
+
+
 class Run:
     """A run folder that is open for writing. Make one with `Run.open`."""
 
@@ -71,13 +92,11 @@ class Run:
             raise UserError(
                 f"{folder} already exists and is not empty: choose another --out, or continue it with --resume."
             )
+        make_folder(folder)
         try:
-            folder.mkdir(parents=True, exist_ok=True)
             stored_config.write_text(json.dumps(config, indent=2) + "\n")
         except OSError as error:
-            raise UserError(
-                f"cannot write to {folder} ({error.strerror}): choose an --out folder that you may write to."
-            ) from error
+            raise _cannot_write(folder, "--out", error.strerror) from error
         return cls(folder, resumed=False, wandb_project=wandb_project)
 
     def rewind(self, step: int) -> None:

@@ -8,19 +8,19 @@ import jax.numpy as jnp
 import numpy as np
 import tyro
 from gymnax.environments import environment
-from rich.console import Console
 
 from scb.agents.agent import flat_bounds
 from scb.analysis.importance import reward_variance
 from scb.analysis.optimal_actions import first_action, optimal_actions, optimal_policy
 from scb.analysis.planes import observation_names, plane_for
 from scb.analysis.states import bandit_states, follow
+from scb.console import console
 from scb.discovery import check_fits
 from scb.environments.registry import make
 from scb.environments.synthetic import SyntheticBandit
 from scb.environments.zoo import PREFIX, open_bandit
 from scb.errors import UserError
-from scb.runs import write_json
+from scb.runs import make_folder, write_json
 from scb.statistics import estimate
 
 STATES = 2000  # of either distribution, as in the paper
@@ -127,16 +127,16 @@ def explain_command(
     env, env_params = make(target, backend)
     check_fits(loaded, env, env_params, target)
     folder = Path("runs") / "explain" / loaded.name if out is None else out
+    make_folder(folder)
     numbers, parts = explain(loaded, env, env_params, target, episodes, seed)
-    folder.mkdir(parents=True, exist_ok=True)
     write_json(folder / "explain.json", numbers)
-    console = Console()
+    printer = console()
     earned = numbers["return_of_optimal_policy"]
-    console.print(
+    printer.print(
         f"The bandit's optimal policy earns {earned['value']:.1f} in {target} ({episodes} episodes)."
     )
     for name, share in sorted(numbers["importance"].items(), key=lambda item: -item[1]):
-        console.print(f"  {share:6.1%} of the reward's variance: {name}")
+        printer.print(f"  {share:6.1%} of the reward's variance: {name}")
     if parts:
         plotting.save(figures.explained(parts), folder / "explain.png")
-    console.print(f"written to {folder}", soft_wrap=True)
+    printer.print(f"written to {folder}", soft_wrap=True)

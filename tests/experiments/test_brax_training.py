@@ -44,7 +44,10 @@ def test_the_verdict_follows_the_figures(report):
         "2 of 2 agents reach the bandit's 200, by 600000 steps in the median (evaluations are 400000 apart), 60 times"
         in said
     )
-    assert "0 of 2 agents reach the bandit's 200, in the median not within 800000 steps, 80" in said
+    more = (
+        "0 of 2 agents reach the bandit's 200, in the median not within 800000 steps, more than 80"
+    )
+    assert more in said
     assert "two orders of magnitude are not tested" in said
     # Of two agents one gets there: the median is not that one's.
     report["environments"]["hopper (spring)"]["ppo"]["returns"][0] = [0.0, 0.0, 0.0]

@@ -77,6 +77,41 @@ def test_another_preset_does_not_continue_a_report(tmp_path, capsys):
     assert json.loads((tmp_path / "c.json").read_text())["preset"] == "quick"
 
 
+def test_the_report_of_another_experiment_is_left_alone(tmp_path, capsys):
+    out = tmp_path / "c.json"
+    for content in ('{"entries": []}', '{"experiment": "lemma", "complete": true}'):
+        out.write_text(content)
+        for flags in ([], ["--only-render"]):
+            assert page.main(counting(), [*flags, "--out", str(out)]) == 2
+            assert "is no report of counting: choose another --out" in capsys.readouterr().err
+        assert out.read_text() == content
+
+
+def test_the_page_of_a_report_elsewhere_is_written_beside_it(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert page.main(counting(), ["--out", "mine/c.json"]) == 0
+    assert (tmp_path / "mine" / "counting.md").exists() and not (tmp_path / "docs").exists()
+    assert page.main(counting(), []) == 0
+    assert (tmp_path / "docs" / "counting.md").exists()
+
+
+@pytest.mark.parametrize("flag", ["--out", "--docs"])
+def test_folders_that_cannot_be_made_are_told_before_measuring(tmp_path, capsys, flag):
+    (tmp_path / "file").write_text("precious")
+    inside = tmp_path / "file" / "inside"
+    flags = ["--out", str(tmp_path / "c.json"), "--docs", str(tmp_path)]
+    flags[flags.index(flag) + 1] = str(inside / "c.json" if flag == "--out" else inside)
+    assert page.main(counting(fail_at="a"), flags) == 2
+    assert f"choose another {flag}, a folder that you may write to" in capsys.readouterr().err
+
+
+def test_nothing_to_render_is_an_error(tmp_path, capsys):
+    flags = ["--only-render", "--data", str(tmp_path / "typo"), "--docs", str(tmp_path)]
+    assert everything.main(flags) == 2
+    assert "holds no report of an experiment" in capsys.readouterr().err
+    assert not (tmp_path / "experiments.md").exists()
+
+
 @pytest.mark.parametrize("content", [None, "{", "[1, 2]"])
 def test_rendering_without_a_report_says_so(tmp_path, capsys, content):
     out = tmp_path / "c.json"

@@ -42,8 +42,24 @@ def test_the_papers_sizes_are_those_of_its_preset():
 
 def test_the_last_judgement_is_over_searches_that_have_one():
     curves = {str(i): {"fitness": [0.0, x]} for i, x in enumerate([1.0, None, 4.0])}
-    assert searches.final(curves, np.mean).value == 2.5
-    assert searches.final({"0": {"fitness": [None]}}, np.mean) is None
+    found = searches.final(curves, np.mean)
+    assert (found.estimate.value, found.failed, found.searches) == (2.5, 1, 3)
+    assert found.text(1) == "2.5 [1.0, 4.0] (1 of 3 failed)"
+    none = searches.final({"0": {"fitness": [None]}}, np.mean)
+    assert none.estimate is None and none.text() == "all failed"
+
+
+def test_only_five_searches_or_more_are_clearly_above_others():
+    def ending(*fitness):
+        return searches.final({str(i): {"fitness": [x]} for i, x in enumerate(fitness)}, np.mean)
+
+    high, low = ending(*range(10, 15)), ending(*range(5))
+    assert high.clearly_above(low) and not low.clearly_above(high)
+    assert not ending(10, 11).clearly_above(ending(0, 1))
+    # A failure is worse than any return.
+    assert not ending(10, 11, 12, 13, None).clearly_above(low)
+    assert low.clearly_above(ending(*[None] * 5))
+    assert not ending(*[None] * 5).clearly_above(low)
 
 
 def test_a_judgement_without_a_number_is_a_gap_and_failures_are_averaged():

@@ -58,7 +58,12 @@ def test_points_are_stored_to_a_thousandth_of_the_plane():
 def test_the_verdict_follows_the_figures(report):
     said = experiment.verdict(report)
     assert "in 1 of 2 environments (MountainCar-v0 100% against 0%" in said
-    assert "in 1 of 2 (MountainCar-v0)" in said
+    assert "in 1 of 2 (MountainCar-v0 0.0% against 100.0%, Pendulum-v1 50.0% against 0.0%)" in said
+    assert "off the plane" not in said
+    # Twice as far out as the plane reaches.
+    entry = report["environments"]["MountainCar-v0"]
+    entry["contexts"] = experiment.stored_points(np.full((4000, 2), 2.0), LIMITS)
+    assert "with 100% of its contexts off the plane" in experiment.verdict(report)
 
 
 def test_the_page_and_the_figure_show_both_distributions(report):

@@ -219,14 +219,14 @@ def test_a_folder_that_holds_something_is_left_alone(refused, working_folder, co
 def test_a_folder_that_cannot_be_made_is_told_before_training(refused, working_folder, command):
     (working_folder / "file").write_text("precious")
     message = refused(*WRITING[command], "--out", "file/inside")
-    assert "cannot write to file/inside (Not a directory): choose an --out folder" in message
+    assert "cannot write to file/inside (Not a directory): choose another --out" in message
 
 
 @pytest.mark.parametrize("command", ["train", "evaluate"])
 def test_a_folder_without_permission_is_told_before_training(refused, monkeypatch, command):
     # By a stand-in for the system's answer, since an administrator may write anywhere.
     monkeypatch.setattr(os, "access", lambda path, mode: False)
-    assert "cannot write to mine: choose an --out folder" in refused(command, "--out", "mine")
+    assert "cannot write to mine: choose another --out" in refused(command, "--out", "mine")
 
 
 @pytest.mark.parametrize("command", ["run", "meta-train"])

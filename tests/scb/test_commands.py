@@ -341,6 +341,17 @@ def test_listing_names_every_bandit_of_the_zoo():
     for name in zoo_names():
         assert any(line.startswith(f"{name} ") for line in lines)
         assert f"{name}: {bandit_metadata(name)['command']}" in lines
+    assert "…" not in result.out
+
+
+def test_a_reader_that_stops_early_is_no_error(monkeypatch):
+    # A file of its own, which the command may point elsewhere.
+    with open(os.devnull, "w") as stdout:
+        monkeypatch.setattr("sys.stdout", stdout)
+        monkeypatch.setattr(
+            "scb.commands.list_command", lambda: (_ for _ in ()).throw(BrokenPipeError)
+        )
+        assert scb_main(["list"]) == 1
 
 
 # -- errors
