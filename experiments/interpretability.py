@@ -11,7 +11,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from experiments.page import CLASSIC_CONTROL, Experiment, Save, packed, table, text, unpacked
+from experiments.page import (
+    ACTIONS,
+    CLASSIC_CONTROL,
+    Experiment,
+    Save,
+    packed,
+    table,
+    text,
+    unpacked,
+)
 from experiments.page import main as run
 
 if TYPE_CHECKING:
@@ -165,16 +174,19 @@ def draw(report: Mapping[str, Any]) -> "Figure":
                 top, plane, unpacked(found["actions"]), found["num_actions"], found["bounds"]
             )
             bar = figure.colorbar(drawn, ax=top, location="bottom", aspect=30)
+            bar.set_label(f"best action: {ACTIONS[name]}", fontsize=8)
             if found["num_actions"]:
                 bar.set_ticks(range(found["num_actions"]))
             figures.draw_trajectory(top, plane, unpacked(found["episode"]))
             top.set_title(name, fontsize=10)
             shares = [x["value"] for x in found["importance"].values()]
-            figures.importance_bars(bottom, list(found["importance"]), shares)
+            intervals = [(x["low"], x["high"]) for x in found["importance"].values()]
+            figures.importance_bars(bottom, list(found["importance"]), shares, intervals=intervals)
             bottom.tick_params(labelsize=8)
         plotting.figure_title(
             figure,
-            "The bandits' best actions, with an episode in the environment; what their rewards depend on",
+            "The bandits' best actions, with an episode in the environment (\u00d7 its end); what their rewards "
+            "depend on (95 % intervals)",
         )
     return figure
 

@@ -34,6 +34,14 @@ CLASSIC_CONTROL = (
     "MountainCarContinuous-v0",
     "Pendulum-v1",
 )
+# What the actions of each are.
+ACTIONS = {
+    "Acrobot-v1": "torque on joint 2, \u22121, 0, 1",
+    "CartPole-v1": "push left, right",
+    "MountainCar-v0": "push left, none, right",
+    "MountainCarContinuous-v0": "force (of its maximum)",
+    "Pendulum-v1": "torque (N m)",
+}
 Save = Callable[[], None]
 
 

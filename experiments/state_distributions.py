@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from experiments.page import CLASSIC_CONTROL, Experiment, Save, packed, table, unpacked
+from experiments.page import ACTIONS, CLASSIC_CONTROL, Experiment, Save, packed, table, unpacked
 from experiments.page import main as run
 
 if TYPE_CHECKING:
@@ -223,15 +223,6 @@ def draw(report: Mapping[str, Any]) -> "Figure":
         )
     return figure
 
-
-# What the actions are.
-ACTIONS = {
-    "Acrobot-v1": "torque on joint 2, \u22121, 0, 1",
-    "CartPole-v1": "push left, right",
-    "MountainCar-v0": "push left, none, right",
-    "MountainCarContinuous-v0": "force (of its maximum)",
-    "Pendulum-v1": "torque (N m)",
-}
 
 # Which entries of the larger observations span the plane: the largest two numbers are taken.
 _ENTRIES = {"Acrobot-v1": [0, 0, 0, 0, 1, 1], "CartPole-v1": [0, 0, 1, 1]}
