@@ -60,7 +60,7 @@ def overview(experiments: Sequence[Experiment], data: Path) -> str:
     """The page with all verdicts, from the reports that there are."""
     from scb.errors import UserError
 
-    lines = ["# The paper's experiments", "", "`python -m experiments --preset quick`", ""]
+    rows, sections = [], []
     for experiment in experiments:
         path = data / f"{experiment.name}.json"
         if not path.exists():
@@ -68,22 +68,29 @@ def overview(experiments: Sequence[Experiment], data: Path) -> str:
         try:
             report = page.read(path)
         except UserError:
-            lines += [f"## {experiment.title}", "", "Its report cannot be read.", ""]
+            sections += [f"## {experiment.title}", "", "Its report cannot be read.", ""]
             continue
         if not page.complete(report):
-            lines += [f"## {experiment.title}", "", "Measured in part only.", ""]
+            sections += [f"## {experiment.title}", "", "Measured in part only.", ""]
             continue
-        lines += [
-            f"## [{experiment.title}]({experiment.name}.md)",
+        link = f"[{experiment.title}]({experiment.name}.md)"
+        outcome = experiment.outcome(report)
+        rows.append([link, experiment.paper, outcome, report["preset"]])
+        sections += [
+            f"## {link}",
             "",
             f"**The paper** ({experiment.paper}): {experiment.claim}",
             "",
-            f"**Here** (preset {report['preset']}): {experiment.verdict(report)}",
+            f"**Here** (preset {report['preset']}) it {page.said(outcome)}: "
+            f"{experiment.verdict(report)}",
             "",
             f"![{experiment.title}](figures/{experiment.name}.png)",
             "",
         ]
-    return "\n".join(lines)
+    head = ["experiment", "in the paper", "its claim here", "preset"]
+    summary = [*page.table(head, rows), ""] if rows else []
+    title = ["# The paper's experiments", "", "`python -m experiments --preset quick`", ""]
+    return "\n".join([*title, *summary, *sections])
 
 
 def _is_whole_paper(out: Path) -> bool:

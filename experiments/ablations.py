@@ -111,50 +111,94 @@ def _never_reached(report: Mapping[str, Any], environment: str, search: str) -> 
     return environment in WORST and bool(means) and max(means) <= WORST[environment]
 
 
+def _rows(report: Mapping[str, Any], environment: str) -> dict[str, dict[str, Final]]:
+    """{row of the figure: {label: what its searches were worth}}."""
+    return {
+        row: {label: finals(report, environment, search) for label, search in labels.items()}
+        for row, labels in rows(environment).items()
+    }
+
+
+def _goal_unseen(report: Mapping[str, Any], environment: str) -> bool:
+    """Whether no agent of any search ever reached the goal."""
+    return all(_never_reached(report, environment, x) for x in searches_of(environment))
+
+
+def _few(report: Mapping[str, Any], environment: str) -> bool:
+    return int(report["plan"]["environments"][environment]["seeds"]) < ENOUGH
+
+
+def _continuous_better(found: Mapping[str, Final]) -> bool:
+    """Whether every continuous latent is clearly better than every categorical one."""
+    categorical = {label for label in found if "categorical" in label}
+    return all(
+        found[x].clearly_above(found[y]) for x in found.keys() - categorical for y in categorical
+    )
+
+
+def _helpful(found: Mapping[str, Final]) -> list[str]:
+    """The curricula that are clearly better than none."""
+    return [x for x, e in found.items() if e.clearly_above(found[NONE])]
+
+
+def parts(report: Mapping[str, Any]) -> list[bool | None]:
+    """For each environment: TI above T, I not below TI, continuous latents; then T's goal and every curriculum.
+
+    None where there are too few searches, or none that got anywhere.
+    """
+    told: list[bool | None] = []
+    for environment in ENVIRONMENTS:
+        found = _rows(report, environment)
+        learned = found["what is learned"]
+        of_it: list[bool | None] = [
+            learned["TI"].clearly_above(learned["T"]),
+            not learned["TI"].clearly_above(learned["I"]),
+            _continuous_better(found["latent"]),
+        ]
+        if environment in WITH_CURRICULUM:
+            helpful = _helpful(found["curriculum"])
+            of_it.append(_never_reached(report, environment, name_of("T", "normal", NONE)))
+            of_it += [x in helpful for x in SHAPES]
+        untold = _few(report, environment) or _goal_unseen(report, environment)
+        told += [None] * len(of_it) if untold else of_it
+    return told
+
+
 def verdict(report: Mapping[str, Any]) -> str:
     """The paper's claims in its order, each with its figures; "clearly" where intervals are apart."""
-    parts = []
+    told = []
     for environment in ENVIRONMENTS:
-        found = {
-            row: {label: finals(report, environment, search) for label, search in labels.items()}
-            for row, labels in rows(environment).items()
-        }
+        if _goal_unseen(report, environment):
+            told.append(
+                f"{environment}: no agent of any search reaches the goal after so few generations, which leaves the "
+                "paper's claims about it untested."
+            )
+            continue
+        found = _rows(report, environment)
         described = {
             row: ", ".join(f"{label} {x.text()}" for label, x in estimates.items())
             for row, estimates in found.items()
         }
         learned = found["what is learned"]
-        all_of_it = searches_of(environment)
-        never = [x for x in all_of_it if _never_reached(report, environment, x)]
-        if len(never) == len(all_of_it):
-            parts.append(
-                f"{environment}: no agent of any search reaches the goal after so few generations, which leaves the "
-                "paper's claims about it untested."
-            )
-            continue
-        few = report["plan"]["environments"][environment]["seeds"] < ENOUGH
+        few = _few(report, environment)
         said = [
             f"{environment}"
             + (" (too few searches to tell anything clearly apart)" if few else "")
             + f": {described['what is learned']}",
             f"TI {_compared(learned['TI'], learned['T'])} T, I {_compared(learned['I'], learned['TI'])} TI",
         ]
-        if name_of("T", "normal", NONE) in never:
+        if _never_reached(report, environment, name_of("T", "normal", NONE)):
             said.append("with T no agent ever reaches the goal, as in the paper")
-        said.append(f"latents: {described['latent']}")
-        continuous = [x for label, x in found["latent"].items() if "categorical" not in label]
-        categorical = [x for label, x in found["latent"].items() if "categorical" in label]
-        every = all(x.clearly_above(y) for x in continuous for y in categorical)
-        said.append(
-            "the continuous ones are " + ("clearly better" if every else "not all clearly better")
+        better = (
+            "clearly better" if _continuous_better(found["latent"]) else "not all clearly better"
         )
+        said += [f"latents: {described['latent']}", f"the continuous ones are {better}"]
         if "curriculum" in found:
-            none = found["curriculum"][NONE]
-            better = [x for x, e in found["curriculum"].items() if e.clearly_above(none)]
+            helpful = ", ".join(_helpful(found["curriculum"])) or "no shape"
             said.append(f"curricula: {described['curriculum']}")
-            said.append(f"clearly better than none: {', '.join(better) or 'no shape'}")
-        parts.append("; ".join(said) + ".")
-    return " ".join(parts)
+            said.append(f"clearly better than none: {helpful}")
+        told.append("; ".join(said) + ".")
+    return " ".join(told)
 
 
 def _compared(a: Final, b: Final) -> str:
@@ -299,6 +343,7 @@ EXPERIMENT = Experiment(
     presets=_presets(),
     minutes={"quick": "30", "paper": "weeks; for a GPU"},
     measure=measure,
+    parts=parts,
     verdict=verdict,
     body=body,
     draw=draw,

@@ -61,17 +61,33 @@ def finals(report: Mapping[str, Any]) -> dict[str, searches.Final]:
     return {shape: searches.final(curves, iqm) for shape, curves in report["curves"].items()}
 
 
-def verdict(report: Mapping[str, Any]) -> str:
-    """Every curriculum against every search without one."""
-    found = finals(report)
+def _best_without(report: Mapping[str, Any]) -> float:
+    """Where the best search without a curriculum ends; minus infinity where all failed."""
     without = [c["fitness"][-1] for c in report["curves"][NONE].values()]
-    best = max((x for x in without if x is not None), default=-math.inf)
-    # A failed search is worse than any.
-    above = [
+    return max((x for x in without if x is not None), default=-math.inf)
+
+
+def _above(report: Mapping[str, Any]) -> list[str]:
+    """The curricula that end above the best search without one; a failed search is worse than any."""
+    best = _best_without(report)
+    return [
         shape
-        for shape, x in found.items()
+        for shape, x in finals(report).items()
         if shape != NONE and x.estimate is not None and not x.failed and x.estimate.value > best
     ]
+
+
+def parts(report: Mapping[str, Any]) -> list[bool | None]:
+    """Shape by shape: whether it ends above; None where no search reached the local optimum of standing still."""
+    above, shapes = _above(report), [x for x in report["curves"] if x != NONE]
+    if -math.inf < _best_without(report) < STANDING:
+        return [None] * len(shapes)
+    return [x in above for x in shapes]
+
+
+def verdict(report: Mapping[str, Any]) -> str:
+    """Every curriculum against every search without one."""
+    found, best, above = finals(report), _best_without(report), _above(report)
     shapes = [shape for shape in found if shape != NONE]
     said = (
         "every curriculum ends above the best of them"
@@ -94,7 +110,7 @@ def verdict(report: Mapping[str, Any]) -> str:
         + (
             f" None of them earns what standing still does ({STANDING:.0f}), the local optimum that the claim is "
             "about: so few generations do not test it."
-            if best < STANDING
+            if -math.inf < best < STANDING
             else ""
         )
     )
@@ -210,6 +226,7 @@ EXPERIMENT = Experiment(
     },
     minutes={"quick": "25", "paper": "weeks; for a GPU"},
     measure=measure,
+    parts=parts,
     verdict=verdict,
     body=body,
     draw=draw,

@@ -34,6 +34,7 @@ PAPER: dict[str, dict[str, float]] = {
     "halfcheetah": {"ppo": 3487.1, "sac": 7735.5, "ddpg": 3263.3, "td3": 13213.5},
     "humanoidstandup": {"ppo": 17243.5, "sac": 23808.1, "ddpg": 24944.8, "td3": 28376.2},
 }
+ROUGHLY = 50  # times as many steps are roughly two orders of magnitude
 
 
 def published_folder() -> Path | None:
@@ -226,6 +227,18 @@ def matches(report: Mapping[str, Any]) -> list[dict[str, Any]]:
                 }
             )
     return rows
+
+
+def parts(report: Mapping[str, Any]) -> list[bool | None]:
+    """Row by row of `matches`: whether the environment takes 50 times the steps or more, roughly two orders.
+
+    None where it was trained for less and its agents did not get there.
+    """
+    found: list[bool | None] = []
+    for row in matches(report):
+        times = (row["steps"] or row["trained"]) / row["bandit_steps"]
+        found.append(None if row["steps"] is None and times < ROUGHLY else times >= ROUGHLY)
+    return found
 
 
 def verdict(report: Mapping[str, Any]) -> str:
@@ -426,6 +439,7 @@ EXPERIMENT = Experiment(
     },
     minutes={"quick": "15", "paper": "days; for a GPU"},
     measure=measure,
+    parts=parts,
     verdict=verdict,
     body=body,
     draw=draw,

@@ -150,28 +150,40 @@ def scores_of(report: Mapping[str, Any], reward: str, states: str) -> np.ndarray
     return normalized_score(returns_of(report, reward, states), report["random"], ceilings)
 
 
+def _less(report: Mapping[str, Any], combination: tuple[str, str], than: tuple[str, str]) -> bool:
+    """Whether agents clearly earn less: the paired difference's interval lies below zero."""
+    from scb.statistics import pooled_estimate
+
+    difference = pooled_estimate(
+        scores_of(report, *combination), scores_of(report, *than), paired_groups=True
+    )
+    return difference.high is not None and difference.high < 0
+
+
+def parts(report: Mapping[str, Any]) -> list[bool]:
+    """Whether each way to learn needs the contexts, Q works badly, and the other two ways do as well."""
+    itself = (BANDIT, SYNTHETIC)
+    return [
+        *(_less(report, (r, EXPERT), (r, SYNTHETIC)) for r in (BANDIT, CLONING, ACTION)),
+        _less(report, (Q, SYNTHETIC), itself),
+        *(not _less(report, (r, SYNTHETIC), itself) for r in (CLONING, ACTION)),
+    ]
+
+
 def verdict(report: Mapping[str, Any]) -> str:
-    """Each part of the claim, with its figures; "less" where the paired difference's interval excludes zero."""
+    """Each part of the claim, with its figures."""
     from scb.statistics import pooled_estimate
 
     def of(reward: str, states: str) -> str:
         return text(pooled_estimate(scores_of(report, reward, states)), 2)
 
-    def less(combination: tuple[str, str], than: tuple[str, str]) -> bool:
-        difference = pooled_estimate(
-            scores_of(report, *combination), scores_of(report, *than), paired_groups=True
-        )
-        return difference.high is not None and difference.high < 0
-
-    itself = (BANDIT, SYNTHETIC)
-    needing = [r for r in (BANDIT, CLONING, ACTION) if less((r, EXPERT), (r, SYNTHETIC))]
+    ways = (BANDIT, CLONING, ACTION)
+    *needed, q_is_less, cloning_is_as_good, closeness_is_as_good = parts(report)
+    needing = [r for r, needs in zip(ways, needed, strict=True) if needs]
     return (
         f"Normalised scores (0 a random policy, 1 the expert) with {len(report['experts'])} experts; intervals over "
         "experts and agents. On the expert's states instead of the bandit's contexts: "
-        + ", ".join(
-            f"{of(r, EXPERT)} instead of {of(r, SYNTHETIC)} with {WITH[r]}"
-            for r in (BANDIT, CLONING, ACTION)
-        )
+        + ", ".join(f"{of(r, EXPERT)} instead of {of(r, SYNTHETIC)} with {WITH[r]}" for r in ways)
         + "; "
         + (
             "clearly less with each of them. "
@@ -181,11 +193,11 @@ def verdict(report: Mapping[str, Any]) -> str:
             else "clearly less with none of them. "
         )
         + f"The expert's Q-function as the reward gives {of(Q, SYNTHETIC)}: "
-        f"{'clearly' if less((Q, SYNTHETIC), itself) else 'not clearly'} less than the bandit's own reward does. "
+        f"{'clearly' if q_is_less else 'not clearly'} less than the bandit's own reward does. "
         "On the bandit's contexts, cloning is "
-        f"{'worse than' if less((CLONING, SYNTHETIC), itself) else 'not clearly worse than'}, and closeness to the "
-        f"expert's action {'worse than' if less((ACTION, SYNTHETIC), itself) else 'not clearly worse than'}, the "
-        f"bandit's own reward ({of(*itself)})."
+        f"{'not clearly worse than' if cloning_is_as_good else 'worse than'}, and closeness to the expert's action "
+        f"{'not clearly worse than' if closeness_is_as_good else 'worse than'}, the bandit's own reward "
+        f"({of(BANDIT, SYNTHETIC)})."
     )
 
 
@@ -284,6 +296,7 @@ EXPERIMENT = Experiment(
     },
     minutes={"quick": "5", "paper": "18"},
     measure=measure,
+    parts=parts,
     verdict=verdict,
     body=body,
     draw=draw,

@@ -150,22 +150,47 @@ def scores(report: Mapping[str, Any], environment: str, limit: str) -> "Estimate
     return estimate(normalized(report, environment, limit))
 
 
-def verdict(report: Mapping[str, Any]) -> str:
-    """How many episodes end after a step, and what a limit of one step costs or brings."""
+def _brought(report: Mapping[str, Any]) -> "dict[str, Estimate]":
+    """{environment: what a limit of one step changes}, with the same seeds and hyperparameters."""
     from scb.statistics import paired_difference
 
-    single = {name: shares(x)["1"] for name, x in report["environments"].items()}
+    return {
+        name: paired_difference(normalized(report, name, "1"), normalized(report, name, OWN))
+        for name in report["environments"]
+    }
+
+
+def _single(report: Mapping[str, Any]) -> dict[str, float]:
+    return {name: shares(x)["1"] for name, x in report["environments"].items()}
+
+
+def _searched(report: Mapping[str, Any]) -> list[str]:
+    """Where the search without a limit is not far from its end."""
+    return [name for name in report["environments"] if scores(report, name, OWN).value >= GOOD]
+
+
+def parts(report: Mapping[str, Any]) -> list[bool | None]:
+    """Whether most environments' episodes end after a step, and whether that limit costs nothing clearly.
+
+    Neither is told where fewer than half of the searches got anywhere.
+    """
+    single = _single(report)
+    if 2 * len(_searched(report)) < len(single):
+        return [None, None]
+    most = sum(share > 0.8 for share in single.values())
+    costs = any(x.high is not None and x.high < 0 for x in _brought(report).values())
+    return [2 * most > len(single), not costs]
+
+
+def verdict(report: Mapping[str, Any]) -> str:
+    """How many episodes end after a step, and what a limit of one step costs or brings."""
+    single, found = _single(report), _brought(report)
     most = [name for name, share in single.items() if share > 0.8]
     listed = ", ".join(f"{name} {share:.0%}" for name, share in single.items())
-    good = [name for name in single if scores(report, name, OWN).value >= GOOD]
-    better, worse, differences = [], [], []
-    for name in single:
-        # The same seeds and hyperparameters with every limit.
-        found = paired_difference(normalized(report, name, "1"), normalized(report, name, OWN))
-        differences.append(f"{name} {text(found, 2, sign=True)}")
-        if found.low is not None and found.high is not None:
-            better += [name] if found.low > 0 else []
-            worse += [name] if found.high < 0 else []
+    good = _searched(report)
+    differences = [f"{name} {text(x, 2, sign=True)}" for name, x in found.items()]
+    better = [name for name, x in found.items() if x.low is not None and x.low > 0]
+    worse = [name for name, x in found.items() if x.high is not None and x.high < 0]
     return (
         f"episodes of one step where many are allowed: {listed}; more than 80% in {len(most)} of {len(single)} "
         f"environments. {_searched_enough(good, len(single))} What a limit of one step changes in the normalised "
@@ -328,6 +353,7 @@ EXPERIMENT = Experiment(
     },
     minutes={"quick": "30", "paper": "days; for a GPU"},
     measure=measure,
+    parts=parts,
     verdict=verdict,
     body=body,
     draw=draw,

@@ -73,16 +73,20 @@ def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None
         save()
 
 
+def parts(report: Mapping[str, Any]) -> list[bool]:
+    """Environment by environment: whether the interval reaches the paper's."""
+    from scb.statistics import estimate
+
+    found = {name: estimate(x["returns"]) for name, x in report["environments"].items()}
+    return [(x.value if x.high is None else x.high) >= PAPER[n][1] for n, x in found.items()]
+
+
 def verdict(report: Mapping[str, Any]) -> str:
     """Each environment's figure, and where it lies below the paper's interval."""
     from scb.statistics import estimate
 
     found = {name: estimate(x["returns"]) for name, x in report["environments"].items()}
-    below = [
-        name
-        for name, x in found.items()
-        if (x.value if x.high is None else x.high) < PAPER[name][1]
-    ]
+    below = [name for name, level in zip(found, parts(report), strict=True) if not level]
     listed = ", ".join(f"{name} {text(x, 1)}" for name, x in found.items())
     return f"{listed}; " + (
         f"below the paper's interval in {' and '.join(below)}, on its level or above elsewhere."
@@ -180,6 +184,7 @@ EXPERIMENT = Experiment(
     },
     minutes={"quick": "8", "paper": "12"},
     measure=measure,
+    parts=parts,
     verdict=verdict,
     body=body,
     draw=draw,

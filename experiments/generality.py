@@ -254,37 +254,63 @@ def normalized(report: Mapping[str, Any], source: str, column: str) -> list[np.n
     ]
 
 
+def _unseen_worse(report: Mapping[str, Any]) -> list[str]:
+    """Which agents that no search saw are clearly worse in the zoo's bandits than the paper's algorithms.
+
+    Networks differ from the paper's agent by agent; other agents are compared by intervals that lie apart.
+    """
+    from scb.statistics import stratified_estimate
+
+    together = normalized(report, ZOO, TOGETHER)
+    own = stratified_estimate(together)
+
+    def worse(name: str) -> bool:
+        scores = normalized(report, ZOO, name)
+        if name in (WIDE, SWISH):
+            difference = stratified_estimate(scores, together)
+            return difference.high is not None and difference.high < 0
+        high = stratified_estimate(scores).high
+        return high is not None and own.low is not None and high < own.low
+
+    return [name for name in UNSEEN if worse(name)]
+
+
+def _differences(report: Mapping[str, Any]) -> "tuple[Estimate, Estimate]":
+    """What the zoo's bandits bring over the environments, and drawn hyperparameters over fixed ones in a search."""
+    from scb.statistics import stratified_estimate
+
+    zoo, itself, drawn, fixed = (
+        normalized(report, source, TOGETHER) for source in (ZOO, ENVIRONMENT, DRAWN, FIXED)
+    )
+    return stratified_estimate(zoo, itself), stratified_estimate(drawn, fixed)
+
+
+def parts(report: Mapping[str, Any]) -> list[bool | None]:
+    """Robustness, what drawing hyperparameters brings (None where it is not clear), agents that no search saw."""
+    robust, drawn = map(_sign, _differences(report))
+    worse = _unseen_worse(report)
+    return [robust > 0, None if drawn == 0 else drawn > 0, *(x not in worse for x in UNSEEN)]
+
+
 def verdict(report: Mapping[str, Any]) -> str:
     """Robustness to drawn hyperparameters, what drawing them in the search brings, and agents that no search saw."""
     from scb.statistics import stratified_estimate
 
-    together = {source: normalized(report, source, TOGETHER) for source in SOURCES}
-    robust = stratified_estimate(together[ZOO], together[ENVIRONMENT])
-    drawn = stratified_estimate(together[DRAWN], together[FIXED])
-    listed = ", ".join(f"{s} {text(stratified_estimate(x), 2)}" for s, x in together.items())
-    parts = [
+    scores = {
+        source: stratified_estimate(normalized(report, source, TOGETHER)) for source in SOURCES
+    }
+    robust, drawn = _differences(report)
+    listed = ", ".join(f"{source} {text(x, 2)}" for source, x in scores.items())
+    unseen = {name: stratified_estimate(normalized(report, ZOO, name)) for name in UNSEEN}
+    worse = _unseen_worse(report)
+    return (
         "normalised scores (0 a random policy, 1 the paper's expert; the mean over environments of the interquartile "
         f"mean over agents) of the paper's algorithms with drawn hyperparameters: {listed}. The zoo's bandits "
         + ("are" if _sign(robust) > 0 else "are not")
         + f" more robust to hyperparameters than the environments (difference {text(robust, 2, sign=True)}). Drawing "
         f"them in the search (one search each) changes {text(drawn, 2, sign=True)}: "
         + {1: "it helps", 0: "no clear difference", -1: "it harms here"}[_sign(drawn)]
-        + f" ({_by_environment(report)})."
-    ]
-    own = stratified_estimate(together[ZOO])
-    unseen = {name: stratified_estimate(normalized(report, ZOO, name)) for name in UNSEEN}
-
-    def clearly_worse(name: str) -> bool:
-        """Networks differ from the paper's agent by agent; other agents are compared by intervals that lie apart."""
-        if name in (WIDE, SWISH):
-            difference = stratified_estimate(normalized(report, ZOO, name), together[ZOO])
-            return difference.high is not None and difference.high < 0
-        high = unseen[name].high
-        return high is not None and own.low is not None and high < own.low
-
-    worse = [name for name in unseen if clearly_worse(name)]
-    parts.append(
-        "Agents that are not in the paper's inner loop, in the zoo's bandits: "
+        + f" ({_by_environment(report)}). Agents that are not in the paper's inner loop, in the zoo's bandits: "
         + ", ".join(f"{name} {text(x, 2)}" for name, x in unseen.items())
         + "; "
         + (
@@ -293,7 +319,6 @@ def verdict(report: Mapping[str, Any]) -> str:
             else "none is clearly worse than those that are."
         )
     )
-    return " ".join(parts)
 
 
 def _by_environment(report: Mapping[str, Any]) -> str:
@@ -472,6 +497,7 @@ EXPERIMENT = Experiment(
     },
     minutes={"quick": "60 to 120 min", "paper": "days; for a GPU"},
     measure=measure,
+    parts=parts,
     verdict=verdict,
     body=body,
     draw=draw,

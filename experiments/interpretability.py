@@ -91,15 +91,33 @@ def _shares(report: Mapping[str, Any], environment: str) -> dict[str, float]:
     return {name: x["value"] for name, x in importance.items()}
 
 
+def parts(report: Mapping[str, Any]) -> list[bool]:
+    """Of Acrobot's angles, CartPole's position and angle, and either mountain car."""
+    x = _observed(report)
+    return [
+        x["angles"] < x["speeds"],
+        max(x["position"], x["angle"]) < HARDLY,
+        x["idle"] < 0.01,
+        x["idle_continuous"] > 0.1,
+    ]
+
+
+def _observed(report: Mapping[str, Any]) -> dict[str, float]:
+    acrobot, cart = _shares(report, "Acrobot-v1"), _shares(report, "CartPole-v1")
+    return {
+        "angles": max(x for name, x in acrobot.items() if "angle" in name),
+        "speeds": min(x for name, x in acrobot.items() if "velocity" in name),
+        "position": cart["position (m)"],
+        "angle": cart["angle (rad)"],
+        "idle": nothing_done(report["environments"]["MountainCar-v0"]),
+        "idle_continuous": nothing_done(report["environments"]["MountainCarContinuous-v0"]),
+    }
+
+
 def verdict(report: Mapping[str, Any]) -> str:
     """Each of the paper's three observations, with its figures."""
-    acrobot, cart = _shares(report, "Acrobot-v1"), _shares(report, "CartPole-v1")
-    angles = max(x for name, x in acrobot.items() if "angle" in name)
-    speeds = min(x for name, x in acrobot.items() if "velocity" in name)
-    position, angle = cart["position (m)"], cart["angle (rad)"]
-    idle = nothing_done(report["environments"]["MountainCar-v0"])
-    idle_continuous = nothing_done(report["environments"]["MountainCarContinuous-v0"])
-    parts = [
+    angles, speeds, position, angle, idle, idle_continuous = _observed(report).values()
+    said = [
         f"Acrobot's reward depends less on its angles (no more than {angles:.0%} of the variance each) than on its "
         f"angular velocities (at least {speeds:.0%}): "
         + ("holds." if angles < speeds else "does not hold."),
@@ -126,7 +144,7 @@ def verdict(report: Mapping[str, Any]) -> str:
             else "does not hold."
         ),
     ]
-    return " ".join(parts)
+    return " ".join(said)
 
 
 def body(report: Mapping[str, Any]) -> list[str]:
@@ -204,6 +222,7 @@ EXPERIMENT = Experiment(
     },
     minutes={"quick": "2", "paper": "5"},
     measure=measure,
+    parts=parts,
     verdict=verdict,
     body=body,
     draw=draw,

@@ -181,19 +181,22 @@ def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None
     report["mdps"], report["policies"] = plan["mdps"], POLICIES
 
 
-def verdict(report: Mapping[str, Any]) -> str:
-    """Does it hold, with how many policies."""
+def parts(report: Mapping[str, Any]) -> list[bool]:
+    """Whether every bandit has the MDP's optima that shows every optimal policy's states, or singles one out."""
     found = report["regrets"]
-    single = "1 where a = a*"
-    enough = [found[f"{c} | {x}"] for c in COVERED for x in (ANY, EVERY)] + [
-        found[f"{single} | {ONE}"]
-    ]
-    holds = all(x["optimal"] == 1.0 for x in enough)
+    enough = [f"{c} | {x}" for c in COVERED for x in (ANY, EVERY)] + [f"1 where a = a* | {ONE}"]
+    return [all(found[x]["optimal"] == 1.0 for x in enough)]
+
+
+def verdict(report: Mapping[str, Any]) -> str:
+    """Where it holds, with how many policies."""
+    found = report["regrets"]
+    (holds,) = parts(report)
     lost = 1.0 - found[f"Q* | {ONE}"]["optimal"]
     text = (
-        f"{'it holds' if holds else 'it fails'} where the bandit shows the states of every optimal policy, or "
-        f"where its reward singles out one: {'all' if holds else 'not all'} of {report['policies']} policies drawn "
-        f"from the optima of each of {report['mdps']:,} bandits are optimal in their MDP."
+        "where the bandit shows the states of every optimal policy, or where its reward singles out one, "
+        f"{'all' if holds else 'not all'} of {report['policies']} policies drawn from the optima of each of "
+        f"{report['mdps']:,} bandits are optimal in their MDP."
     )
     if lost > 0:
         text += (
@@ -266,6 +269,7 @@ EXPERIMENT = Experiment(
     presets={"quick": {"mdps": 300, "seed": 0}, "paper": {"mdps": 5000, "seed": 0}},
     minutes={"quick": "1", "paper": "10"},
     measure=measure,
+    parts=parts,
     verdict=verdict,
     body=body,
     draw=draw,

@@ -43,6 +43,13 @@ ACTIONS = {
     "Pendulum-v1": "torque (N m)",
 }
 Save = Callable[[], None]
+# What becomes of a claim.
+HOLDS, IN_PART, FAILS, UNTESTED = (
+    "holds",
+    "holds in part",
+    "does not hold",
+    "not tested at this size",
+)
 
 
 @dataclass(frozen=True)
@@ -58,7 +65,8 @@ class Experiment:
       minutes: {preset: roughly how long it takes on two cores}.
       needs: what it needs beyond the library or keeps beside its report, in words; empty for nothing.
       measure: (plan, report, save) fills the report in, and saves after every part.
-      verdict: report -> does the claim hold here, in one or two sentences with figures.
+      parts: report -> whether each part of the claim holds here; None where the report cannot tell.
+      verdict: report -> how the claim's parts fare, in a few sentences with figures.
       body: report -> the lines of the page below the figure.
       draw: report -> the figure.
       extras: (report, docs) writes what the page shows beside the figure; None for nothing.
@@ -71,11 +79,27 @@ class Experiment:
     presets: Mapping[str, Mapping[str, Any]]
     minutes: Mapping[str, str]
     measure: Callable[[Mapping[str, Any], dict[str, Any], Save], None]
+    parts: Callable[[Mapping[str, Any]], Sequence[bool | None]]
     verdict: Callable[[Mapping[str, Any]], str]
     body: Callable[[Mapping[str, Any]], list[str]]
     draw: Callable[[Mapping[str, Any]], "Figure"]
     needs: str = ""
     extras: Callable[[Mapping[str, Any], Path], None] | None = None
+
+    def outcome(self, report: Mapping[str, Any]) -> str:
+        """Whether the claim holds here: one of four."""
+        parts = self.parts(report)
+        told = [part for part in parts if part is not None]
+        if not told:
+            return UNTESTED
+        if not any(told):
+            return FAILS
+        return HOLDS if all(told) and len(told) == len(parts) else IN_PART
+
+
+def said(outcome: str) -> str:
+    """With its verb, as in "it holds", "it is not tested at this size"."""
+    return f"is *{outcome}*" if outcome == UNTESTED else f"*{outcome}*"
 
 
 def page(experiment: Experiment, report: Mapping[str, Any]) -> str:
@@ -91,7 +115,7 @@ def page(experiment: Experiment, report: Mapping[str, Any]) -> str:
         "",
         f"**The paper** ({experiment.paper}): {experiment.claim}",
         "",
-        f"**Here**: {experiment.verdict(report)}",
+        f"**Here** it {said(experiment.outcome(report))}: {experiment.verdict(report)}",
         "",
         f"![{experiment.title}](figures/{experiment.name}.png)",
         "",

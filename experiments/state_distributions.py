@@ -137,6 +137,13 @@ def summary(entry: Mapping[str, Any]) -> dict[str, float]:
     }
 
 
+def parts(report: Mapping[str, Any]) -> list[bool]:
+    """Environment by environment: whether the contexts cover more; then whether actions are smoother in two or more."""
+    found = [summary(x) for x in report["environments"].values()]
+    smoother = sum(x[BANDIT_ROUGHNESS] < x[EXPERT_ROUGHNESS] for x in found)
+    return [*(x[BANDIT_COVERAGE] > x[EXPERT_COVERAGE] for x in found), smoother >= 2]
+
+
 def verdict(report: Mapping[str, Any]) -> str:
     """Whose states cover more of the plane, and whose best actions change less over it."""
     found = {name: summary(x) for name, x in report["environments"].items()}
@@ -251,6 +258,7 @@ EXPERIMENT = Experiment(
     },
     minutes={"quick": "9", "paper": "15"},
     measure=measure,
+    parts=parts,
     verdict=verdict,
     body=body,
     draw=draw,

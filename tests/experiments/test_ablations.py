@@ -80,6 +80,9 @@ def test_the_verdict_follows_the_figures():
     assert "with T no agent ever reaches the goal" in said and "not all clearly better" in said
     assert "TI is clearly better than T, I is not clearly apart from TI" in said
     assert "clearly better than none: no shape" in said
+    found = ablations.parts(report(**{name_of("T", "normal", NONE): -200.0}))
+    # TI beats T in both, I is as good as TI, latents are alike; T never reaches the goal; no curriculum helps.
+    assert found == [True, True, False] + [True, True, False, True] + [False] * len(SHAPES)
     worse = {name_of("T", "normal", NONE): None, name_of("I", "normal", NONE): -500.0}
     said = ablations.verdict(report(**worse))
     assert "T all failed" in said and "I is clearly worse than TI" in said
@@ -95,6 +98,7 @@ def test_the_verdict_follows_the_figures():
     said = ablations.verdict(report(seeds=2, **worse))
     assert "Pendulum-v1 (too few searches to tell anything clearly apart)" in said
     assert "I is not clearly apart from TI" in said
+    assert set(ablations.parts(report(seeds=2, **worse))) == {None}
 
 
 def test_a_line_says_how_many_of_its_searches_failed():

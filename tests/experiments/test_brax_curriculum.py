@@ -53,6 +53,8 @@ def test_the_verdict_follows_the_figures():
     assert "205 [200, 210] without" in said and "the best ends at 210" in said
     assert "None of them earns what standing still does (1000)" in said
     assert "None of them" not in experiment.verdict(report(none=1000.0))
+    assert experiment.parts(report(linear=300.0, step=150.0)) == [None, None]
+    assert experiment.parts(report(none=1000.0, linear=1500.0)) == [True, False]
 
 
 def test_failed_searches_are_worse_than_any():

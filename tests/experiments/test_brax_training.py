@@ -49,6 +49,7 @@ def test_the_verdict_follows_the_figures(report):
     )
     assert more in said
     assert "two orders of magnitude are not tested" in said
+    assert experiment.parts(report) == [True, True]
     # Of two agents one gets there: the median is not that one's.
     report["environments"]["hopper (spring)"]["ppo"]["returns"][0] = [0.0, 0.0, 0.0]
     assert "1 of 2 agents reach the bandit's 200, in the median not within" in experiment.verdict(

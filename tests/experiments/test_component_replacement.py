@@ -63,6 +63,7 @@ def test_the_verdict_follows_the_figures():
     assert "clearly less with each of them" in said
     assert ": not clearly less than the bandit's own reward does" in said
     assert "cloning is not clearly worse than, and closeness" in said
+    assert experiment.parts(with_returns(good, needed, needed)) == [True] * 3 + [False] + [True] * 2
     alike = dict.fromkeys(REPLACED, good)
     assert "clearly less with none" in experiment.verdict(with_returns(good, alike, alike))
     poor = needed | {(r, SYNTHETIC): bad for r in (ACTION, CLONING, Q)}
@@ -70,6 +71,9 @@ def test_the_verdict_follows_the_figures():
     assert "clearly less with the bandit's reward only" in said
     assert ": clearly less than the bandit's own reward does" in said
     assert "cloning is worse than, and closeness to the expert's action worse than," in said
+    assert (
+        experiment.parts(with_returns(good, poor, poor)) == [True, False, False, True] + [False] * 2
+    )
     # One expert of two from whom cloning learns nothing makes it uncertain, not worse.
     said = experiment.verdict(with_returns(good, needed, poor))
     assert "cloning is not clearly worse than" in said

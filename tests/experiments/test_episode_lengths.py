@@ -42,7 +42,11 @@ def test_the_verdict_follows_the_figures():
     said = experiment.verdict(report())
     assert "MountainCar-v0 90%" in said and "more than 80% in 2 of 2" in said
     assert "it costs nothing clearly, and is clearly better in MountainCar-v0 and CartPole" in said
+    assert experiment.parts(report()) == [True, True]
     said = experiment.verdict(report(one=-190.0, single=3))
+    assert experiment.parts(report(one=-190.0, single=3)) == [False, False]
+    # Searches without a limit that get nowhere tell nothing.
+    assert experiment.parts(report(own=-199.0)) == [None, None]
     assert "in 0 of 2" in said and "Every" not in said
     assert "trains agents of 0.5 or more of the expert's score in MountainCar-v0 only" in said
     assert "clearly worse in MountainCar-v0 and CartPole-v1." in said

@@ -63,6 +63,7 @@ def test_the_verdict_names_what_is_below_the_paper(report):
     assert "on the paper's level or above it everywhere" in experts.verdict(changed)
     changed["environments"]["Pendulum-v1"]["returns"] = [-300.0] * 10
     assert "below the paper's interval in Pendulum-v1, on" in experts.verdict(changed)
+    assert experts.parts(changed) == [True] * 4 + [False]
 
 
 def test_the_page_and_the_figure_show_ours_beside_the_papers(report):

@@ -116,6 +116,9 @@ def test_the_verdict_follows_the_figures():
     entry[ZOO][EVOLVED] = [100.0] * 4
     said = generality.verdict(changed)
     assert "it helps (clearly better in CartPole-v1)" in said and "are not more robust" in said
+    # Robust, drawn in the search, then 1 x 512, swish, neuroevolution and the optimal policy.
+    assert generality.parts(changed) == [False, True, True, True, False, True]
+    assert generality.parts(report(itself=50.0)) == [True, None, True, True, True, True]
     assert f"clearly worse than those that are: {EVOLVED}." in said
     for agent in ("ppo", "sac"):
         entry[DRAWN][agent] = [100.0] * 4

@@ -46,6 +46,7 @@ def test_the_verdict_follows_the_figures(report):
     said = interpretability.verdict(changed)
     assert "(at least 50%): holds" in said and "holds for both" in said
     assert interpretability.verdict(report) != said
+    assert interpretability.parts(changed) == [True, True, True, False]
 
 
 def test_the_figure_has_a_map_and_bars_of_each_environment(report):

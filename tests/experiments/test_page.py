@@ -10,7 +10,7 @@ from experiments.page import Experiment, table, text
 from scb.statistics import Estimate
 
 
-def counting(parts=("a", "b"), fail_at=None) -> Experiment:
+def counting(parts=("a", "b"), fail_at=None, claimed=(True, True)) -> Experiment:
     """An experiment that writes down how often each of its parts was measured."""
 
     def measure(plan, report, save):
@@ -31,6 +31,7 @@ def counting(parts=("a", "b"), fail_at=None) -> Experiment:
         presets={"quick": {"value": 1}, "paper": {"value": 2}},
         minutes={"quick": "0", "paper": "0"},
         measure=measure,
+        parts=lambda report: claimed,
         verdict=lambda report: f"{report['measured']} measured.",
         body=lambda report: table(["part"], [[x] for x in report["parts"]]),
         draw=lambda report: Figure(figsize=(2, 2)),
@@ -46,7 +47,7 @@ def test_an_interrupted_experiment_measures_only_what_is_missing(tmp_path):
     assert report["parts"] == {"a": 1, "b": 1} and report["measured"] == 2
     written = (tmp_path / "docs" / "counting.md").read_text()
     assert "**The paper** (no figure): parts are measured once." in written
-    assert "**Here**: 2 measured." in written
+    assert "**Here** it *holds*: 2 measured." in written
     assert "quick preset has fewer" in written
     assert (tmp_path / "docs" / "figures" / "counting.png").exists()
 
@@ -121,6 +122,20 @@ def test_rendering_without_a_report_says_so(tmp_path, capsys, content):
     assert "is no report of this command" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("claimed", "outcome"),
+    [
+        ([True, True], "holds"),
+        ([True, False], "holds in part"),
+        ([True, None], "holds in part"),
+        ([False, None], "does not hold"),
+        ([None, None], "not tested at this size"),
+    ],
+)
+def test_a_claim_is_the_sum_of_its_parts(claimed, outcome):
+    assert counting(claimed=claimed).outcome({}) == outcome
+
+
 def test_estimates_have_real_minus_signs():
     assert text(Estimate(-3.25, -4.0, -2.5, 9), 1) == "−3.2 [−4.0, −2.5]"
     assert text(Estimate(3.0, None, None, 1), sign=True) == "+3"
@@ -147,7 +162,8 @@ def test_all_experiments_in_one_go_leave_one_page(tmp_path, monkeypatch):
     flags = ["--data", str(tmp_path / "data"), "--docs", str(tmp_path / "docs")]
     assert everything.main(flags) == 0
     overview = (tmp_path / "docs" / "experiments.md").read_text()
-    assert "[Counting](counting.md)" in overview and "2 measured." in overview
+    assert "## [Counting](counting.md)" in overview and "2 measured." in overview
+    assert "| [Counting](counting.md) | no figure | holds | quick |" in overview
     assert everything.main([*flags, "--preset", "paper"]) == 2
     (tmp_path / "data" / "counting.json").write_text("{")
     assert everything.main(flags) == 2

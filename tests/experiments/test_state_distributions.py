@@ -60,6 +60,8 @@ def test_the_verdict_follows_the_figures(report):
     assert "in 1 of 2 environments (MountainCar-v0 100% against 0%" in said
     assert "in 1 of 2 (MountainCar-v0 0.0% against 100.0%, Pendulum-v1 50.0% against 0.0%)" in said
     assert "off the plane" not in said
+    # Wider in the first; smoother in one, which is not several.
+    assert experiment.parts(report) == [True, False, False]
     # Twice as far out as the plane reaches.
     entry = report["environments"]["MountainCar-v0"]
     entry["contexts"] = experiment.stored_points(np.full((4000, 2), 2.0), LIMITS)

@@ -33,6 +33,8 @@ def test_gifs_are_made_from_the_report(report, tmp_path):
 
 def test_the_page_says_what_the_shown_episodes_earn(report):
     said = visualize.verdict(report)
+    told = dict(zip(report["environments"], visualize.parts(report), strict=True))
+    assert told["CartPole-v1"] and not told[visualize.HOPPER]
     assert "CartPole-v1 500" in said and "Pendulum-v1 −" in said
     assert sum(line.startswith("| ") for line in visualize.body(report)) == 8
 
