@@ -416,7 +416,7 @@ EXPERIMENT = Experiment(
         "quick": {
             "bandits": [[OURS, "hopper", "spring"], [PUBLISHED, "hopper", "generalized"]],
             "bandit_algorithms": ["ppo", "sac", "ddpg", "td3"],
-            "bandit_agents": 8,
+            "bandit_agents": 20,
             "environment_algorithms": ["ppo", "sac"],
             "environment_agents": 4,
             "environment_steps": 1_000_000,
