@@ -10,7 +10,7 @@ from the folder in the variable SCB_PUBLISHED; without them ours are measured al
 
 import os
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -204,15 +204,22 @@ def _environment_of(name: str) -> str:
 
 
 def matches(report: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """For each bandit and algorithm that was trained in the environment too: who reaches the bandit's level, when."""
-    from scb.statistics import iqm
+    """For each bandit and algorithm that was trained in the environment too: who reaches the bandit's level, when.
+
+    The level is uncertain, so the median number of steps to the lower end of its interval is there too.
+    """
+    from scb.statistics import estimate
+
+    def median(steps: Sequence[int | None]) -> float | None:
+        middle = float(np.median([np.inf if x is None else x for x in steps]))
+        return middle if np.isfinite(middle) else None
 
     rows = []
     for name, algorithms in report["bandits"].items():
         for algorithm, curves in report["environments"][_environment_of(name)].items():
-            level = float(iqm(finals(algorithms[algorithm])))
-            steps = steps_to_match(curves, level)
-            median = float(np.median([np.inf if x is None else x for x in steps]))
+            level = estimate(finals(algorithms[algorithm]))
+            steps = steps_to_match(curves, level.value)
+            low = level.value if level.low is None else level.low
             rows.append(
                 {
                     "bandit": name,
@@ -221,7 +228,8 @@ def matches(report: Mapping[str, Any]) -> list[dict[str, Any]]:
                     "bandit_steps": algorithms[algorithm]["steps"][-1],
                     "reached": sum(x is not None for x in steps),
                     "agents": len(steps),
-                    "steps": median if np.isfinite(median) else None,
+                    "steps": median(steps),
+                    "steps_low": median(steps_to_match(curves, low)),
                     "trained": curves["steps"][-1],
                     "spacing": curves["steps"][1] - curves["steps"][0],
                 }
@@ -232,36 +240,46 @@ def matches(report: Mapping[str, Any]) -> list[dict[str, Any]]:
 def parts(report: Mapping[str, Any]) -> list[bool | None]:
     """Row by row of `matches`: whether the environment takes 50 times the steps or more, roughly two orders.
 
-    None where it was trained for less and its agents did not get there.
+    To the lower end of the bandit's level, so that the luck of its agents does not decide. None where the
+    environment was trained for less and its agents did not get there.
     """
     found: list[bool | None] = []
     for row in matches(report):
-        times = (row["steps"] or row["trained"]) / row["bandit_steps"]
-        found.append(None if row["steps"] is None and times < ROUGHLY else times >= ROUGHLY)
+        times = (row["steps_low"] or row["trained"]) / row["bandit_steps"]
+        found.append(None if row["steps_low"] is None and times < ROUGHLY else times >= ROUGHLY)
     return found
+
+
+def _times(row: Mapping[str, Any], steps: float | None) -> str:
+    """How many times the bandit's steps."""
+    if steps is None:
+        return f"more than {row['trained'] / row['bandit_steps']:.0f}"
+    return f"{steps / row['bandit_steps']:.0f}"
 
 
 def verdict(report: Mapping[str, Any]) -> str:
     """How many times as many steps the environment takes; the median counts agents that never get there."""
-    parts = []
+    told = []
     for row in matches(report):
         most = row["trained"] / row["bandit_steps"]
         said = (
             f"{row['bandit']}, {row['algorithm'].upper()}: {row['reached']} of {row['agents']} agents reach the "
-            f"bandit's {row['level']:.0f}, "
+            f"bandit's {text(row['level'])}, "
         )
         said += (
-            f"in the median not within {row['trained']} steps, more than {most:.0f} times the bandit's"
+            f"in the median not within {row['trained']} steps, {_times(row, None)} times the bandit's"
             if row["steps"] is None
             else f"by {row['steps']:.0f} steps in the median (evaluations are {row['spacing']} apart), "
-            f"{row['steps'] / row['bandit_steps']:.0f} times the bandit's"
+            f"{_times(row, row['steps'])} times the bandit's"
         )
+        if row["steps_low"] != row["steps"]:
+            said += f" ({_times(row, row['steps_low'])} to the lower end)"
         if most < 100:
             said += (
                 f" (trained up to {most:.0f} times as long: two orders of magnitude are not tested)"
             )
-        parts.append(said)
-    return "; ".join(parts).replace("-", "\u2212") + "."
+        told.append(said)
+    return "; ".join(told).replace("-", "\u2212") + "."
 
 
 def body(report: Mapping[str, Any]) -> list[str]:
@@ -293,13 +311,12 @@ def body(report: Mapping[str, Any]) -> list[str]:
         [
             row["bandit"],
             row["algorithm"].upper(),
-            f"{row['level']:.0f}",
+            text(row["level"]),
             f"{row['reached']} of {row['agents']}",
             f"more than {row['trained']}" if row["steps"] is None else f"{row['steps']:.0f}",
             str(row["spacing"]),
-            f"more than {row['trained'] / row['bandit_steps']:.0f}"
-            if row["steps"] is None
-            else f"{row['steps'] / row['bandit_steps']:.0f}",
+            _times(row, row["steps"]),
+            _times(row, row["steps_low"]),
         ]
         for row in matches(report)
     ]
@@ -351,6 +368,7 @@ def body(report: Mapping[str, Any]) -> list[str]:
                 "steps (median)",
                 "evaluations apart",
                 "times the bandit's",
+                "to the level's lower end",
             ],
             matched,
         ),

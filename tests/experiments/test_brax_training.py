@@ -41,20 +41,29 @@ def test_steps_to_match_are_of_the_first_evaluation_that_reaches_the_level():
 def test_the_verdict_follows_the_figures(report):
     said = experiment.verdict(report)
     assert (
-        "2 of 2 agents reach the bandit's 200, by 600000 steps in the median (evaluations are 400000 apart), 60 times"
+        "2 of 2 agents reach the bandit's 200 [200, 200], by 600000 steps in the median (evaluations are 400000 apart), 60 times"
         in said
     )
-    more = (
-        "0 of 2 agents reach the bandit's 200, in the median not within 800000 steps, more than 80"
-    )
+    more = "0 of 2 agents reach the bandit's 200 [200, 200], in the median not within 800000 steps, more than 80"
     assert more in said
     assert "two orders of magnitude are not tested" in said
     assert experiment.parts(report) == [True, True]
     # Of two agents one gets there: the median is not that one's.
     report["environments"]["hopper (spring)"]["ppo"]["returns"][0] = [0.0, 0.0, 0.0]
-    assert "1 of 2 agents reach the bandit's 200, in the median not within" in experiment.verdict(
-        report
+    assert (
+        "1 of 2 agents reach the bandit's 200 [200, 200], in the median not within"
+        in experiment.verdict(report)
     )
+
+
+def test_the_uncertainty_of_a_level_is_that_of_its_steps(report):
+    # The interval of two agents is their range, 100 to 300: both agents earn 100 at the first evaluation.
+    in_bandit = curves([0, 10_000], [0.0, 100.0], [0.0, 300.0])
+    report["bandits"]["hopper (spring), ours"]["ppo"] = in_bandit
+    said = experiment.verdict(report)
+    assert "bandit's 200 [100, 300], by 600000 steps" in said
+    assert "60 times the bandit's (40 to the lower end)" in said
+    assert experiment.parts(report) == [False, True]
 
 
 def test_the_page_and_the_figure_show_bandits_environments_and_the_paper(report):
