@@ -168,7 +168,7 @@ def body(report: Mapping[str, Any]) -> list[str]:
         ),
         "",
         "PPO with the paper's fixed hyperparameters; the agent shown is the best of them by other episodes. Most "
-        "likely actions.",
+        "likely actions. Acrobot's last step costs nothing.",
     ]
 
 

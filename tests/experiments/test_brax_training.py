@@ -40,10 +40,8 @@ def test_steps_to_match_are_of_the_first_evaluation_that_reaches_the_level():
 
 def test_the_verdict_follows_the_figures(report):
     said = experiment.verdict(report)
-    assert (
-        "2 of 2 agents reach the bandit's 200 [200, 200], by 600000 steps in the median (evaluations are 400000 apart), 60 times"
-        in said
-    )
+    assert "2 of 2 agents reach the bandit's 200 [200, 200], by 600000 steps in the median" in said
+    assert "(evaluations are 400000 apart), 60 times" in said
     more = "0 of 2 agents reach the bandit's 200 [200, 200], in the median not within 800000 steps, more than 80"
     assert more in said
     assert "two orders of magnitude are not tested" in said
