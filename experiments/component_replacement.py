@@ -294,7 +294,7 @@ EXPERIMENT = Experiment(
             "episodes": 50,
         },
     },
-    minutes={"quick": "5", "paper": "18"},
+    minutes={"quick": "3", "paper": "16"},
     measure=measure,
     parts=parts,
     verdict=verdict,

@@ -182,7 +182,7 @@ EXPERIMENT = Experiment(
             "evaluations": 200,
         },
     },
-    minutes={"quick": "8", "paper": "12"},
+    minutes={"quick": "5", "paper": "12"},
     measure=measure,
     parts=parts,
     verdict=verdict,

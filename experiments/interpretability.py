@@ -220,7 +220,7 @@ EXPERIMENT = Experiment(
         "quick": {"episodes": 50, "repetitions": 5, "seed": 0},
         "paper": {"episodes": 200, "repetitions": 20, "seed": 0},
     },
-    minutes={"quick": "2", "paper": "5"},
+    minutes={"quick": "1", "paper": "2"},
     measure=measure,
     parts=parts,
     verdict=verdict,

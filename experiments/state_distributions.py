@@ -256,7 +256,7 @@ EXPERIMENT = Experiment(
             "entries": _ENTRIES,
         },
     },
-    minutes={"quick": "9", "paper": "15"},
+    minutes={"quick": "6", "paper": "13"},
     measure=measure,
     parts=parts,
     verdict=verdict,

@@ -218,7 +218,7 @@ EXPERIMENT = Experiment(
             "seed": 50_000,
         },
     },
-    minutes={"quick": "2", "paper": "5"},
+    minutes={"quick": "2", "paper": "3"},
     needs="needs a browser with access to the web for Hopper's page",
     measure=measure,
     parts=parts,
