@@ -37,7 +37,7 @@ format: $(INSTALLED) ## put every file into the project's format
 bench: $(INSTALLED) .venv-rejax/.installed ## train agents in the bandits beside rejax's: time and return
 	@$(BIN)/python -m experiments.benchmark --rejax-python .venv-rejax/bin/python
 
-experiments: $(INSTALLED) ## the paper's experiments, quick presets, what is missing of them: docs/experiments.md
+experiments: $(INSTALLED) ## the paper's experiments: measure what is missing (quick presets), write docs/experiments.md
 	@$(BIN)/python -m experiments --preset quick
 
 # rejax needs a gymnax that this project doesn't run on, so it gets an environment of its own.

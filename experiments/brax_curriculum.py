@@ -80,9 +80,12 @@ def _above(report: Mapping[str, Any]) -> list[str]:
 def parts(report: Mapping[str, Any]) -> list[bool | None]:
     """Shape by shape: whether it ends above; None where no search reached the local optimum of standing still."""
     above, shapes = _above(report), [x for x in report["curves"] if x != NONE]
-    if -math.inf < _best_without(report) < STANDING:
-        return [None] * len(shapes)
-    return [x in above for x in shapes]
+    return [None if _untold(_best_without(report)) else x in above for x in shapes]
+
+
+def _untold(best: float) -> bool:
+    """Whether searches without a curriculum stay below the local optimum that the claim is about."""
+    return -math.inf < best < STANDING
 
 
 def verdict(report: Mapping[str, Any]) -> str:
@@ -110,7 +113,7 @@ def verdict(report: Mapping[str, Any]) -> str:
         + (
             f" None of them earns what standing still does ({STANDING:.0f}), the local optimum that the claim is "
             "about: so few generations do not test it."
-            if -math.inf < best < STANDING
+            if _untold(best)
             else ""
         )
     )

@@ -15,8 +15,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from experiments.page import exit_status
-from experiments.zoo_table import read_report
+from experiments.page import exit_status, read
 from experiments.zoo_table_page import ENVIRONMENTS, TARGETS, label
 from lpo.cli import configure_jax
 
@@ -405,7 +404,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             write_report(arguments.out, report)
             for left in report["left_out"]:
                 print(f"left out: {left['name']}, since {left['why']}")
-        render(read_report(arguments.out), arguments.docs)
+        render(read(arguments.out), arguments.docs)
         return 0
 
     return exit_status("discovery_cost", collect_and_render)

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from scb.analysis.components import SACExpert
+    from scb.statistics import Estimate
 
 # Liesen et al. (2024), table of SAC experts: interquartile mean and 95 % interval of 200 evaluations.
 PAPER = {
@@ -73,19 +74,21 @@ def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None
         save()
 
 
-def parts(report: Mapping[str, Any]) -> list[bool]:
-    """Environment by environment: whether the interval reaches the paper's."""
+def _earned(report: Mapping[str, Any]) -> "dict[str, Estimate]":
     from scb.statistics import estimate
 
-    found = {name: estimate(x["returns"]) for name, x in report["environments"].items()}
-    return [(x.value if x.high is None else x.high) >= PAPER[n][1] for n, x in found.items()]
+    return {name: estimate(x["returns"]) for name, x in report["environments"].items()}
+
+
+def parts(report: Mapping[str, Any]) -> list[bool]:
+    """Environment by environment: whether the interval reaches the paper's."""
+    found = _earned(report).items()
+    return [(x.value if x.high is None else x.high) >= PAPER[name][1] for name, x in found]
 
 
 def verdict(report: Mapping[str, Any]) -> str:
     """Each environment's figure, and where it lies below the paper's interval."""
-    from scb.statistics import estimate
-
-    found = {name: estimate(x["returns"]) for name, x in report["environments"].items()}
+    found = _earned(report)
     below = [name for name, level in zip(found, parts(report), strict=True) if not level]
     listed = ", ".join(f"{name} {text(x, 1)}" for name, x in found.items())
     return f"{listed}; " + (

@@ -52,29 +52,29 @@ def _examine(name: str, plan: Mapping[str, Any]) -> dict[str, Any]:
 
     bandit = open_bandit(f"Synthetic-{name}")
     env, env_params = scb.make(name)
-    numbers, parts = explain(bandit, env, env_params, name, plan["episodes"], plan["seed"])
+    numbers, drawn = explain(bandit, env, env_params, name, plan["episodes"], plan["seed"])
     keys = jax.random.split(jax.random.key(plan["seed"] + 1), plan["repetitions"])
     shares = []
     for key in keys:
         key_contexts, key_vary = jax.random.split(key)
         contexts = jnp.asarray(bandit_states(bandit, key_contexts, 2000))
         shares.append(np.asarray(reward_variance(bandit, contexts, key_vary)))
-    plane = parts["plane"]
+    plane = drawn["plane"]
     _, _, nodes = plane.grid(POINTS)
-    actions = parts["best"](nodes)
+    actions = drawn["best"](nodes)
     return {
         "sha256": bandit_metadata(bandit.name)["sha256"],
         "return": numbers["return_of_optimal_policy"],
         "importance": {
             entry: estimate(column).as_dict()
-            for entry, column in zip(parts["names"], np.transpose(shares), strict=True)
+            for entry, column in zip(drawn["names"], np.transpose(shares), strict=True)
         },
         "labels": list(plane.labels),
         "limits": [list(x) for x in plane.limits],
-        "num_actions": parts["num_actions"],
-        "bounds": parts["bounds"],
+        "num_actions": drawn["num_actions"],
+        "bounds": drawn["bounds"],
         "actions": packed(actions.reshape(POINTS, POINTS)),
-        "episode": packed(plane.project(parts["episode"])),
+        "episode": packed(plane.project(drawn["episode"])),
     }
 
 
@@ -117,15 +117,16 @@ def _observed(report: Mapping[str, Any]) -> dict[str, float]:
 def verdict(report: Mapping[str, Any]) -> str:
     """Each of the paper's three observations, with its figures."""
     angles, speeds, position, angle, idle, idle_continuous = _observed(report).values()
+    fewer_angles, both_hardly, never_idle, often_idle = parts(report)
     said = [
         f"Acrobot's reward depends less on its angles (no more than {angles:.0%} of the variance each) than on its "
         f"angular velocities (at least {speeds:.0%}): "
-        + ("holds." if angles < speeds else "does not hold."),
+        + ("holds." if fewer_angles else "does not hold."),
         f"CartPole's position causes {position:.1%} and its angle {angle:.1%}: the near-invariance (less than "
         f"{HARDLY:.0%}) "
         + (
             "holds for both."
-            if max(position, angle) < HARDLY
+            if both_hardly
             else "holds for the position only."
             if position < HARDLY
             else "holds for the angle only."
@@ -136,11 +137,11 @@ def verdict(report: Mapping[str, Any]) -> str:
         f"nothing in {idle_continuous:.1%}: "
         + (
             "holds."
-            if idle < 0.01 and idle_continuous > 0.1
+            if never_idle and often_idle
             else "the first half holds."
-            if idle < 0.01
+            if never_idle
             else "the second half holds."
-            if idle_continuous > 0.1
+            if often_idle
             else "does not hold."
         ),
     ]

@@ -140,15 +140,20 @@ def summary(entry: Mapping[str, Any]) -> dict[str, float]:
 def parts(report: Mapping[str, Any]) -> list[bool]:
     """Environment by environment: whether the contexts cover more; then whether actions are smoother in two or more."""
     found = [summary(x) for x in report["environments"].values()]
-    smoother = sum(x[BANDIT_ROUGHNESS] < x[EXPERT_ROUGHNESS] for x in found)
-    return [*(x[BANDIT_COVERAGE] > x[EXPERT_COVERAGE] for x in found), smoother >= 2]
+    return [*map(_wider, found), sum(map(_smoother, found)) >= 2]
+
+
+def _wider(x: Mapping[str, float]) -> bool:
+    return x[BANDIT_COVERAGE] > x[EXPERT_COVERAGE]
+
+
+def _smoother(x: Mapping[str, float]) -> bool:
+    return x[BANDIT_ROUGHNESS] < x[EXPERT_ROUGHNESS]
 
 
 def verdict(report: Mapping[str, Any]) -> str:
     """Whose states cover more of the plane, and whose best actions change less over it."""
     found = {name: summary(x) for name, x in report["environments"].items()}
-    wider = [n for n, x in found.items() if x[BANDIT_COVERAGE] > x[EXPERT_COVERAGE]]
-    smoother = [n for n, x in found.items() if x[BANDIT_ROUGHNESS] < x[EXPERT_ROUGHNESS]]
     covered = ", ".join(
         f"{n} {x[BANDIT_COVERAGE]:.0%} against {x[EXPERT_COVERAGE]:.0%}"
         + (f", with {x[OUTSIDE]:.0%} of its contexts off the plane" if x[OUTSIDE] > MANY else "")
@@ -157,10 +162,11 @@ def verdict(report: Mapping[str, Any]) -> str:
     changes = ", ".join(
         f"{n} {x[BANDIT_ROUGHNESS]:.1%} against {x[EXPERT_ROUGHNESS]:.1%}" for n, x in found.items()
     )
+    wider, smoother = (sum(map(f, found.values())) for f in (_wider, _smoother))
     return (
-        f"the bandit's contexts cover more of the plane than the expert's states in {len(wider)} of {len(found)} "
+        f"the bandit's contexts cover more of the plane than the expert's states in {wider} of {len(found)} "
         f"environments ({covered}); its best actions change less over the plane than the expert's in "
-        f"{len(smoother)} of {len(found)} ({changes})."
+        f"{smoother} of {len(found)} ({changes})."
     )
 
 

@@ -15,7 +15,6 @@ the same command continues an interrupted one. The table and the figure are made
 
 import argparse
 import hashlib
-import json
 import sys
 import time
 from collections.abc import Iterable, Mapping, Sequence
@@ -25,7 +24,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from experiments.page import exit_status
+from experiments.page import exit_status, read
 from experiments.zoo_table_page import (
     ACTIONS,
     BANDITS,
@@ -261,16 +260,6 @@ def command_text(arguments: argparse.Namespace, published: bool) -> str:
     return " ".join(parts)
 
 
-def read_report(path: Path) -> dict[str, Any]:
-    """A report from its file; a UserError where there is none."""
-    from scb.errors import UserError
-
-    try:
-        return dict(json.loads(path.read_text()))
-    except (OSError, TypeError, ValueError) as error:
-        raise UserError(f"{path} is no report of this command ({error}): measure first.") from error
-
-
 def parser() -> argparse.ArgumentParser:
     made = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -305,7 +294,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             published = arguments.published
             if published is None and DEFAULT_PUBLISHED.is_dir():
                 published = DEFAULT_PUBLISHED
-            report = read_report(arguments.out) if arguments.out.exists() else {}
+            report = read(arguments.out, missing_is_new=True)
             entries = report.get("entries", [])
             report = {
                 # Entries that are there already stay, so several commands may have made them.
@@ -328,7 +317,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             )
             found = candidates(arguments.bandits, published, arguments.skip_brax)
             measure(found, protocol, report, arguments.out)
-        render(read_report(arguments.out), arguments.docs)
+        render(read(arguments.out), arguments.docs)
         return 0
 
     return exit_status("zoo_table", measure_and_render)

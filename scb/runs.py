@@ -30,13 +30,13 @@ def make_folder(folder: Path, flag: str = "--out") -> None:
     """Makes a folder for what a command will write, so that it fails before the work and not after it.
 
     Raises:
-      UserError: nothing can be written there; `flag` says where.
+      UserError: nothing can be written there, or read; `flag` says where.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise _cannot_write(folder, flag, error.strerror) from error
-    if not os.access(folder, os.W_OK):
+    if not os.access(folder, os.R_OK | os.W_OK | os.X_OK):
         raise _cannot_write(folder, flag)
 
 
