@@ -35,6 +35,7 @@ from typing import Any
 import numpy as np
 
 from experiments.page import exit_status
+from scb.keys import key_at, root_key, split_key
 
 EPISODES = 20
 STEPS = 10_000
@@ -107,13 +108,13 @@ def measure_this_project(task: Task, steps: int) -> dict[str, list[float]]:
     seconds: list[float] = []
     returns: list[float] = []
     for repeat in range(task.repeats + 1):
-        keys = jax.random.split(jax.random.key(repeat), task.population)
+        keys = split_key(root_key(repeat), task.population)
         start = time.perf_counter()
         states = train_all(keys)
         if repeat == 0:
             continue
         seconds.append((time.perf_counter() - start) / task.population)
-        keys = jax.random.split(jax.random.fold_in(jax.random.key(repeat), 1), task.population)
+        keys = split_key(key_at(root_key(repeat), 1), task.population)
         returns += evaluate_all(states, keys).tolist()
     return {"seconds": seconds, "returns": returns}
 

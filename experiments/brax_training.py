@@ -19,6 +19,7 @@ import numpy as np
 from experiments import zoo_table, zoo_table_page
 from experiments.page import Experiment, Save, table, text
 from experiments.page import main as run
+from scb.keys import root_key, split_key
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -149,8 +150,6 @@ def _curves(
     import time
     from dataclasses import replace
 
-    import jax
-
     from scb.evolution import map_population
 
     every, iterations = evaluation_steps(agent.config.num_iterations, plan["points"])
@@ -166,7 +165,7 @@ def _curves(
         return agent.train_with_evaluations(key, hyperparameters, trained_in, evaluation, every)[1]
 
     start = time.monotonic()
-    keys = jax.random.split(jax.random.key(REPORTING_SEED), number)
+    keys = split_key(root_key(REPORTING_SEED), number)
     returns = np.asarray(map_population(train, number, (0,))(keys))
     seconds = time.monotonic() - start
     # What is no number counts as the agent before its training.

@@ -15,6 +15,7 @@ import numpy as np
 
 from experiments.page import Experiment, Save, finite, table, text
 from experiments.page import main as run
+from scb.keys import key_at, root_key, split_key
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -52,7 +53,6 @@ def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None
     ]
     if not unfinished:
         return
-    import jax
     import jax.numpy as jnp
 
     import scb
@@ -66,7 +66,7 @@ def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None
     space = env.action_space(env_params)
     bandit = open_bandit(f"Synthetic-{ENVIRONMENT}")
     inner = inner_loop("ppo", ENVIRONMENT, space)
-    key_random, key_experts = jax.random.split(jax.random.key(EXPERT_SEED))
+    key_random, key_experts = split_key(root_key(EXPERT_SEED))
 
     def counted(returns: Any) -> list[float]:
         """Two digits of each; what is no number counts as a random policy's."""
@@ -87,7 +87,7 @@ def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None
     def imitate(expert: Any, states: Any) -> list[float]:
         """Returns of policies cloned from the expert in these states."""
         source = components.ReplacedBandit(bandit, states=states)
-        key_draw, key_agents = jax.random.split(jax.random.key(REPORTING_SEED))
+        key_draw, key_agents = split_key(root_key(REPORTING_SEED))
         returns = components.judge_cloning(
             expert,
             lambda key: source.reset_env(key, source.default_params)[0],
@@ -109,9 +109,7 @@ def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None
         report["bandit"] = learn(None, None)
         save()
     for number in unfinished:
-        key_train, key_follow, key_judge = jax.random.split(
-            jax.random.fold_in(key_experts, number), 3
-        )
+        key_train, key_follow, key_judge = split_key(key_at(key_experts, number), 3)
         expert = components.train_sac_expert(
             ENVIRONMENT, env, env_params, key_train, plan["candidates"]
         )

@@ -16,6 +16,7 @@ from experiments import searches
 from experiments.page import CLASSIC_CONTROL, Experiment, Save, finite, span, table, text
 from experiments.page import main as run
 from experiments.searches import PAPER_SIZES
+from scb.keys import root_key, split_key
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -59,7 +60,6 @@ def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None
 def _measure_limit(
     environment: str, limit: str, plan: Mapping[str, Any], entry: dict[str, Any]
 ) -> None:
-    import jax
 
     from lpo.suite import random_return
     from scb.agents.hyperparameters import algorithms_for, inner_loop
@@ -80,7 +80,7 @@ def _measure_limit(
             inner_loop(algorithm, environment, space),
         )
         judged, lengths = returns_and_lengths(
-            training, outcome.mean, jax.random.key(JUDGE_SEED), plan["agents"], plan["episodes"]
+            training, outcome.mean, root_key(JUDGE_SEED), plan["agents"], plan["episodes"]
         )
         returns[algorithm], number = finite(judged, entry["random"])
         failed += number
@@ -97,14 +97,13 @@ def returns_and_lengths(
     Returns:
       ([N] mean returns in the environment with most likely actions, [N, E] steps of episodes in the synthetic one).
     """
-    import jax
 
     from scb.evolution import map_population
 
-    key_draw, key_agents = jax.random.split(key)
+    key_draw, key_agents = split_key(key)
 
     def one(hyperparameters: Any, key: Any, weights: Any) -> Any:
-        key_train, key_judge, key_act = jax.random.split(key, 3)
+        key_train, key_judge, key_act = split_key(key, 3)
         state = training.train(weights, hyperparameters, key_train)
         returns = training.evaluate(state, key_judge, num_episodes, mode=True)
         params = training.synthetic.params(weights)
@@ -112,7 +111,7 @@ def returns_and_lengths(
         return returns.mean(), episodes.lengths
 
     hyperparameters = training.inner.sample(key_draw, num_agents)
-    keys = jax.random.split(key_agents, num_agents)
+    keys = split_key(key_agents, num_agents)
     returns, lengths = map_population(one, num_agents, (0, 0, None))(hyperparameters, keys, weights)
     return np.asarray(returns), np.asarray(lengths)
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from experiments.page import CLASSIC_CONTROL, Experiment, Save, table, text
 from experiments.page import main as run
+from scb.keys import root_key
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -31,13 +32,12 @@ EXPERT_SEED, JUDGE_SEED = 40_000, 10_000
 
 def train(environment: str, number: int, episodes: int) -> "tuple[SACExpert, Any, Any]":
     """(the best of `number` agents on `episodes` episodes, the environment, its parameters)."""
-    import jax
 
     import scb
     from scb.analysis.components import train_sac_expert
 
     env, env_params = scb.make(environment)
-    key = jax.random.key(EXPERT_SEED)
+    key = root_key(EXPERT_SEED)
     return train_sac_expert(environment, env, env_params, key, number, episodes), env, env_params
 
 
@@ -61,7 +61,7 @@ def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None
             lambda key, expert=expert, env=env, env_params=env_params: (
                 evaluate(env, env_params, expert.policy(), key, plan["evaluations"]).returns
             )
-        )(jax.random.key(JUDGE_SEED))
+        )(root_key(JUDGE_SEED))
         setting = environment_setting(environment, "sac")
         found[environment] = {
             "returns": np.round(np.asarray(returns), 2).tolist(),

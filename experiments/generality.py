@@ -19,6 +19,7 @@ from experiments import searches
 from experiments.page import CLASSIC_CONTROL, Experiment, Save, finite, span, table, text
 from experiments.page import main as run
 from experiments.searches import PAPER_SIZES
+from scb.keys import root_key, split_key
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -145,11 +146,10 @@ class _Trainer:
 
     def returns(self, agent: str) -> np.ndarray:
         """[N] mean returns of agents of one kind, most likely actions."""
-        import jax
 
         from scb.agents.hyperparameters import inner_loop
 
-        key = jax.random.key(REPORTING_SEED)
+        key = root_key(REPORTING_SEED)
         if agent == OPTIMAL:
             return self._optimal(key)
         if agent == EVOLVED:
@@ -160,23 +160,22 @@ class _Trainer:
         )
 
     def _trained(self, inner: "InnerLoop", key: Any) -> np.ndarray:
-        import jax
 
         from scb.evolution import map_population
 
         agent, episodes = inner.agent(self.trained_in), self.plan["episodes"]
-        key_draw, key_agents = jax.random.split(key)
+        key_draw, key_agents = split_key(key)
         number = self.plan["agents"]
 
         def judged(hyperparameters: Any, key: Any, params: Any) -> Any:
-            key_train, key_judge = jax.random.split(key)
+            key_train, key_judge = split_key(key)
             state = agent.train(key_train, hyperparameters, params)
             return agent.evaluate(
                 state, key_judge, episodes, self.env, self.env_params, mode=True
             ).returns.mean()
 
         hyperparameters = inner.sample(key_draw, number)
-        keys = jax.random.split(key_agents, number)
+        keys = split_key(key_agents, number)
         judge = map_population(judged, number, (0, 0, None))
         return np.asarray(judge(hyperparameters, keys, self.trained_in_params))
 
@@ -197,18 +196,17 @@ class _Trainer:
         return self._judged_policies(lambda key: policy, key)
 
     def _judged_policies(self, make: Callable[[Any], Any], key: Any) -> np.ndarray:
-        import jax
 
         from scb.evaluation import evaluate
         from scb.evolution import map_population
 
         def judged(key: Any) -> Any:
-            key_make, key_judge = jax.random.split(key)
+            key_make, key_judge = split_key(key)
             policy, episodes = make(key_make), self.plan["episodes"]
             return evaluate(self.env, self.env_params, policy, key_judge, episodes).returns.mean()
 
         number = self.plan["agents"]
-        return np.asarray(map_population(judged, number, (0,))(jax.random.split(key, number)))
+        return np.asarray(map_population(judged, number, (0,))(split_key(key, number)))
 
 
 def in_environment(config: "NeuroevolutionConfig", limit: int) -> "NeuroevolutionConfig":

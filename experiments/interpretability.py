@@ -22,6 +22,7 @@ from experiments.page import (
     unpacked,
 )
 from experiments.page import main as run
+from scb.keys import root_key, split_key
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -40,7 +41,6 @@ def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None
 
 
 def _examine(name: str, plan: Mapping[str, Any]) -> dict[str, Any]:
-    import jax
     import jax.numpy as jnp
 
     import scb
@@ -53,10 +53,10 @@ def _examine(name: str, plan: Mapping[str, Any]) -> dict[str, Any]:
     bandit = open_bandit(f"Synthetic-{name}")
     env, env_params = scb.make(name)
     numbers, drawn = explain(bandit, env, env_params, name, plan["episodes"], plan["seed"])
-    keys = jax.random.split(jax.random.key(plan["seed"] + 1), plan["repetitions"])
+    keys = split_key(root_key(plan["seed"] + 1), plan["repetitions"])
     shares = []
     for key in keys:
-        key_contexts, key_vary = jax.random.split(key)
+        key_contexts, key_vary = split_key(key)
         contexts = jnp.asarray(bandit_states(bandit, key_contexts, 2000))
         shares.append(np.asarray(reward_variance(bandit, contexts, key_vary)))
     plane = drawn["plane"]

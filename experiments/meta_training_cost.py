@@ -15,6 +15,7 @@ import numpy as np
 
 from experiments.page import exit_status
 from lpo.cli import configure_jax
+from scb.keys import root_key
 
 
 def main() -> int:
@@ -49,14 +50,14 @@ def main() -> int:
     }
     result: dict[str, dict[str, float]] = {}
     for name, problem in problems.items():
-        weights = problem.initial_solution(jax.random.key(0))
+        weights = problem.initial_solution(root_key(0))
         population = jax.tree.map(
             lambda x: jnp.broadcast_to(x, (arguments.population_size, *x.shape)), weights
         )
         evaluate = map_population(problem.evaluate, arguments.population_size, (0, None, None))
         watch, seconds = Stopwatch(), []
         for generation in range(arguments.generations + 1):
-            evaluate(population, jax.random.key(generation), jnp.int32(generation))
+            evaluate(population, root_key(generation), jnp.int32(generation))
             seconds.append(watch.lap())
         steps = problem.steps()
         result[name] = {

@@ -13,6 +13,7 @@ import numpy as np
 
 from experiments.page import ACTIONS, CLASSIC_CONTROL, Experiment, Save, packed, table, unpacked
 from experiments.page import main as run
+from scb.keys import root_key, split_key
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -50,7 +51,7 @@ def _examine(environment: str, plan: Mapping[str, Any]) -> dict[str, Any]:
     from scb.analysis.states import bandit_states, follow
     from scb.environments.zoo import bandit_metadata, open_bandit
 
-    key_states, key_episodes, key_pick = jax.random.split(jax.random.key(SEED), 3)
+    key_states, key_episodes, key_pick = split_key(root_key(SEED), 3)
     expert, env, env_params = experts.train(environment, plan["agents"], plan["selection_episodes"])
     bandit = open_bandit(f"Synthetic-{environment}")
     space = env.action_space(env_params)

@@ -17,6 +17,7 @@ import numpy as np
 from experiments.brax_curriculum import STANDING
 from experiments.page import CLASSIC_CONTROL, Experiment, Save, packed, table, text, unpacked
 from experiments.page import main as run
+from scb.keys import root_key, split_key
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -55,7 +56,7 @@ def _show(name: str, plan: Mapping[str, Any]) -> dict[str, Any]:
     bandit = open_bandit(f"Synthetic-{environment}")
     inner = inner_loop("ppo", environment, env.action_space(env_params), sampled=False)
     agent = inner.agent(bandit)
-    key_train, key_choose, key_show = jax.random.split(jax.random.key(plan["seed"]), 3)
+    key_train, key_choose, key_show = split_key(root_key(plan["seed"]), 3)
     episodes = plan["brax_episodes"] if brax else plan["episodes"]
 
     @jax.jit
@@ -65,7 +66,7 @@ def _show(name: str, plan: Mapping[str, Any]) -> dict[str, Any]:
         found = agent.evaluate(state, key_choose, episodes, env, env_params, mode=True)
         return state, found.returns.mean()
 
-    states, returns = train(jax.random.split(key_train, plan["agents"]))
+    states, returns = train(split_key(key_train, plan["agents"]))
     if not np.isfinite(returns).all():
         raise UserError(f"an agent of {name} has no finite return: choose another seed.")
     best = int(np.argmax(returns))

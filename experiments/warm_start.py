@@ -19,6 +19,7 @@ from typing import Any
 
 from experiments.page import exit_status
 from lpo.cli import configure_jax
+from scb.keys import root_key, split_key
 
 # Not the seeds that results are reported on.
 SEED = 7_000
@@ -66,7 +67,6 @@ def main() -> int:
     arguments = parser.parse_args()
     configure_jax()
 
-    import jax
     import numpy as np
 
     from scb import make
@@ -91,7 +91,7 @@ def main() -> int:
     for name in arguments.environment:
         env, env_params = make(name)
         space = env.action_space(env_params)
-        key_expert, key_data, key_fit = jax.random.split(jax.random.key(SEED), 3)
+        key_expert, key_data, key_fit = split_key(root_key(SEED), 3)
         start = time.perf_counter()
         expert = find_expert(name, env, env_params, key_expert, WarmStartConfig())
         seconds = time.perf_counter() - start

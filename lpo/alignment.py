@@ -33,6 +33,7 @@ from scb.environments.registry import make
 from scb.environments.zoo import home_of
 from scb.errors import UserError
 from scb.evolution import map_population
+from scb.keys import root_key, split_key
 from scb.runs import Stopwatch
 from scb.statistics import iqm, spearman
 
@@ -113,7 +114,7 @@ def known_drifts() -> list[Objective]:
     none = NoDrift()
     return [
         *_clips(0.05, 0.1, 0.2, 0.3, 0.5, 1.0),
-        Objective("none", none, none.init(jax.random.key(0))),
+        Objective("none", none, none.init(root_key(0))),
         *_dpo((1.0, 0.3), (2.0, 0.6), (4.0, 1.2)),
     ]
 
@@ -126,12 +127,12 @@ def other_drifts() -> list[Objective]:
 
 # Objectives of one drift with other parameters share a program.
 def _clips(*clips: float) -> list[Objective]:
-    key = jax.random.key(0)
+    key = root_key(0)
     return [Objective(f"ppo-{clip:g}", ClipDrift(), ClipDrift(clip).init(key)) for clip in clips]
 
 
 def _dpo(*parameters: tuple[float, float]) -> list[Objective]:
-    key = jax.random.key(0)
+    key = root_key(0)
     return [
         Objective(f"dpo ({alpha:g}, {beta:g})", DPODrift(), DPODrift(alpha, beta).init(key))
         for alpha, beta in parameters
@@ -205,7 +206,7 @@ def _program(regime: Regime, drift: Drift, size: int) -> Callable[..., Any]:
             )
             return episodes.returns.mean()
 
-        key_train, key_sampled, key_home = jax.random.split(jax.random.key(seed), 3)
+        key_train, key_sampled, key_home = split_key(root_key(seed), 3)
         state, curve = task.agent.train_with_evaluations(
             key_train,
             replace(hyperparameters, drift=parameters),

@@ -20,6 +20,7 @@ from lpo.certificate import certify
 from lpo.drift import LearnedDrift, gated
 from lpo.formula import FUNCTIONS, ClosedFormDrift, parse
 from scb.errors import UserError
+from scb.keys import root_key
 
 if TYPE_CHECKING:
     from lpo.objectives import Objective
@@ -159,7 +160,7 @@ def distill(objective: "Objective", config: DistillConfig | None = None) -> Dist
         if score < best - config.tolerance:
             continue
         closed = ClosedFormDrift(text, **shape)
-        parameters = closed.init(jax.random.key(0))
+        parameters = closed.init(root_key(0))
         if certify(closed, parameters).holds:
             break
     else:
@@ -171,7 +172,7 @@ def distill(objective: "Objective", config: DistillConfig | None = None) -> Dist
         drift=closed,
         parameters=parameters,
         r2=fit_quality(objective, closed, parameters, held_out),
-        base_r2=fit_quality(objective, nothing, nothing.init(jax.random.key(0)), held_out),
+        base_r2=fit_quality(objective, nothing, nothing.init(root_key(0)), held_out),
         front=[{"size": size, "r2": score, "expression": text} for text, score, size in front],
         seconds=time.perf_counter() - start,
     )

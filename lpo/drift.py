@@ -17,6 +17,7 @@ import jax.numpy as jnp
 
 from scb.agents.ppo import clipped_surrogate_drift
 from scb.errors import UserError, unknown_name
+from scb.keys import split_key
 
 Base: TypeAlias = Literal["ppo", "none"]
 BASES: tuple[Base, ...] = ("ppo", "none")
@@ -175,7 +176,7 @@ class LearnedDrift:
         The network is odd in its weights, net(W1, W2) = net(-W1, -W2): from zeros, antithetic pairs
         of an evolution strategy would tie exactly and the search would never leave.
         """
-        key_hidden, key_output = jax.random.split(key)
+        key_hidden, key_output = split_key(key)
         initialize = jax.nn.initializers.lecun_normal()
         shapes = self.weight_shapes()
         return {

@@ -20,6 +20,7 @@ from scb.agents.settings import Setting, environment_setting
 from scb.environments.registry import make
 from scb.errors import UserError
 from scb.evolution import map_population
+from scb.keys import root_key
 from scb.statistics import Estimate, estimate, paired_difference
 
 
@@ -227,7 +228,7 @@ def _family_curves(
 
         hyperparameters = replace(setting.hyperparameters, drift=parameters)
         _, returns = agent.train_with_evaluations(
-            jax.random.key(seed), hyperparameters, env_params, judge, every
+            root_key(seed), hyperparameters, env_params, judge, every
         )
         return returns
 

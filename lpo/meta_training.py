@@ -29,6 +29,7 @@ from scb.environments.synthetic import SyntheticBandit
 from scb.environments.zoo import home_of
 from scb.errors import UserError, unknown_name
 from scb.evolution import EnvironmentSteps, EvolutionConfig, Outcome, evolve
+from scb.keys import key_at, root_key, split_key
 from scb.runs import Run
 
 Fitness = Literal["return", "area", "transfer"]
@@ -204,7 +205,7 @@ class TaskTraining:
         self.evaluation_episodes = config.evaluation_episodes or (50 if one_step else 20)
         self.training_params = self.env_params
         if isinstance(self.env, SyntheticBandit) and config.reward_noise:
-            scale = self.env.reward_scale(self.env_params, jax.random.key(0))
+            scale = self.env.reward_scale(self.env_params, root_key(0))
             self.training_params = self.env_params.replace(reward_noise=config.reward_noise * scale)
         self.base_hyperparameters = environment_setting(self.home).hyperparameters
 
@@ -216,12 +217,12 @@ class TaskTraining:
         Args:
           horizon: how long they train, as a fraction of the inner loop's iterations; traced.
         """
-        key_draw, key_agents = jax.random.split(key)
+        key_draw, key_agents = split_key(key)
         hyperparameters = sample_hyperparameters(
             key_draw, self.config.hyperparameters, number, self.base_hyperparameters
         )
         return jax.vmap(lambda h, k: self._train_one(drift_parameters, h, k, horizon))(
-            hyperparameters, jax.random.split(key_agents, number)
+            hyperparameters, split_key(key_agents, number)
         )
 
     def _train_one(
@@ -232,7 +233,7 @@ class TaskTraining:
         horizon: ArrayLike,
     ) -> jax.Array:
         config = self.config
-        key_train, key_evaluate = jax.random.split(key)
+        key_train, key_evaluate = split_key(key)
         hyperparameters = replace(hyperparameters, drift=drift_parameters)
 
         def judge(state: PPOState, key: jax.Array) -> jax.Array:
@@ -317,12 +318,10 @@ class MetaTraining:
         if config.horizons:
             # One for the whole generation: candidates are compared on it, and no agent waits for
             # another.
-            key_horizon = jax.random.fold_in(key, len(config.tasks))
+            key_horizon = key_at(key, len(config.tasks))
             horizon = jax.random.choice(key_horizon, jnp.asarray(config.horizons))
         fitness = {
-            name: task.fitness(
-                candidate, jax.random.fold_in(key, i), config.agents_per_candidate, horizon
-            )
+            name: task.fitness(candidate, key_at(key, i), config.agents_per_candidate, horizon)
             for i, (name, task) in enumerate(self.tasks.items())
         }
         apart = {} if len(fitness) == 1 else {f"fitness/{n}": x.mean() for n, x in fitness.items()}
@@ -330,7 +329,7 @@ class MetaTraining:
 
     def evaluate_mean(self, candidate: Any, key: jax.Array) -> dict[str, jax.Array]:
         fitness = {
-            name: task.fitness(candidate, jax.random.fold_in(key, i), 1)[0]
+            name: task.fitness(candidate, key_at(key, i), 1)[0]
             for i, (name, task) in enumerate(self.judges.items())
         }
         apart = {} if len(fitness) == 1 else {f"fitness/{n}": x for n, x in fitness.items()}

@@ -16,6 +16,7 @@ from lpo.drift import TEMPORAL_FEATURES, ClipDrift, DPODrift, Drift, LearnedDrif
 from lpo.formula import ClosedFormDrift
 from scb import artefacts
 from scb.errors import UserError, unknown_name
+from scb.keys import root_key
 
 KIND = "drift"
 _CLIP_NAME = re.compile(r"ppo-(\d*\.?\d+)$")
@@ -75,7 +76,7 @@ def load_objective(name: str | Path) -> Objective:
 
 def _closed_form(name: str, drift: Drift) -> Objective:
     # A closed form's parameters are not random.
-    return Objective(name, drift, drift.init(jax.random.key(0)))
+    return Objective(name, drift, drift.init(root_key(0)))
 
 
 def _from_file(path: Path) -> Objective:
@@ -119,7 +120,7 @@ def _formula(path: Path, artefact: artefacts.Artefact, family: Mapping[str, Any]
         xi=family["xi"],
         gate=family.get("gate", 0.0),
     )
-    parameters = drift.init(jax.random.key(0))
+    parameters = drift.init(root_key(0))
     artefacts.expect_shapes(artefact, {"constants": parameters["constants"].shape})
     # The text is what a reader sees, so it must be what is computed.
     if not np.array_equal(np.asarray(artefact.arrays["constants"]), parameters["constants"]):
@@ -143,11 +144,11 @@ def save_objective(
       metadata: config (of the meta-training), seeds, results, cost, command.
     """
     if isinstance(drift, ClosedFormDrift) and not np.array_equal(
-        drift.init(jax.random.key(0))["constants"], parameters["constants"]
+        drift.init(root_key(0))["constants"], parameters["constants"]
     ):
         # Trained on: its text must say the numbers that it is saved with.
         drift = drift.with_parameters(parameters)
-        parameters = drift.init(jax.random.key(0))
+        parameters = drift.init(root_key(0))
     certificate = certify(drift, parameters)
     config = dict(metadata.get("config", {}))
     own: dict[str, Any]

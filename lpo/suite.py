@@ -20,6 +20,7 @@ from scb.environments.brax import BRAX_NAMES
 from scb.environments.registry import make
 from scb.errors import UserError, unknown_name
 from scb.evaluation import evaluate
+from scb.keys import root_key
 from scb.statistics import Estimate, iqm, normalized_score
 
 SUITES: dict[str, tuple[str, ...]] = {
@@ -75,7 +76,7 @@ def random_return(
     space = env.action_space(env_params)
     result = jax.jit(
         lambda key: evaluate(env, env_params, lambda _, k: space.sample(k), key, episodes)
-    )(jax.random.key(0))
+    )(root_key(0))
     return float(np.mean(result.returns))
 
 

@@ -37,6 +37,7 @@ from scb.environments.synthetic_mdp import PARAMETERIZATIONS, SyntheticMDP, synt
 from scb.environments.zoo import open_bandit
 from scb.errors import UserError, unknown_name
 from scb.evolution import EnvironmentSteps, EvolutionConfig, Outcome, evolve, map_population
+from scb.keys import key_at, root_key, split_key
 from scb.runs import Run, Stopwatch
 from scb.warm_start import (
     WarmStartConfig,
@@ -158,7 +159,7 @@ class SyntheticTraining:
         """(weights, [N] hyperparameters, [N] keys) -> [N] mean returns with each of `modes`, compiled once."""
 
         def returns(weights: Weights, hyperparameters: Any, key: jax.Array) -> list[jax.Array]:
-            key_train, key_evaluate = jax.random.split(key)
+            key_train, key_evaluate = split_key(key)
             state = self.train(weights, hyperparameters, key_train)
             return [self.evaluate(state, key_evaluate, num_episodes, m).mean() for m in modes]
 
@@ -205,7 +206,7 @@ class SyntheticTraining:
         longest: int | None = None,
     ) -> jax.Array:
         """[E] returns of one agent: `train`, then `evaluate`."""
-        key_train, key_evaluate = jax.random.split(key)
+        key_train, key_evaluate = split_key(key)
         state = self.train(weights, hyperparameters, key_train)
         return self.evaluate(state, key_evaluate, num_episodes, mode, limit, longest)
 
@@ -290,8 +291,8 @@ class BanditDiscovery:
     def _expert_fit(self) -> Weights:
         assert isinstance(self.bandit, SyntheticBandit)
         # Of the seed alone, so that a resumed run starts from the same fit.
-        key_expert, key_data, key_fit = jax.random.split(
-            jax.random.fold_in(jax.random.key(self.config.evolution.seed), 1), 3
+        key_expert, key_data, key_fit = split_key(
+            key_at(root_key(self.config.evolution.seed), 1), 3
         )
         warm, watch = self.config.warm_start, Stopwatch()
         expert = find_expert(self.config.environment, self.env, self.env_params, key_expert, warm)
@@ -313,7 +314,7 @@ class BanditDiscovery:
 
         def returns_of(name: str, key: jax.Array) -> jax.Array:
             training = self.trainings[name]
-            key_draw, key_agents = jax.random.split(key)
+            key_draw, key_agents = split_key(key)
             number = config.agents_per_candidate
             return jax.vmap(
                 lambda h, k: training.returns(
@@ -325,12 +326,12 @@ class BanditDiscovery:
                     limit,
                     self._longest,
                 ).mean()
-            )(training.inner.sample(key_draw, number), jax.random.split(key_agents, number))
+            )(training.inner.sample(key_draw, number), split_key(key_agents, number))
 
         names = list(self.trainings)
         if config.mode == "all":
             returns = {
-                name: returns_of(name, key if i == 0 else jax.random.fold_in(key, i))
+                name: returns_of(name, key if i == 0 else key_at(key, i))
                 for i, name in enumerate(names)
             }
             means = {f"fitness/{name}": r.mean() for name, r in returns.items()}
@@ -350,7 +351,7 @@ class BanditDiscovery:
     def evaluate_mean(self, candidate: Weights, key: jax.Array) -> dict[str, jax.Array]:
         results = {}
         for i, (name, training) in enumerate(self.trainings.items()):
-            key_draw, key_agent = jax.random.split(key if i == 0 else jax.random.fold_in(key, i))
+            key_draw, key_agent = split_key(key if i == 0 else key_at(key, i))
             hyperparameters = jax.tree.map(lambda x: x[0], training.inner.sample(key_draw, 1))
             results[f"fitness/{name}"] = training.returns(
                 candidate,
@@ -385,7 +386,7 @@ def standardize_reward(
 
     Both are over its contexts and uniform actions. What agents should do in it stays the same.
     """
-    rewards = bandit.sample_rewards(bandit.params(weights), jax.random.key(0), num_samples)
+    rewards = bandit.sample_rewards(bandit.params(weights), root_key(0), num_samples)
     factor = std / rewards.std()
     # Through the network's last layer, which is linear.
     reward = dict(weights["reward"])
@@ -440,11 +441,11 @@ def judge(
       {"sampled_actions": [N], "mode_actions": [N]} of the same agents; with `mode` given, only that
       one.
     """
-    key_draw, key_agents = jax.random.split(jax.random.key(seed))
+    key_draw, key_agents = split_key(root_key(seed))
     names = {False: "sampled_actions", True: "mode_actions"}
     modes = tuple(names) if mode is None else (mode,)
     hyperparameters = training.inner.sample(key_draw, num_agents)
-    keys = jax.random.split(key_agents, num_agents)
+    keys = split_key(key_agents, num_agents)
     population = training.population(num_agents, num_episodes, modes)
     returns = population(weights, hyperparameters, keys)
     return {names[m]: np.asarray(x) for m, x in zip(modes, returns, strict=True)}

@@ -8,6 +8,8 @@ import jax.numpy as jnp
 from gymnax.environments import environment
 from jax.typing import ArrayLike
 
+from scb.keys import key_at, split_key
+
 Policy = Callable[
     [jax.Array, jax.Array], jax.Array
 ]  # (observation, key) -> action, for one environment
@@ -41,18 +43,18 @@ def evaluate(
       Episodes of shape [E].
     """
     limit = env_params.max_steps_in_episode if horizon is None else horizon
-    key_reset, key_loop = jax.random.split(key)
+    key_reset, key_loop = split_key(key)
     observation, state = jax.vmap(env.reset_env, in_axes=(0, None))(
-        jax.random.split(key_reset, num_episodes), env_params
+        split_key(key_reset, num_episodes), env_params
     )
 
     def step(carry: Any) -> Any:
         time, observation, state, active, returns, lengths = carry
-        key_act, key_step = jax.random.split(jax.random.fold_in(key_loop, time))
-        action = jax.vmap(policy)(observation, jax.random.split(key_act, num_episodes))
+        key_act, key_step = split_key(key_at(key_loop, time))
+        action = jax.vmap(policy)(observation, split_key(key_act, num_episodes))
         # step_env, not step: a finished episode needs no reset, and its later rewards are masked.
         observation, state, reward, terminated, _ = jax.vmap(env.step_env, in_axes=(0, 0, 0, None))(
-            jax.random.split(key_step, num_episodes), state, action, env_params
+            split_key(key_step, num_episodes), state, action, env_params
         )
         truncated = jax.vmap(env.is_truncated, in_axes=(0, None))(state, env_params)
         returns = returns + jnp.where(active, jnp.reshape(reward, (num_episodes,)), 0.0)

@@ -24,6 +24,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, Ti
 from scipy.stats import rankdata
 
 from scb.errors import UserError, unknown_name
+from scb.keys import key_at, root_key, split_key
 from scb.runs import Checkpoints, Run, Stopwatch
 from scb.statistics import iqm
 
@@ -286,7 +287,7 @@ class _Strategy:
     def start(self, key: jax.Array, solution: Any) -> Any:
         if self.has_mean:
             return self._algorithm.init(key, solution, self._params)
-        key_population, key_init = jax.random.split(key)
+        key_population, key_init = split_key(key)
         flat, unravel = jax.flatten_util.ravel_pytree(solution)
         noise = jax.random.normal(key_population, (self._size, flat.size))
         population = jax.vmap(unravel)(flat + self._sigma * noise.at[0].set(0.0))
@@ -329,8 +330,8 @@ def evolve(
     Returns:
       The Outcome.
     """
-    root = jax.random.key(config.seed)
-    key_solution, key_strategy, key_generations, key_mean = jax.random.split(root, 4)
+    root = root_key(config.seed)
+    key_solution, key_strategy, key_generations, key_mean = split_key(root, 4)
     solution = problem.initial_solution(key_solution)
     strategy = _Strategy(config, solution)
     state = {
@@ -365,7 +366,7 @@ def evolve(
         mean = strategy.mean(state["strategy"])
         # The same seeds at every judgement: means of different generations are then compared in
         # pairs.
-        keys = jax.random.split(key_mean, config.mean_evaluations)
+        keys = split_key(key_mean, config.mean_evaluations)
         judged = evaluate_mean(mean, keys)
         outcome = {name: float(np.mean(v)) for name, v in judged.items()}
         # The interquartile mean too: of agents with random hyperparameters a few fail far below the rest.
@@ -381,9 +382,7 @@ def evolve(
 
     with _progress(console, config.num_generations, first) as advance:
         for generation in range(first, config.num_generations):
-            key_ask, key_evaluate, key_tell = jax.random.split(
-                jax.random.fold_in(key_generations, generation), 3
-            )
+            key_ask, key_evaluate, key_tell = split_key(key_at(key_generations, generation), 3)
             metrics: dict[str, Any] = {}
             if generation % config.evaluate_mean_every == 0 and strategy_is_ready(
                 strategy, generation

@@ -22,6 +22,7 @@ from scb.curriculum import CurriculumConfig, horizon, with_limit
 from scb.errors import UserError
 from scb.evaluation import evaluate
 from scb.evolution import EnvironmentSteps, EvolutionConfig, evolve
+from scb.keys import root_key, split_key
 from scb.neuroevolution import network_action, policy_network
 
 EPISODES = 20  # by which an expert is judged
@@ -76,14 +77,14 @@ def best_agent(
 
     @jax.jit
     def train(key: jax.Array) -> tuple[Any, jax.Array]:
-        key_train, key_evaluate = jax.random.split(key)
+        key_train, key_evaluate = split_key(key)
         state = agent.train(key_train, setting.hyperparameters, training_params)
         episodes = agent.evaluate(
             state, key_evaluate, num_episodes, env_params=env_params, mode=True
         )
         return state, episodes.returns.mean()
 
-    states, returns = jax.vmap(train)(jax.random.split(key, num_agents))
+    states, returns = jax.vmap(train)(split_key(key, num_agents))
     if not bool(jnp.isfinite(returns).any()):
         raise UserError(
             f"none of {num_agents} agents has a finite return: lower the setting's learning rate."
@@ -197,7 +198,7 @@ def evolve_expert(
     Args:
       key: decides everything; `config.evolution.seed` is not used.
     """
-    key_seed, key_judge = jax.random.split(key)
+    key_seed, key_judge = split_key(key)
     seed = int(jax.random.randint(key_seed, (), 0, 2**31 - 1))
     evolution = replace(config.evolution, seed=seed)
     problem = _PolicySearch(env, env_params, config)
@@ -215,19 +216,19 @@ def _random_statistics(
     def step(carry: Any, inputs: tuple[jax.Array, jax.Array]) -> Any:
         env_state, action = carry
         time, key = inputs
-        key_action, key_step = jax.random.split(key)
+        key_action, key_step = split_key(key)
         action = jnp.where(time % 20 == 0, space.sample(key_action), action)
         observation, env_state, *_ = env.step(key_step, env_state, action, env_params)
         return (env_state, action), jnp.ravel(observation)
 
     def roll(key: jax.Array) -> jax.Array:
-        key_reset, key_action, key_steps = jax.random.split(key, 3)
+        key_reset, key_action, key_steps = split_key(key, 3)
         _, env_state = env.reset(key_reset, env_params)
         number = min(200, int(env_params.max_steps_in_episode))
-        inputs = (jnp.arange(number), jax.random.split(key_steps, number))
+        inputs = (jnp.arange(number), split_key(key_steps, number))
         return jax.lax.scan(step, (env_state, space.sample(key_action)), inputs)[1]
 
     with jax.ensure_compile_time_eval():
-        visited = jax.jit(jax.vmap(roll))(jax.random.split(jax.random.key(0), num_envs))
+        visited = jax.jit(jax.vmap(roll))(split_key(root_key(0), num_envs))
         visited = jnp.reshape(visited, (-1, visited.shape[-1]))
         return update_statistics(RunningStatistics.start(visited.shape[-1]), visited)

@@ -17,6 +17,7 @@ from scb.agents import networks
 from scb.agents.agent import clip_to_space, scale_to_space
 from scb.errors import UserError
 from scb.evaluation import Policy, evaluate
+from scb.keys import split_key
 
 
 @dataclass(frozen=True)
@@ -84,13 +85,13 @@ def evolve_policy(
             network.apply(weights, jnp.ravel(observation)), space
         )
 
-    key_init, key_start, key_search = jax.random.split(key, 3)
+    key_init, key_start, key_search = split_key(key, 3)
     start = network.init(key_init, jnp.zeros(size))
     snes = SNES(config.population_size, start)
     params = snes.default_params.replace(std_init=config.sigma)
 
     def generation(state: Any, key: jax.Array) -> tuple[Any, None]:
-        key_ask, key_evaluate, key_tell = jax.random.split(key, 3)
+        key_ask, key_evaluate, key_tell = split_key(key, 3)
         population, state = snes.ask(key_ask, state, params)
         fitness = jax.vmap(
             lambda weights: evaluate(
@@ -104,6 +105,6 @@ def evolve_policy(
     state, _ = jax.lax.scan(
         generation,
         snes.init(key_start, start, params),
-        jax.random.split(key_search, config.num_generations),
+        split_key(key_search, config.num_generations),
     )
     return policy_of(snes.get_mean(state))

@@ -21,6 +21,7 @@ from scb.curriculum import paper_curriculum
 from scb.environments.synthetic import BanditParams, SyntheticBandit, Weights
 from scb.errors import UserError, unknown_name
 from scb.experts import Expert, PolicySearchConfig, evolve_expert, train_expert
+from scb.keys import split_key
 
 EXPERTS = ("auto", "evolution", *ALGORITHMS)
 CONSTRUCTIONS = ("advantage", "q", "action_distance")
@@ -163,7 +164,7 @@ def expert_dataset(
       (the dataset, environment steps it took).
     """
     space = env.action_space(env_params)
-    key_roll, key_pick, _, key_q = jax.random.split(key, 4)
+    key_roll, key_pick, _, key_q = split_key(key, 4)
 
     def expert_policy(observation: jax.Array) -> jax.Array:
         return expert.policy(jnp.ravel(observation))
@@ -173,7 +174,7 @@ def expert_dataset(
 
     def step(carry: Any, key: jax.Array) -> Any:
         env_state, observation, skill = carry
-        key_random, key_mix, key_step = jax.random.split(key, 3)
+        key_random, key_mix, key_step = split_key(key, 3)
         random_action = space.sample(key_random)
         action = jnp.where(
             jax.random.uniform(key_mix) < skill, expert_policy(observation), random_action
@@ -182,12 +183,12 @@ def expert_dataset(
         return (next_state, next_observation, skill), (env_state, observation)
 
     def roll(key: jax.Array) -> Any:
-        key_reset, key_skill, key_steps = jax.random.split(key, 3)
+        key_reset, key_skill, key_steps = split_key(key, 3)
         observation, env_state = env.reset(key_reset, env_params)
         start = (env_state, observation, jax.random.uniform(key_skill))
-        return jax.lax.scan(step, start, jax.random.split(key_steps, num_steps))[1]
+        return jax.lax.scan(step, start, split_key(key_steps, num_steps))[1]
 
-    visited = jax.jit(jax.vmap(roll))(jax.random.split(key_roll, num_envs))
+    visited = jax.jit(jax.vmap(roll))(split_key(key_roll, num_envs))
     picked = jax.random.choice(
         key_pick,
         num_envs * num_steps,
@@ -209,17 +210,17 @@ def expert_dataset(
             return (env_state, expert_policy(observation), weight), reward
 
         start = (env_state, action, jnp.float32(1.0))
-        return jax.lax.scan(follow, start, jax.random.split(key, config.horizon))[1].sum()
+        return jax.lax.scan(follow, start, split_key(key, config.horizon))[1].sum()
 
     @jax.jit
     @jax.vmap
     def label(env_state: Any, observation: jax.Array, key: jax.Array) -> Any:
-        key_random, key_follow = jax.random.split(key)
+        key_random, key_follow = split_key(key)
         best = jnp.reshape(expert_policy(observation), space.shape)
         if isinstance(space, spaces.Discrete):
             actions = jnp.arange(space.n)
         else:
-            random = jax.vmap(space.sample)(jax.random.split(key_random, config.num_actions - 1))
+            random = jax.vmap(space.sample)(split_key(key_random, config.num_actions - 1))
             actions = jnp.concatenate([best[None], random])
         if config.construction == "action_distance":
             q = jnp.zeros(actions.shape[0])  # it only asks what the expert does
@@ -227,7 +228,7 @@ def expert_dataset(
             q = jax.vmap(q_value, in_axes=(None, 0, None))(env_state, actions, key_follow)
         return actions, q, best
 
-    actions, q, best = label(env_states, observations, jax.random.split(key_q, config.num_states))
+    actions, q, best = label(env_states, observations, split_key(key_q, config.num_states))
     if config.min_spread > 0:
         observations, best = _stretched(observations, config.min_spread, expert_policy)
         best = jnp.reshape(best, (config.num_states, *space.shape))
@@ -278,7 +279,7 @@ def fit_bandit(
       (weights, {"reward_r2": explained variance of the reward, "energy_distance": of the
       contexts}).
     """
-    key_init, key_reward, key_context = jax.random.split(key, 3)
+    key_init, key_reward, key_context = split_key(key, 3)
     weights = bandit.init_weights(key_init)
     target = reward_targets(dataset, config.construction, bandit.discrete)
     optimizer = optax.adam(optax.cosine_decay_schedule(5e-3, config.fit_steps))
@@ -296,7 +297,7 @@ def fit_bandit(
     def context_loss(state_weights: Any, index: jax.Array, key: jax.Array) -> jax.Array:
         params = BanditParams(weights={"initial_state": state_weights, "reward": {}})
         generated, _ = jax.vmap(bandit.reset_env, in_axes=(0, None))(
-            jax.random.split(key, index.shape[0]), params
+            split_key(key, index.shape[0]), params
         )
         return energy_distance(generated / scale, dataset.observation[index] / scale)
 
@@ -305,7 +306,7 @@ def fit_bandit(
     ) -> tuple[Any, jax.Array]:
         def step(carry: Any, key: jax.Array) -> Any:
             weights, state = carry
-            key_index, key_loss = jax.random.split(key)
+            key_index, key_loss = split_key(key)
             index = jax.random.randint(key_index, (batch,), 0, num_states)
             arguments = (index, key_loss) if keyed else (index,)
             value, gradient = jax.value_and_grad(loss)(weights, *arguments)
@@ -313,7 +314,7 @@ def fit_bandit(
             return (optax.apply_updates(weights, updates), state), value
 
         carry = (start, optimizer.init(start))
-        (weights, _), losses = jax.lax.scan(step, carry, jax.random.split(key, config.fit_steps))
+        (weights, _), losses = jax.lax.scan(step, carry, split_key(key, config.fit_steps))
         return weights, losses[-100:].mean()
 
     fit_reward = jax.jit(lambda w, k: fit(reward_loss, w, k, batch=256, keyed=False))

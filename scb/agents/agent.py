@@ -17,6 +17,7 @@ from jax.typing import ArrayLike
 
 from scb.errors import UserError
 from scb.evaluation import Episodes, evaluate
+from scb.keys import split_key
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,14 +101,14 @@ class Agent(ABC):
                 f"evaluation every {every} iterations does not divide {self.config.num_iterations} iterations: "
                 "choose a divisor."
             )
-        key_train, key_evaluate = jax.random.split(key)
+        key_train, key_evaluate = split_key(key)
         state = self.init(key_train, hyperparameters, env_params)
 
         def segment(state: Any, key: jax.Array) -> tuple[Any, Any]:
             outcome = evaluation(state, key)
             return self.train_iterations(state, hyperparameters, env_params, every), outcome
 
-        keys = jax.random.split(key_evaluate, self.config.num_iterations // every + 1)
+        keys = split_key(key_evaluate, self.config.num_iterations // every + 1)
         state, outcomes = jax.lax.scan(segment, state, keys[:-1])
         last = evaluation(state, keys[-1])
         return state, jax.tree.map(lambda a, b: jnp.concatenate([a, b[None]]), outcomes, last)

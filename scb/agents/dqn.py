@@ -19,6 +19,7 @@ from scb.agents.off_policy import (
     target_values,
 )
 from scb.errors import UserError
+from scb.keys import split_key
 
 
 @dataclass(frozen=True)
@@ -95,7 +96,7 @@ class DQN(OffPolicyAgent):
         progress: jax.Array,
         env_params: Any,
     ) -> jax.Array:
-        key_coin, key_random = jax.random.split(key)
+        key_coin, key_random = split_key(key)
         number = observation.shape[0]
         done = jnp.clip(progress / hyperparameters.epsilon_decay, 0.0, 1.0)
         start = jnp.asarray(hyperparameters.epsilon_start)

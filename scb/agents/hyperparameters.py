@@ -19,6 +19,7 @@ from scb.agents.sac import SAC, SACConfig, SACHyperparameters
 from scb.agents.td3 import TD3, TD3Config, TD3Hyperparameters, ddpg_config
 from scb.environments.brax import BRAX_NAMES
 from scb.errors import UserError, unknown_name
+from scb.keys import split_key
 
 Lists: TypeAlias = Mapping[str, Sequence[float]]
 
@@ -234,12 +235,12 @@ def sample_hyperparameters(
     check_lists(lists, hyperparameters)
 
     def deal(key: jax.Array, values: Sequence[float]) -> jax.Array:
-        key_order, key_offset = jax.random.split(key)
+        key_order, key_offset = split_key(key)
         order = jax.random.permutation(key_order, number)
         offset = jax.random.randint(key_offset, (), 0, len(values))
         return jnp.asarray(values, jnp.float32)[(order + offset) % len(values)]
 
-    keys = jax.random.split(key, len(lists))
+    keys = split_key(key, len(lists))
     drawn = {
         name: deal(k, values) for k, (name, values) in zip(keys, sorted(lists.items()), strict=True)
     }

@@ -19,6 +19,7 @@ from scb.agents import networks, replay
 from scb.agents.agent import Agent, clip_to_space
 from scb.agents.normalization import RunningStatistics, normalize, update_statistics
 from scb.errors import UserError, unknown_name
+from scb.keys import key_at, split_key
 
 
 @dataclass(frozen=True)
@@ -161,7 +162,7 @@ class OffPolicyAgent(Agent):
 
     def init(self, key: jax.Array, hyperparameters: Any, env_params: Any) -> OffPolicyState:
         """A fresh agent with its buffer prefilled by uniformly random actions."""
-        key_learner, key_reset, key_prefill, key_train = jax.random.split(key, 4)
+        key_learner, key_reset, key_prefill, key_train = split_key(key, 4)
         config, space = self.config, self.env.action_space(env_params)
         size = self.observation_size(env_params)
         standing = None
@@ -180,7 +181,7 @@ class OffPolicyAgent(Agent):
         )
 
         def random_actions(observation: jax.Array, key: jax.Array) -> jax.Array:
-            return jax.vmap(space.sample)(jax.random.split(key, observation.shape[0]))
+            return jax.vmap(space.sample)(split_key(key, observation.shape[0]))
 
         if self.one_step:
             # Contexts are independent: all of them at once.
@@ -191,18 +192,18 @@ class OffPolicyAgent(Agent):
             steps = config.prefill // config.num_envs
             held = jnp.arange(steps) // config.prefill_hold
             # A number that no step's key has.
-            key_held = jax.random.fold_in(key_prefill, steps)
+            key_held = key_at(key_prefill, steps)
 
             def step(standing: Any, inputs: tuple[jax.Array, jax.Array]) -> tuple[Any, Transition]:
                 key, choice = inputs
 
                 def hold(observation: jax.Array, _: jax.Array) -> jax.Array:
-                    return random_actions(observation, jax.random.fold_in(key_held, choice))
+                    return random_actions(observation, key_at(key_held, choice))
 
                 actions = random_actions if config.prefill_hold == 1 else hold
                 return self._step(standing, config.num_envs, actions, key, env_params)
 
-            keys = jax.random.split(key_prefill, steps)
+            keys = split_key(key_prefill, steps)
             standing, transitions = jax.lax.scan(step, standing, (keys, held))
             transitions = jax.tree.map(
                 lambda x: jnp.reshape(x, (config.prefill, *x.shape[2:])), transitions
@@ -213,7 +214,7 @@ class OffPolicyAgent(Agent):
         self, state: OffPolicyState, hyperparameters: Any, env_params: Any
     ) -> OffPolicyState:
         config = self.config
-        key, key_step, *keys_learn = jax.random.split(state.key, 2 + config.gradient_steps)
+        key, key_step, *keys_learn = split_key(state.key, 2 + config.gradient_steps)
         progress = (config.prefill + state.iteration * config.num_envs) / config.total_steps
 
         def explore(observation: jax.Array, key: jax.Array) -> jax.Array:
@@ -229,7 +230,7 @@ class OffPolicyAgent(Agent):
 
         def gradient_step(learner: Any, inputs: tuple[jax.Array, jax.Array]) -> tuple[Any, None]:
             key, number = inputs
-            key_sample, key_learn = jax.random.split(key)
+            key_sample, key_learn = split_key(key)
             batch = replay.sample(state.buffer, key_sample, config.batch_size)
             batch = batch._replace(
                 observation=self._inputs(state, batch.observation),
@@ -261,7 +262,7 @@ class OffPolicyAgent(Agent):
     def _reset(self, key: jax.Array, number: int, env_params: Any) -> tuple[Any, jax.Array]:
         reset = self.env.reset_env if self.one_step else self.env.reset
         observation, env_state = jax.vmap(reset, in_axes=(0, None))(
-            jax.random.split(key, number), env_params
+            split_key(key, number), env_params
         )
         return env_state, _flatten(observation)
 
@@ -269,13 +270,13 @@ class OffPolicyAgent(Agent):
         self, standing: Any, number: int, policy: Any, key: jax.Array, env_params: Any
     ) -> tuple[Any, Transition]:
         """One step of `number` environments; one-step environments start afresh."""
-        key_reset, key_act, key_step = jax.random.split(key, 3)
+        key_reset, key_act, key_step = split_key(key, 3)
         space = self.env.action_space(env_params)
         env_state, observation = (
             self._reset(key_reset, number, env_params) if self.one_step else standing
         )
         action = jax.vmap(lambda a: clip_to_space(a, space))(policy(observation, key_act))
-        keys = jax.random.split(key_step, number)
+        keys = split_key(key_step, number)
         if self.one_step:
             _, _, reward, terminated, _ = jax.vmap(self.env.step_env, in_axes=(0, 0, 0, None))(
                 keys, env_state, action, env_params

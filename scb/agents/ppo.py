@@ -25,6 +25,7 @@ from scb.agents import networks
 from scb.agents.agent import Agent, clip_to_space
 from scb.agents.normalization import RunningStatistics, normalize, update_statistics
 from scb.errors import UserError, unknown_name
+from scb.keys import split_key
 
 DriftFunction: TypeAlias = Callable[[Any, jax.Array, jax.Array, jax.Array], jax.Array]
 
@@ -222,7 +223,7 @@ class PPO(Agent):
         self, key: jax.Array, hyperparameters: PPOHyperparameters, env_params: Any
     ) -> PPOState:
         """A fresh agent, its environments at their first observation."""
-        key_policy, key_value, key_reset, key_train = jax.random.split(key, 4)
+        key_policy, key_value, key_reset, key_train = split_key(key, 4)
         policy, value = self._networks(env_params)
         size = self.observation_size(env_params)
         params = {
@@ -234,7 +235,7 @@ class PPO(Agent):
         standing = None
         if not self.one_step:
             observation, env_state = jax.vmap(self.env.reset, in_axes=(0, None))(
-                jax.random.split(key_reset, self.config.num_envs), env_params
+                split_key(key_reset, self.config.num_envs), env_params
             )
             standing = (env_state, observation)
         return PPOState(
@@ -270,7 +271,7 @@ class PPO(Agent):
     def iterate(
         self, state: PPOState, hyperparameters: PPOHyperparameters, env_params: Any
     ) -> PPOState:
-        key, key_collect, key_update = jax.random.split(state.key, 3)
+        key, key_collect, key_update = split_key(state.key, 3)
         state = replace(state, key=key)
         if self.one_step:
             batch = self._collect_contexts(state, key_collect, env_params)
@@ -287,15 +288,15 @@ class PPO(Agent):
         """One batch of independent one-step episodes: nothing to bootstrap, A = r - V(s)."""
         size = self.config.batch_size
         space = self.env.action_space(env_params)
-        key_reset, key_act, key_step = jax.random.split(key, 3)
+        key_reset, key_act, key_step = split_key(key, 3)
         observation, env_state = jax.vmap(self.env.reset_env, in_axes=(0, None))(
-            jax.random.split(key_reset, size), env_params
+            split_key(key_reset, size), env_params
         )
         observation = jnp.reshape(observation, (size, -1))
         distribution = self._policy(state, observation, env_params)
         action, log_prob = distribution.sample_and_log_prob(seed=key_act)
         _, _, reward, _, _ = jax.vmap(self.env.step_env, in_axes=(0, 0, 0, None))(
-            jax.random.split(key_step, size),
+            split_key(key_step, size),
             env_state,
             jax.vmap(lambda a: clip_to_space(a, space))(action),
             env_params,
@@ -318,13 +319,13 @@ class PPO(Agent):
 
         def step(carry: Any, key: jax.Array) -> Any:
             env_state, observation = carry
-            key_act, key_step = jax.random.split(key)
+            key_act, key_step = split_key(key)
             distribution = self._policy(state, flat(observation), env_params)
             action, log_prob = distribution.sample_and_log_prob(seed=key_act)
             next_observation, env_state, reward, terminated, truncated, info = jax.vmap(
                 self.env.step, in_axes=(0, 0, 0, None)
             )(
-                jax.random.split(key_step, num_envs),
+                split_key(key_step, num_envs),
                 env_state,
                 jax.vmap(lambda a: clip_to_space(a, space))(action),
                 env_params,
@@ -340,7 +341,7 @@ class PPO(Agent):
             }
             return (env_state, next_observation), transition
 
-        standing, steps = jax.lax.scan(step, state.environment, jax.random.split(key, num_steps))
+        standing, steps = jax.lax.scan(step, state.environment, split_key(key, num_steps))
         value = self._value(state, steps["observation"], env_params)
         advantage = generalized_advantages(
             steps["reward"],
@@ -427,7 +428,7 @@ class PPO(Agent):
             return jax.lax.scan(update, carry, minibatches)
 
         (params, optimizer_state), _ = jax.lax.scan(
-            epoch, (state.params, state.optimizer), jax.random.split(key, config.num_epochs)
+            epoch, (state.params, state.optimizer), split_key(key, config.num_epochs)
         )
         return replace(state, params=params, optimizer=optimizer_state)
 

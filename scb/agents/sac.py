@@ -24,6 +24,7 @@ from scb.agents.off_policy import (
     polyak_average,
     target_values,
 )
+from scb.keys import split_key
 
 
 @dataclass(frozen=True)
@@ -93,7 +94,7 @@ class SAC(OffPolicyAgent):
     ) -> SACLearner:
         policy, critics = self._networks(env_params)
         discrete, size = self._space(env_params)
-        key_policy, key_critics = jax.random.split(key)
+        key_policy, key_critics = split_key(key)
         observation = jnp.zeros(self.observation_size(env_params))
         inputs = (observation,) if discrete else (observation, jnp.zeros(size))
         params = {
@@ -172,7 +173,7 @@ class SAC(OffPolicyAgent):
     ) -> SACLearner:
         discrete, size = self._space(env_params)
         policy, critics = self._networks(env_params)
-        key_next, key_policy = jax.random.split(key)
+        key_next, key_policy = split_key(key)
         params, optimizer_state = dict(learner.params), dict(learner.optimizer)
         optimizer = optax.adam(hyperparameters.learning_rate)
         temperature = jnp.exp(params["log_temperature"])

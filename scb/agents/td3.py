@@ -23,6 +23,7 @@ from scb.agents.off_policy import (
     target_values,
 )
 from scb.errors import UserError
+from scb.keys import split_key
 
 
 @dataclass(frozen=True)
@@ -102,7 +103,7 @@ class TD3(OffPolicyAgent):
         self, key: jax.Array, hyperparameters: TD3Hyperparameters, env_params: Any
     ) -> TD3Learner:
         policy, critics = self._networks(env_params)
-        key_policy, key_critics = jax.random.split(key)
+        key_policy, key_critics = split_key(key)
         observation = jnp.zeros(self.observation_size(env_params))
         params = {
             "policy": policy.init(key_policy, observation),

@@ -23,6 +23,7 @@ from scb.agents.settings import environment_setting
 from scb.environments.synthetic import BanditParams, BanditState, SyntheticBandit
 from scb.evaluation import Policy, evaluate
 from scb.experts import best_agent
+from scb.keys import root_key, split_key
 
 Reward = Callable[[jax.Array, jax.Array], jax.Array]  # ([O] observation, action) -> []
 
@@ -72,9 +73,7 @@ class SACExpert:
 
     def action(self, observation: jax.Array) -> jax.Array:
         """[O] -> the most likely action, within the bounds."""
-        return self.agent.act(
-            self.state, observation, jax.random.key(0), self.env_params, mode=True
-        )
+        return self.agent.act(self.state, observation, root_key(0), self.env_params, mode=True)
 
     def policy(self) -> Policy:
         """`action` as `scb.evaluation.evaluate` takes it."""
@@ -175,8 +174,8 @@ def clone(
         return (optax.apply_updates(weights, updates), state), None
 
     def batch(carry: Any, key: jax.Array) -> Any:
-        key_states, key_order = jax.random.split(key)
-        states = jax.vmap(contexts)(jax.random.split(key_states, batch_size))
+        key_states, key_order = split_key(key)
+        states = jax.vmap(contexts)(split_key(key_states, batch_size))
 
         def epoch(carry: Any, key: jax.Array) -> Any:
             order = jax.random.permutation(key, batch_size)
@@ -184,13 +183,13 @@ def clone(
             return jax.lax.scan(learn, carry, shuffled)
 
         return jax.lax.scan(
-            lambda c, k: (epoch(c, k)[0], None), carry, jax.random.split(key_order, num_epochs)
+            lambda c, k: (epoch(c, k)[0], None), carry, split_key(key_order, num_epochs)
         )
 
-    key_init, key_batches = jax.random.split(key)
+    key_init, key_batches = split_key(key)
     weights = network.init(key_init, contexts(key_init))
     (weights, _), _ = jax.lax.scan(
-        batch, (weights, optimizer.init(weights)), jax.random.split(key_batches, num_batches)
+        batch, (weights, optimizer.init(weights)), split_key(key_batches, num_batches)
     )
 
     def policy(observation: jax.Array, key: jax.Array) -> jax.Array:
@@ -218,8 +217,8 @@ def judge_cloning(
     @jax.jit
     @jax.vmap
     def returns(key: jax.Array, learning_rate: jax.Array) -> jax.Array:
-        key_clone, key_evaluate = jax.random.split(key)
+        key_clone, key_evaluate = split_key(key)
         policy = clone(expert, contexts, space, key_clone, learning_rate, activation=activation)
         return evaluate(env, env_params, policy, key_evaluate, num_episodes).returns.mean()
 
-    return np.asarray(returns(jax.random.split(key, len(learning_rates)), learning_rates))
+    return np.asarray(returns(split_key(key, len(learning_rates)), learning_rates))

@@ -20,6 +20,7 @@ from scb.environments.registry import make
 from scb.environments.synthetic import SyntheticBandit
 from scb.environments.zoo import PREFIX, open_bandit
 from scb.errors import UserError
+from scb.keys import root_key, split_key
 from scb.runs import make_folder, write_json
 from scb.statistics import estimate
 
@@ -46,7 +47,7 @@ def explain(
     Returns:
       (numbers for JSON, parts for the figure).
     """
-    key_context, key_vary, key_episode = jax.random.split(jax.random.key(seed), 3)
+    key_context, key_vary, key_episode = split_key(root_key(seed), 3)
     space = bandit.action_space()
     contexts = bandit_states(bandit, key_context, STATES)
     importance = np.asarray(reward_variance(bandit, jnp.asarray(contexts), key_vary))

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 
 from scb.environments.synthetic import BanditParams, SyntheticBandit
+from scb.keys import split_key
 
 
 def reward_variance(
@@ -33,15 +34,15 @@ def reward_variance(
     """
     params = bandit.default_params if params is None else params
     number, size = observations.shape
-    key_action, key_value, key_entries = jax.random.split(key, 3)
+    key_action, key_value, key_entries = split_key(key, 3)
     independent = jnp.stack(
         [
             observations[jax.random.permutation(k, number), i]
-            for i, k in enumerate(jax.random.split(key_entries, size))
+            for i, k in enumerate(split_key(key_entries, size))
         ],
         axis=1,
     )
-    actions = jax.vmap(bandit.action_space().sample)(jax.random.split(key_action, number))
+    actions = jax.vmap(bandit.action_space().sample)(split_key(key_action, number))
     reward = jax.vmap(bandit.mean_reward, in_axes=(0, 0, None))
     picked = jax.random.randint(key_value, (number, num_values), 0, number)
 

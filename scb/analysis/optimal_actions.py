@@ -18,6 +18,7 @@ from scb.agents.agent import clip_to_space, flat_bounds
 from scb.environments.synthetic import BanditParams, SyntheticBandit
 from scb.errors import UserError, unknown_name
 from scb.evaluation import Policy
+from scb.keys import root_key
 
 METHODS = ("gradient", "grid")
 GRID_POINTS = 101  # in each dimension of the action
@@ -98,7 +99,7 @@ def _ascent(
     low, high = flat_bounds(space)
     # In units of the action's range, so that one step size suits every environment: the centre, and
     # random actions that are the same in every context.
-    random = jax.random.uniform(jax.random.key(0), (STARTS - 1, low.size))
+    random = jax.random.uniform(root_key(0), (STARTS - 1, low.size))
     starts = jnp.concatenate([jnp.full((1, low.size), 0.5), random])
     optimizer = optax.adam(optax.cosine_decay_schedule(0.1, STEPS))
 

@@ -9,6 +9,7 @@ import numpy as np
 from gymnax.environments import environment
 
 from scb.environments.synthetic import BanditParams, SyntheticBandit
+from scb.keys import split_key
 
 
 class Trajectories(NamedTuple):
@@ -43,9 +44,7 @@ def bandit_states(
 ) -> np.ndarray:
     """[number, O] contexts."""
     params = bandit.default_params if params is None else params
-    contexts, _ = jax.vmap(bandit.reset_env, in_axes=(0, None))(
-        jax.random.split(key, number), params
-    )
+    contexts, _ = jax.vmap(bandit.reset_env, in_axes=(0, None))(split_key(key, number), params)
     return np.asarray(contexts)
 
 
@@ -65,7 +64,7 @@ def follow(
     """
     steps = int(env_params.max_steps_in_episode) if num_steps is None else num_steps
     records = jax.jit(jax.vmap(lambda key: record_episode(env, env_params, policy, key, steps)[0]))(
-        jax.random.split(key, num_episodes)
+        split_key(key, num_episodes)
     )
     return Trajectories(*(np.asarray(x) for x in records))
 
@@ -78,12 +77,12 @@ def record_episode(
     num_steps: int,
 ) -> tuple[Trajectories, Any]:
     """One episode of a policy, traceable: every step of it without the axis E, and the [T] states it stood in."""
-    key_reset, key_steps = jax.random.split(key)
+    key_reset, key_steps = split_key(key)
     observation, state = env.reset_env(key_reset, env_params)
 
     def step(carry: Any, key: jax.Array) -> Any:
         observation, before, active = carry
-        key_act, key_step = jax.random.split(key)
+        key_act, key_step = split_key(key)
         action = policy(observation, key_act)
         after, state, reward, terminated, _ = env.step_env(key_step, before, action, env_params)
         ended = terminated | env.is_truncated(state, env_params)
@@ -91,7 +90,7 @@ def record_episode(
         return (after, state, active & ~ended), (record, before)
 
     start = (observation, state, jnp.bool_(True))
-    records: tuple[Trajectories, Any] = jax.lax.scan(
-        step, start, jax.random.split(key_steps, num_steps)
-    )[1]
+    records: tuple[Trajectories, Any] = jax.lax.scan(step, start, split_key(key_steps, num_steps))[
+        1
+    ]
     return records

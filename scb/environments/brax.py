@@ -24,6 +24,7 @@ from flax import struct
 from gymnax.environments import environment, spaces
 
 from scb.errors import UserError, unknown_name
+from scb.keys import root_key, split_key
 
 if TYPE_CHECKING:
     import brax.envs
@@ -99,7 +100,7 @@ class BraxEnvironment(environment.Environment[BraxState, BraxParams]):
         self._backend = backend
         self._num_start_states = num_start_states
         self._brax = _load(name, backend)
-        start = jax.eval_shape(self._brax.reset, jax.random.key(0))
+        start = jax.eval_shape(self._brax.reset, root_key(0))
         self._observation_shape: tuple[int, ...] = start.obs.shape
 
     # jit keys its cache on `self`: two environments made alike share one compiled program.
@@ -248,7 +249,7 @@ def _load(name: str, backend: str) -> "brax.envs.Env":
 def _start_states(name: str, backend: str, number: int) -> "brax.envs.State":
     """Reset states with a leading axis [number]; NumPy arrays, as they go into any program."""
     with jax.ensure_compile_time_eval():
-        keys = jax.random.split(jax.random.key(0), number)
+        keys = split_key(root_key(0), number)
         # A loop, not vmap: it compiles twice as fast, and even so compiling is all that this costs.
         reset_all = jax.jit(partial(jax.lax.map, _load(name, backend).reset))
         return jax.tree.map(np.asarray, reset_all(keys))

@@ -20,6 +20,7 @@ from gymnax.environments import environment, spaces
 from jax.typing import ArrayLike
 
 from scb.errors import UserError, unknown_name
+from scb.keys import root_key, split_key
 
 Latent: TypeAlias = Literal["normal", "uniform", "categorical", "softmax_categorical"]
 Weights: TypeAlias = dict[str, dict[str, dict[str, jax.Array]]]
@@ -153,7 +154,7 @@ class SyntheticBandit(environment.Environment[BanditState, BanditParams]):
 
     def init_weights(self, key: jax.Array) -> Weights:
         """Random weights (Flax's default initialisation), the start of the paper's evolution."""
-        key_state, key_reward = jax.random.split(key)
+        key_state, key_reward = split_key(key)
         inputs = jnp.zeros(self.observation_size + self._action_size)
         return {
             "initial_state": self._initial_state.init(key_state, jnp.zeros(self.latent_size))[
@@ -208,11 +209,11 @@ class SyntheticBandit(environment.Environment[BanditState, BanditParams]):
         """[num_samples] noiseless rewards of random contexts and uniformly random actions."""
 
         def sample(key: jax.Array) -> jax.Array:
-            key_context, key_action = jax.random.split(key)
+            key_context, key_action = split_key(key)
             context, _ = self.reset_env(key_context, params)
             return self.mean_reward(context, self._action_space.sample(key_action), params)
 
-        return jax.vmap(sample)(jax.random.split(key, num_samples))
+        return jax.vmap(sample)(split_key(key, num_samples))
 
     def reward_scale(
         self, params: BanditParams, key: jax.Array, num_samples: int = 4096
@@ -243,7 +244,7 @@ def encode_action(action: ArrayLike, space: spaces.Box | spaces.Discrete) -> jax
 
 def shapes_of(init_weights: Callable[[jax.Array], Weights]) -> dict[str, tuple[int, ...]]:
     """{"reward/Dense_0/kernel": (O + A, hidden), ...} of what `init_weights(key)` returns."""
-    shapes = jax.eval_shape(init_weights, jax.random.key(0))
+    shapes = jax.eval_shape(init_weights, root_key(0))
     flat = jax.tree_util.tree_flatten_with_path(shapes)[0]
     return {"/".join(str(part.key) for part in path): leaf.shape for path, leaf in flat}
 

@@ -35,6 +35,7 @@ from scb.environments.synthetic import (
     shapes_of,
 )
 from scb.errors import UserError, unknown_name
+from scb.keys import split_key
 
 MDP_PARAMETERIZATIONS = ("T", "TI")
 PARAMETERIZATIONS = (*MDP_PARAMETERIZATIONS, "I")
@@ -180,7 +181,7 @@ class SyntheticMDP(environment.Environment[MDPState, MDPParams]):
 
     def init_weights(self, key: jax.Array) -> Weights:
         """Random weights (Flax's default initialisation), the start of the paper's evolution."""
-        key_state, key_reward, key_transition, key_termination = jax.random.split(key, 4)
+        key_state, key_reward, key_transition, key_termination = split_key(key, 4)
         inputs = jnp.zeros(self.observation_size + self._action_size)
         weights = {
             "reward": self._reward.init(key_reward, inputs)["params"],
