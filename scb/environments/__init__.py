@@ -1,1 +1,10 @@
-"""Environments: synthetic bandits, and adapters that put other suites behind gymnax 1.x's interface."""
+"""Synthetic environments, and the environments that they stand for; every family of them is registered here."""
+
+from scb.environments.brax import BraxFamily
+from scb.environments.gymnax import ClassicFamily, GymnaxFamily, MinAtarFamily
+from scb.environments.registry import register
+from scb.environments.zoo import SyntheticFamily
+
+# The last takes what is left of gymnax's names.
+for _family in (ClassicFamily, MinAtarFamily, SyntheticFamily, BraxFamily, GymnaxFamily):
+    register(_family())

@@ -12,7 +12,7 @@ import io
 import logging
 import types
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cache, partial
 from typing import TYPE_CHECKING, Any
 
@@ -23,6 +23,7 @@ import numpy as np
 from flax import struct
 from gymnax.environments import environment, spaces
 
+from scb.environments.spec import Family, Made, Reference
 from scb.errors import UserError, unknown_name
 from scb.keys import root_key, split_key
 
@@ -45,6 +46,19 @@ BRAX_NAMES = (
     "walker2d",
 )
 BACKENDS = ("generalized", "positional", "spring", "mjx")
+DEFAULT_BACKEND = "generalized"
+
+# Final returns of agents trained in the environment, Liesen et al. (2024), table of Brax results, columns EE,
+# which is with the generalized physics.
+_EXPERTS: dict[str, dict[str, float]] = {
+    "hopper": {"ppo": 2521.9, "sac": 3119.4, "ddpg": 1536.0, "td3": 3325.8},
+    "walker2d": {"ppo": 2039.6, "sac": 4140.1, "ddpg": 698.3, "td3": 4605.8},
+    "swimmer": {"ppo": 83.6, "sac": 124.8, "ddpg": 348.5, "td3": 232.2},
+    "halfcheetah": {"ppo": 3487.1, "sac": 7735.5, "ddpg": 3263.3, "td3": 13213.5},
+    "humanoidstandup": {"ppo": 17243.5, "sac": 23808.1, "ddpg": 24944.8, "td3": 28376.2},
+}
+# 1000 steps that each pay brax's healthy reward, whatever the physics.
+_STANDING = {"ant": 1000.0, "hopper": 1000.0, "humanoid": 5000.0, "walker2d": 1000.0}
 
 logger = logging.getLogger(__name__)
 
@@ -84,7 +98,7 @@ class BraxEnvironment(environment.Environment[BraxState, BraxParams]):
     """
 
     def __init__(
-        self, name: str, backend: str = "generalized", num_start_states: int | None = 1024
+        self, name: str, backend: str = DEFAULT_BACKEND, num_start_states: int | None = 1024
     ) -> None:
         super().__init__()
         if name not in BRAX_NAMES:
@@ -227,6 +241,40 @@ class BraxEnvironment(environment.Environment[BraxState, BraxParams]):
     @staticmethod
     def _start(brax_state: "brax.envs.State") -> tuple[jax.Array, BraxState]:
         return brax_state.obs, BraxState(time=jnp.zeros((), jnp.int32), brax_state=brax_state)
+
+
+class BraxFamily(Family):
+    """Brax's environments, with the paper's experts."""
+
+    name = "brax"
+    suite = (
+        "hopper",
+        "walker2d",
+        "halfcheetah",
+        "reacher",
+        "inverted_pendulum",
+        "inverted_double_pendulum",
+    )
+
+    def names(self) -> Sequence[str]:
+        return BRAX_NAMES
+
+    def make(self, name: str, **arguments: Any) -> Made:
+        env = BraxEnvironment(name, **arguments)
+        return env, env.default_params
+
+    def facts(self, name: str) -> Mapping[str, Any]:
+        experts = {
+            algorithm: Reference(value, f"{algorithm.upper()}, Liesen et al. (2024)")
+            for algorithm, value in _EXPERTS.get(name, {}).items()
+        }
+        standing = _STANDING.get(name)
+        return {
+            "backends": BACKENDS,
+            "default_backend": DEFAULT_BACKEND,
+            "experts": {DEFAULT_BACKEND: experts},
+            "standing": {} if standing is None else dict.fromkeys(BACKENDS, standing),
+        }
 
 
 @cache

@@ -1,28 +1,54 @@
-"""Environments by name: synthetic ones, gymnax's and Brax's, all behind gymnax 1.x's interface."""
+"""Environments by name: synthetic ones, gymnax's and Brax's, all behind gymnax 1.x's interface.
+
+A new family of environments touches two files: a module with its `scb.environments.spec.Family`, and the list in
+`scb/environments/__init__.py`, which registers it. Everything else asks `environment_spec`; what it has no
+settings for is trained with general ones.
+"""
 
 from typing import Any
 
-import gymnax
-from gymnax.environments import environment
+from scb.environments.spec import EnvironmentSpec, Family, Made
+from scb.errors import unknown_name
 
-from scb.environments.brax import BRAX_NAMES, BraxEnvironment
-from scb.environments.zoo import load
-from scb.errors import UserError, unknown_name
+_FAMILIES: dict[str, Family] = {}
+
+
+def register(family: Family) -> None:
+    """Adds a family; of several that own a name, the one that was registered first has it."""
+    _FAMILIES[family.name] = family
+
+
+def families() -> dict[str, Family]:
+    """{name: family}."""
+    return dict(_FAMILIES)
 
 
 def environment_names() -> list[str]:
     """Every name that `make` takes."""
-    return [*gymnax.registered_envs, *BRAX_NAMES]
+    return list(dict.fromkeys(name for family in _FAMILIES.values() for name in family.names()))
 
 
-def make(
-    name: str, backend: str | None = None, **arguments: Any
-) -> tuple[environment.Environment[Any, Any], Any]:
-    """An environment and its default parameters.
+def environment_spec(name: str) -> EnvironmentSpec:
+    """What is known of an environment.
 
     Args:
       name: "Synthetic-Pendulum-v1", "CartPole-v1", "hopper", ..., or the file.npz of a bandit or of a
         synthetic MDP.
+
+    Raises:
+      UserError: unknown name (with near matches), or a file that is none of these.
+    """
+    for family in _FAMILIES.values():
+        if family.owns(name):
+            return family.spec(name)
+    raise unknown_name("environment", name, environment_names())
+
+
+def make(name: str, backend: str | None = None, **arguments: Any) -> Made:
+    """An environment and its default parameters.
+
+    Args:
+      name: as `environment_spec` takes it.
       backend: "generalized", "positional" or "spring" for Brax environments; None for their own, and
         for every other environment.
       arguments: for the environment's constructor.
@@ -30,17 +56,4 @@ def make(
     Raises:
       UserError: unknown name (with near matches), or arguments that the environment doesn't take.
     """
-    if backend is not None:
-        arguments["backend"] = backend
-    if name.endswith(".npz"):
-        synthetic = load(name)
-        return synthetic, synthetic.default_params
-    try:
-        if name in BRAX_NAMES:
-            env = BraxEnvironment(name, **arguments)
-            return env, env.default_params
-        if name in gymnax.registered_envs:
-            return gymnax.make(name, **arguments)
-    except TypeError as error:
-        raise UserError(f"environment {name!r} does not take {arguments}: {error}.") from error
-    raise unknown_name("environment", name, environment_names())
+    return environment_spec(name).make(backend, **arguments)

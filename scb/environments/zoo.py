@@ -6,7 +6,7 @@ imported, and read when one is made.
 """
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 from importlib import resources
 from pathlib import Path
@@ -16,16 +16,15 @@ import gymnax
 import jax
 import jax.numpy as jnp
 import numpy as np
-from gymnax.environments import environment, spaces
+from gymnax.environments import spaces
 
 from scb import artefacts
-from scb.environments.brax import BraxEnvironment
+from scb.environments.registry import environment_names, environment_spec, make
+from scb.environments.spec import BANDIT, SYNTHETIC_MDP, Family, Made
 from scb.environments.synthetic import BanditConfig, SyntheticBandit, Weights
 from scb.environments.synthetic_mdp import MDPConfig, SyntheticMDP
 from scb.errors import UserError, unknown_name
 
-KIND = "bandit"
-MDP_KIND = "synthetic_mdp"
 PREFIX = "Synthetic-"
 
 
@@ -35,13 +34,39 @@ def zoo_names() -> list[str]:
     return sorted(p.name.removesuffix(".npz") for p in folder.iterdir() if p.name.endswith(".npz"))
 
 
-def home_of(name: str) -> str | None:
-    """The evaluation environment of a bandit's name or file; None where it isn't a bandit's.
+class SyntheticFamily(Family):
+    """Bandits and synthetic MDPs, by the zoo's name or file; what one stands for is in its metadata."""
 
-    "Synthetic-Pendulum-v1" and "runs/mine/Synthetic-Pendulum-v1.npz" stand for "Pendulum-v1".
-    """
-    stem = Path(name).name.removesuffix(".npz")
-    return stem.removeprefix(PREFIX) if stem.startswith(PREFIX) else None
+    name = "synthetic"
+
+    def names(self) -> Sequence[str]:
+        return zoo_names()
+
+    def owns(self, name: str) -> bool:
+        return name.endswith(".npz") or super().owns(name)
+
+    def make(self, name: str, **arguments: Any) -> Made:
+        opened = load if name.endswith(".npz") else open_bandit
+        synthetic = opened(name, **arguments)  # which takes none, and says so
+        return synthetic, synthetic.default_params
+
+    def facts(self, name: str) -> Mapping[str, Any]:
+        metadata = bandit_metadata(name)
+        return {"family": metadata["kind"], "stands_for": _evaluation_environment(metadata)}
+
+
+def _evaluation_environment(metadata: Mapping[str, Any]) -> str | None:
+    """What the metadata of a synthetic environment says; in files without it, what its name said when it was saved."""
+    stated = metadata["config"].get("evaluation_environment")
+    named = str(metadata["name"]).removeprefix(PREFIX)
+    if stated is None and named in environment_names():
+        return named
+    return stated
+
+
+def home_of(name: str) -> str | None:
+    """The evaluation environment of a bandit; None where it isn't a bandit's."""
+    return environment_spec(name).stands_for
 
 
 def register_zoo() -> None:
@@ -57,16 +82,16 @@ def _make_zoo_bandit(name: str) -> SyntheticBandit:
 
 
 def bandit_metadata(name: str) -> Mapping[str, Any]:
-    """What the .json of a bandit (a zoo name, or path.npz) says: config, seeds, results, cost."""
+    """What the .json of a bandit or synthetic MDP (a zoo name, or path.npz) says: config, seeds, results, cost."""
     if name.endswith(".npz"):
-        return artefacts.load(name, KIND).metadata
+        return artefacts.load(name, BANDIT, SYNTHETIC_MDP).metadata
     with resources.as_file(resources.files("scb") / "zoo") as folder:
-        return artefacts.load(folder / f"{name}.npz", KIND).metadata
+        return artefacts.load(folder / f"{name}.npz", BANDIT).metadata
 
 
 def load_bandit(path: str | Path) -> SyntheticBandit:
     """A bandit from its file; a UserError says what is wrong with it."""
-    return _bandit(artefacts.load(path, KIND), path)
+    return _bandit(artefacts.load(path, BANDIT), path)
 
 
 def _bandit(artefact: artefacts.Artefact, path: str | Path) -> SyntheticBandit:
@@ -93,13 +118,13 @@ def load(path: str | Path) -> SyntheticBandit | SyntheticMDP:
 
     An MDP that starts in its evaluation environment's start states makes that environment by name.
     """
-    artefact = artefacts.load(path, KIND, MDP_KIND)
-    if artefact.metadata["kind"] == KIND:
+    artefact = artefacts.load(path, BANDIT, SYNTHETIC_MDP)
+    if artefact.metadata["kind"] == BANDIT:
         return _bandit(artefact, path)
     config = artefact.metadata["config"]
     try:
         mdp_config = MDPConfig(**config["mdp"])
-        start = _made(config["start"]) if mdp_config.parameterization == "T" else (None, None)
+        start = _start(config["start"]) if mdp_config.parameterization == "T" else (None, None)
         mdp = SyntheticMDP(
             config["observation_size"],
             _space(config["action_space"]),
@@ -117,10 +142,8 @@ def load(path: str | Path) -> SyntheticBandit | SyntheticMDP:
     return mdp
 
 
-def _made(start: Mapping[str, Any]) -> tuple[environment.Environment[Any, Any], Any]:
-    from scb.environments.registry import make  # which imports this module, to open files
-
-    return make(start["environment"], **start["arguments"])
+def _start(description: Mapping[str, Any]) -> Made:
+    return make(description["environment"], **description["arguments"])
 
 
 def open_bandit(name: str) -> SyntheticBandit:
@@ -154,7 +177,7 @@ def save_bandit(
             "latent_size": bandit.latent_size,
         },
     }
-    full = {**metadata, "kind": KIND, "config": config}
+    full = {**metadata, "kind": BANDIT, "config": config}
     return artefacts.save(path, jax.device_get(weights), full)
 
 
@@ -181,18 +204,16 @@ def save_synthetic_mdp(
     }
     if mdp.env is not None:
         name = config.setdefault("evaluation_environment", mdp.env.name)
-        brax = isinstance(mdp.env, BraxEnvironment)
-        config["start"] = {
-            "environment": name,
-            "arguments": {"backend": mdp.env.backend} if brax else {},
-        }
-        made, params = _made(config["start"])
+        # What has physics to choose from says which it has.
+        backend = {"backend": mdp.env.backend} if environment_spec(name).backends else {}
+        config["start"] = {"environment": name, "arguments": backend}
+        made, params = _start(config["start"])
         if type(made) is not type(mdp.env) or not _equal(params, mdp.env_params):
             raise UserError(
                 f"{path} was not written, since {name!r} by its name is not the environment that the MDP "
                 "starts in: give its own name and default parameters."
             )
-    full = {**metadata, "kind": MDP_KIND, "config": config}
+    full = {**metadata, "kind": SYNTHETIC_MDP, "config": config}
     return artefacts.save(path, jax.device_get(weights), full)
 
 
