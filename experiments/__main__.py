@@ -17,6 +17,8 @@ from pathlib import Path
 
 from experiments import page
 from experiments.page import Experiment
+from scb.errors import UserError
+from scb.runs import make_folder
 
 
 def modules() -> list[str]:
@@ -58,8 +60,6 @@ def listing() -> str:
 
 def overview(experiments: Sequence[Experiment], data: Path) -> str:
     """The page with all verdicts, from the reports that there are."""
-    from scb.errors import UserError
-
     rows, sections = [], []
     for experiment in experiments:
         path = data / f"{experiment.name}.json"
@@ -94,7 +94,6 @@ def overview(experiments: Sequence[Experiment], data: Path) -> str:
 
 
 def _is_whole_paper(out: Path) -> bool:
-    from scb.errors import UserError
 
     try:
         report = page.read(out, missing_is_new=True)
@@ -123,8 +122,6 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _all(arguments: argparse.Namespace) -> int:
-    from scb.errors import UserError
-    from scb.runs import make_folder
 
     experiments = found()
     reports = [arguments.data / f"{name}.json" for name in experiments]

@@ -9,19 +9,18 @@ curriculum's shape. Run folders are under runs/ablations and are resumed.
 
 import sys
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from experiments import searches
 from experiments.page import Experiment, Save, table
 from experiments.page import main as run
 from experiments.searches import ENOUGH, NONE, PAPER_SIZES, Final
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-    from scb.discovery import DiscoveryConfig
+from scb import plotting
+from scb.discovery import DiscoveryConfig
+from scb.environments.synthetic import BanditConfig
 
 ENVIRONMENTS = ("Pendulum-v1", "MountainCar-v0")
 # The paper finds no curriculum for Pendulum.
@@ -59,12 +58,8 @@ def searches_of(environment: str) -> list[str]:
     return list(dict.fromkeys(s for row in rows(environment).values() for s in row.values()))
 
 
-def config_of(
-    environment: str, search: str, seed: int, plan: Mapping[str, Any]
-) -> "DiscoveryConfig":
+def config_of(environment: str, search: str, seed: int, plan: Mapping[str, Any]) -> DiscoveryConfig:
     """The search's configuration: the paper's recipe, at the plan's size."""
-    from scb.environments.synthetic import BanditConfig
-
     parameterization, latent, shape = search.split(" | ")
     size = plan["environments"][environment]
     return searches.config_of(
@@ -252,11 +247,8 @@ def body(report: Mapping[str, Any]) -> list[str]:
     ]
 
 
-def draw(report: Mapping[str, Any]) -> "Figure":
+def draw(report: Mapping[str, Any]) -> Figure:
     """The paper's six panels; a line is left out where a search's mean failed."""
-    from matplotlib.figure import Figure
-
-    from scb import plotting
 
     colors = (
         plotting.BLACK,

@@ -18,15 +18,28 @@ import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import jax
 import numpy as np
 
 from experiments.page import exit_status, run_name
+from lpo import figures
+from lpo.alignment import (
+    FITNESSES,
+    Regime,
+    correlation_text,
+    forget_programs,
+    known_drifts,
+    measure_alignment,
+    other_drifts,
+    regime_label,
+)
 from lpo.cli import configure_jax
-
-if TYPE_CHECKING:
-    from lpo.objectives import Objective
+from lpo.objectives import Objective, load_objective
+from scb import plotting
+from scb.errors import UserError
+from scb.runs import write_json
 
 PENDULUM = "Synthetic-Pendulum-v1"
 # One thing changed at a time.
@@ -56,8 +69,6 @@ CHOICES = ("pendulum", "pendulum_small_last_layer")
 
 def recommendation(report: dict[str, Any]) -> str:
     """The regime that ranks best under both initialisations, and where the default stands."""
-    from lpo.alignment import Regime
-
     stages = [report["stages"][name] for name in CHOICES if name in report["stages"]]
     found = {
         row["name"]: [
@@ -101,8 +112,6 @@ def recommendation(report: dict[str, Any]) -> str:
 
 def markdown(report: dict[str, Any]) -> str:
     """The page with the tables."""
-    from lpo.alignment import FITNESSES, correlation_text, regime_label
-
     lines = [
         "# Which bandit regime ranks objectives as the environment does",
         "",
@@ -148,10 +157,8 @@ def markdown(report: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def same_drift(one: "Objective", other: "Objective") -> bool:
+def same_drift(one: Objective, other: Objective) -> bool:
     """Whether two objectives differ in nothing but their names."""
-    import jax
-
     return one.drift == other.drift and all(
         jax.tree.leaves(jax.tree.map(np.array_equal, one.parameters, other.parameters))
     )
@@ -193,22 +200,9 @@ def main() -> int:
     arguments = parser.parse_args()
     configure_jax()
 
-    from lpo import figures
-    from lpo.alignment import (
-        Regime,
-        forget_programs,
-        known_drifts,
-        measure_alignment,
-        other_drifts,
-    )
-    from lpo.objectives import load_objective
-    from scb import plotting
-    from scb.errors import UserError
-    from scb.runs import write_json
-
     arguments.out.parent.mkdir(parents=True, exist_ok=True)
 
-    def named(path: Path) -> "Objective":
+    def named(path: Path) -> Objective:
         return replace(load_objective(path), name=run_name(path))
 
     family = [
@@ -236,7 +230,7 @@ def main() -> int:
         role: str,
         regimes: list[Regime],
         seed: int,
-        objectives: "list[Objective]" = family,
+        objectives: list[Objective] = family,
         scale: float | None = None,
         steps: int | None = None,
     ) -> None:

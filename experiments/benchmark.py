@@ -32,10 +32,18 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 
+import scb
 from experiments.page import exit_status
+from lpo.cli import configure_jax
+from scb.agents.hyperparameters import inner_loop
+from scb.artefacts import flatten, machine_description, package_versions
+from scb.environments.zoo import PREFIX, open_bandit, space_description
+from scb.evolution import map_population
 from scb.keys import key_at, root_key, split_key
+from scb.statistics import Estimate, estimate
 
 EPISODES = 20
 STEPS = 10_000
@@ -63,13 +71,10 @@ TASKS = {
 
 def bandit_of(task: Task) -> Any:
     """The bandit that ships for the task's environment."""
-    from scb.environments.zoo import PREFIX, open_bandit
-
     return open_bandit(PREFIX + task.environment)
 
 
 def inner_loop_of(task: Task, bandit: Any, steps: int) -> Any:
-    from scb.agents.hyperparameters import inner_loop
 
     inner = inner_loop(task.algorithm, task.environment, bandit.action_space(), sampled=False)
     return replace(inner, config=replace(inner.config, total_steps=steps))
@@ -80,13 +85,7 @@ def measure_this_project(task: Task, steps: int) -> dict[str, list[float]]:
 
     Runs in a process of its own.
     """
-    from lpo.cli import configure_jax
-
     configure_jax()
-    import jax
-
-    import scb
-    from scb.evolution import map_population
 
     bandit = bandit_of(task)
     params = bandit.default_params
@@ -121,9 +120,6 @@ def measure_this_project(task: Task, steps: int) -> dict[str, list[float]]:
 
 def write_rejax_job(folder: Path, task: Task, steps: int) -> Path:
     """Writes the bandit and rejax's settings where the peer, which can't import this project, finds them."""
-    from scb.artefacts import flatten
-    from scb.environments.zoo import space_description
-
     bandit = bandit_of(task)
     inner = inner_loop_of(task, bandit, steps)
     algorithm, settings = rejax_settings(task.algorithm, inner, bandit.action_space())
@@ -215,8 +211,6 @@ def rejax_settings(algorithm: str, inner: Any, space: Any) -> tuple[str, dict[st
 
 def summary(task: Task, measured: dict[str, dict[str, list[float]]]) -> dict[str, Any]:
     """What is written for an algorithm. Agents whose return is no number are counted and left out."""
-    from scb.statistics import estimate
-
     result: dict[str, Any] = {
         "environment": task.environment,
         "population": task.population,
@@ -235,7 +229,6 @@ def summary(task: Task, measured: dict[str, dict[str, list[float]]]) -> dict[str
 
 
 def row(name: str, result: dict[str, Any]) -> str:
-    from scb.statistics import Estimate
 
     seconds, returns = [], []
     for who in (THIS, PEER):
@@ -276,7 +269,6 @@ def main() -> int:
     names = arguments.algorithms.split(",")
     if unknown := [name for name in names if name not in TASKS]:
         parser.error(f"unknown algorithm {', '.join(unknown)}: choose from {', '.join(TASKS)}.")
-    from scb.artefacts import machine_description, package_versions
 
     arguments.out.parent.mkdir(parents=True, exist_ok=True)
     print(f"Training for {arguments.steps} steps in the bandit; median seconds an agent.")

@@ -9,26 +9,26 @@ runs/brax_curriculum and are resumed.
 import math
 import sys
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from experiments import searches
 from experiments.page import Experiment, Save, table
 from experiments.page import main as run
 from experiments.searches import NONE, curriculum_of
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-    from scb.discovery import DiscoveryConfig
+from scb import plotting
+from scb.curriculum import horizon
+from scb.discovery import DiscoveryConfig
+from scb.statistics import iqm
 
 ENVIRONMENT = "hopper"
 # What standing still earns in an episode of 1000 steps, the local optimum of searches without a curriculum.
 STANDING = 1000.0
 
 
-def config_of(shape: str, seed: int, plan: Mapping[str, Any]) -> "DiscoveryConfig":
+def config_of(shape: str, seed: int, plan: Mapping[str, Any]) -> DiscoveryConfig:
     """The search with this curriculum: the paper's recipe, at the plan's size."""
     return searches.config_of(
         ENVIRONMENT,
@@ -56,8 +56,6 @@ def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None
 
 def finals(report: Mapping[str, Any]) -> dict[str, searches.Final]:
     """{shape: the last judgement, over searches}."""
-    from scb.statistics import iqm
-
     return {shape: searches.final(curves, iqm) for shape, curves in report["curves"].items()}
 
 
@@ -144,13 +142,8 @@ def body(report: Mapping[str, Any]) -> list[str]:
     ]
 
 
-def draw(report: Mapping[str, Any]) -> "Figure":
+def draw(report: Mapping[str, Any]) -> Figure:
     """Left the curricula, right what the search distribution's mean is worth."""
-    from matplotlib.figure import Figure
-
-    from scb import plotting
-    from scb.curriculum import horizon
-    from scb.statistics import iqm
 
     looks = (
         (plotting.BLACK, "-"),

@@ -10,19 +10,27 @@ from the folder in the variable SCB_PUBLISHED; without them ours are measured al
 
 import os
 import sys
+import time
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 
+import scb
 from experiments import zoo_table, zoo_table_page
 from experiments.page import Experiment, Save, table, text
 from experiments.page import main as run
+from scb import plotting
+from scb.agents.hyperparameters import inner_loop
+from scb.agents.settings import environment_setting
+from scb.environments.zoo import bandit_metadata, open_bandit
+from scb.evolution import map_population
+from scb.importer import PUBLISHED_BANDITS, published_bandit
 from scb.keys import root_key, split_key
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from scb.statistics import estimate
 
 OURS, PUBLISHED = "ours", "published"
 REPORTING_SEED = 10_000
@@ -85,10 +93,6 @@ def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None
 def _in_bandit(
     kind: str, environment: str, backend: str | None, algorithm: str, plan: Mapping[str, Any]
 ) -> dict[str, Any]:
-    import scb
-    from scb.agents.hyperparameters import inner_loop
-    from scb.environments.zoo import bandit_metadata, open_bandit
-    from scb.importer import PUBLISHED_BANDITS, published_bandit
 
     env, env_params = scb.make(environment, backend)
     if kind == OURS:
@@ -116,10 +120,6 @@ def _in_bandit(
 def _in_environment(
     environment: str, backend: str | None, algorithm: str, plan: Mapping[str, Any]
 ) -> dict[str, Any]:
-    from dataclasses import replace
-
-    import scb
-    from scb.agents.settings import environment_setting
 
     env, env_params = scb.make(environment, backend)
     setting = environment_setting(environment, algorithm)
@@ -147,10 +147,6 @@ def _curves(
     plan: Mapping[str, Any],
 ) -> dict[str, Any]:
     """{"steps": [P + 1], "returns": [N, P + 1], "seconds"}: `number` agents, most likely actions."""
-    import time
-    from dataclasses import replace
-
-    from scb.evolution import map_population
 
     every, iterations = evaluation_steps(agent.config.num_iterations, plan["points"])
     # Evaluations are evenly spaced, for which a few iterations may be added at the end.
@@ -207,7 +203,6 @@ def matches(report: Mapping[str, Any]) -> list[dict[str, Any]]:
 
     The level is uncertain, so the median number of steps to the lower end of its interval is there too.
     """
-    from scb.statistics import estimate
 
     def median(steps: Sequence[int | None]) -> float | None:
         middle = float(np.median([np.inf if x is None else x for x in steps]))
@@ -283,8 +278,6 @@ def verdict(report: Mapping[str, Any]) -> str:
 
 def body(report: Mapping[str, Any]) -> list[str]:
     """How it was measured, final returns beside the paper's, steps to match."""
-    from scb.statistics import estimate
-
     plan = report["plan"]
     rows = []
     for name, algorithms in report["bandits"].items():
@@ -374,12 +367,8 @@ def body(report: Mapping[str, Any]) -> list[str]:
     ]
 
 
-def draw(report: Mapping[str, Any]) -> "Figure":
+def draw(report: Mapping[str, Any]) -> Figure:
     """A row a bandit, a column an algorithm; steps on a logarithmic axis."""
-    from matplotlib.figure import Figure
-
-    from scb import plotting
-    from scb.statistics import estimate
 
     algorithms = list(next(iter(report["bandits"].values())))
     with plotting.figure_style():

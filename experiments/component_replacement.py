@@ -9,16 +9,23 @@ is learned depends on the expert, so there are several.
 
 import sys
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
+from matplotlib.figure import Figure
 
+import scb
 from experiments.page import Experiment, Save, finite, table, text
 from experiments.page import main as run
+from scb import plotting
+from scb.agents.hyperparameters import inner_loop
+from scb.analysis import components
+from scb.analysis.states import follow
+from scb.discovery import SyntheticTraining, judge
+from scb.environments.zoo import bandit_metadata, open_bandit
 from scb.keys import key_at, root_key, split_key
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from scb.statistics import iqm, normalized_score, pooled_estimate
 
 ENVIRONMENT = "Pendulum-v1"
 BANDIT, CLONING, ACTION, Q = REWARDS = (
@@ -53,14 +60,6 @@ def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None
     ]
     if not unfinished:
         return
-    import jax.numpy as jnp
-
-    import scb
-    from scb.agents.hyperparameters import inner_loop
-    from scb.analysis import components
-    from scb.analysis.states import follow
-    from scb.discovery import SyntheticTraining, judge
-    from scb.environments.zoo import bandit_metadata, open_bandit
 
     env, env_params = scb.make(ENVIRONMENT)
     space = env.action_space(env_params)
@@ -142,16 +141,12 @@ def returns_of(report: Mapping[str, Any], reward: str, states: str) -> np.ndarra
 
 def scores_of(report: Mapping[str, Any], reward: str, states: str) -> np.ndarray:
     """[experts, agents] normalised scores: 0 is the random policy, 1 the agent's expert."""
-    from scb.statistics import iqm, normalized_score
-
     ceilings = np.array([[iqm(x["own"])] for x in report["experts"].values()])
     return normalized_score(returns_of(report, reward, states), report["random"], ceilings)
 
 
 def _less(report: Mapping[str, Any], combination: tuple[str, str], than: tuple[str, str]) -> bool:
     """Whether agents clearly earn less: the paired difference's interval lies below zero."""
-    from scb.statistics import pooled_estimate
-
     difference = pooled_estimate(
         scores_of(report, *combination), scores_of(report, *than), paired_groups=True
     )
@@ -170,7 +165,6 @@ def parts(report: Mapping[str, Any]) -> list[bool]:
 
 def verdict(report: Mapping[str, Any]) -> str:
     """Each part of the claim, with its figures."""
-    from scb.statistics import pooled_estimate
 
     def of(reward: str, states: str) -> str:
         return text(pooled_estimate(scores_of(report, reward, states)), 2)
@@ -201,8 +195,6 @@ def verdict(report: Mapping[str, Any]) -> str:
 
 def body(report: Mapping[str, Any]) -> list[str]:
     """The table: pooled, and expert by expert."""
-    from scb.statistics import iqm, pooled_estimate
-
     plan = report["plan"]
     rows = []
     for reward in REWARDS:
@@ -233,12 +225,8 @@ def body(report: Mapping[str, Any]) -> list[str]:
     ]
 
 
-def draw(report: Mapping[str, Any]) -> "Figure":
+def draw(report: Mapping[str, Any]) -> Figure:
     """A line a combination: the score with its interval, each expert a dot."""
-    from matplotlib.figure import Figure
-
-    from scb import plotting
-    from scb.statistics import iqm, pooled_estimate
 
     number = len(report["experts"])
     with plotting.figure_style():

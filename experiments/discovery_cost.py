@@ -13,14 +13,19 @@ import json
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import EngFormatter, MaxNLocator
 
 from experiments.page import exit_status, read
 from experiments.zoo_table_page import ENVIRONMENTS, TARGETS, label
 from lpo.cli import configure_jax
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from scb import plotting
+from scb.discovery import DiscoveryConfig
+from scb.errors import UserError
+from scb.runs import read_config
 
 STARTS = ("warm", "random")
 # How a run's log names an algorithm's interquartile mean beside its mean.
@@ -51,8 +56,6 @@ def collect(folders: Sequence[Path]) -> dict[str, Any]:
     Raises:
       UserError: a folder is no run, or no run is left.
     """
-    from scb.errors import UserError
-
     runs, left_out = [], []
     for folder in folders:
         outcome = _run(folder)
@@ -69,9 +72,6 @@ def collect(folders: Sequence[Path]) -> dict[str, Any]:
 
 def _run(folder: Path) -> dict[str, Any] | str:
     """A run's part of the report, or why it has none."""
-    from scb.discovery import DiscoveryConfig
-    from scb.runs import read_config
-
     config = read_config(folder)
     if config.get("from_bandit") or config.get("start"):
         return "it continues from another bandit"
@@ -292,13 +292,8 @@ def _count(steps: float) -> str:
     return f"{steps:,.0f}".replace(",", "\N{NARROW NO-BREAK SPACE}")
 
 
-def figure(report: Mapping[str, Any]) -> "Figure":
+def figure(report: Mapping[str, Any]) -> Figure:
     """A row an environment: the mean's return against minutes (left) and environment steps (right)."""
-    from matplotlib.figure import Figure
-    from matplotlib.lines import Line2D
-    from matplotlib.ticker import EngFormatter, MaxNLocator
-
-    from scb import plotting
 
     runs = report["runs"]
     environments = list(dict.fromkeys(run["environment"] for run in runs))
@@ -366,8 +361,6 @@ def figure(report: Mapping[str, Any]) -> "Figure":
 
 def render(report: Mapping[str, Any], docs: Path) -> None:
     """Writes docs/discovery_cost.md and docs/figures/discovery_cost.png."""
-    from scb import plotting
-
     docs.mkdir(parents=True, exist_ok=True)
     (docs / "discovery_cost.md").write_text(markdown(report))
     plotting.save(figure(report), docs / "figures" / "discovery_cost.png")

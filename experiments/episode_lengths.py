@@ -8,21 +8,24 @@ with several limits of the episode's length, in run folders under runs/episode_l
 
 import sys
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from matplotlib import colormaps
+from matplotlib.figure import Figure
 
 from experiments import searches
 from experiments.page import CLASSIC_CONTROL, Experiment, Save, finite, span, table, text
 from experiments.page import main as run
 from experiments.searches import PAPER_SIZES
+from lpo.suite import REFERENCES, random_return
+from scb import plotting
+from scb.agents.hyperparameters import algorithms_for, inner_loop
+from scb.curriculum import paper_curriculum
+from scb.discovery import DiscoveryConfig, SyntheticTraining
+from scb.evolution import map_population
 from scb.keys import root_key, split_key
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-    from scb.discovery import DiscoveryConfig, SyntheticTraining
-    from scb.statistics import Estimate
+from scb.statistics import Estimate, estimate, normalized_score, paired_difference
 
 OWN = "max"  # the evaluation environment's own limit
 BINS = {"1": 1, "2": 2, "3 to 5": 5, "6 to 10": 10, "11 to 50": 50, "more": np.inf}
@@ -30,10 +33,8 @@ JUDGE_SEED = 10_000
 GOOD = 0.5  # normalised score from which a search counts as one that has found something
 
 
-def config_of(environment: str, limit: str, plan: Mapping[str, Any]) -> "DiscoveryConfig":
+def config_of(environment: str, limit: str, plan: Mapping[str, Any]) -> DiscoveryConfig:
     """The search of an MDP with this limit: the paper's recipe, at the plan's size."""
-    from scb.curriculum import paper_curriculum
-
     size = plan["sizes"][environment]
     return searches.config_of(
         environment,
@@ -61,10 +62,6 @@ def _measure_limit(
     environment: str, limit: str, plan: Mapping[str, Any], entry: dict[str, Any]
 ) -> None:
 
-    from lpo.suite import random_return
-    from scb.agents.hyperparameters import algorithms_for, inner_loop
-    from scb.discovery import SyntheticTraining
-
     folder = f"{plan['runs']}/{environment}-{limit}"
     problem, outcome = searches.search(config_of(environment, limit, plan), folder)
     entry["random"] = round(random_return(problem.env, problem.env_params), 2)
@@ -90,15 +87,13 @@ def _measure_limit(
 
 
 def returns_and_lengths(
-    training: "SyntheticTraining", weights: Any, key: Any, num_agents: int, num_episodes: int
+    training: SyntheticTraining, weights: Any, key: Any, num_agents: int, num_episodes: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Of agents trained in the synthetic environment.
 
     Returns:
       ([N] mean returns in the environment with most likely actions, [N, E] steps of episodes in the synthetic one).
     """
-
-    from scb.evolution import map_population
 
     key_draw, key_agents = split_key(key)
 
@@ -134,25 +129,18 @@ def shares(entry: Mapping[str, Any]) -> dict[str, float]:
 
 def normalized(report: Mapping[str, Any], environment: str, limit: str) -> np.ndarray:
     """[N] scores of the agents of all algorithms: 0 a random policy, 1 the paper's SAC expert."""
-    from lpo.suite import REFERENCES
-    from scb.statistics import normalized_score
-
     entry = report["environments"][environment]
     returns = np.concatenate([np.asarray(x) for x in entry["returns"][limit].values()])
     return normalized_score(returns, entry["random"], REFERENCES[environment])
 
 
-def scores(report: Mapping[str, Any], environment: str, limit: str) -> "Estimate":
+def scores(report: Mapping[str, Any], environment: str, limit: str) -> Estimate:
     """Interquartile mean of `normalized`."""
-    from scb.statistics import estimate
-
     return estimate(normalized(report, environment, limit))
 
 
-def _brought(report: Mapping[str, Any]) -> "dict[str, Estimate]":
+def _brought(report: Mapping[str, Any]) -> dict[str, Estimate]:
     """{environment: what a limit of one step changes}, with the same seeds and hyperparameters."""
-    from scb.statistics import paired_difference
-
     return {
         name: paired_difference(normalized(report, name, "1"), normalized(report, name, OWN))
         for name in report["environments"]
@@ -258,12 +246,8 @@ def body(report: Mapping[str, Any]) -> list[str]:
     ]
 
 
-def draw(report: Mapping[str, Any]) -> "Figure":
+def draw(report: Mapping[str, Any]) -> Figure:
     """Left: lengths, a stacked bar an environment. Right: score against the limit."""
-    from matplotlib import colormaps
-    from matplotlib.figure import Figure
-
-    from scb import plotting
 
     colors = colormaps["viridis"](np.linspace(0.0, 0.95, len(BINS)))
     looks = (

@@ -4,20 +4,23 @@ python -m experiments.experts
 """
 
 import sys
+import time
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import jax
 import numpy as np
+from matplotlib.figure import Figure
 
+import scb
 from experiments.page import CLASSIC_CONTROL, Experiment, Save, table, text
 from experiments.page import main as run
+from scb import plotting
+from scb.agents.settings import environment_setting
+from scb.analysis.components import SACExpert, train_sac_expert
+from scb.evaluation import evaluate
 from scb.keys import root_key
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-    from scb.analysis.components import SACExpert
-    from scb.statistics import Estimate
+from scb.statistics import Estimate, estimate
 
 # Liesen et al. (2024), table of SAC experts: interquartile mean and 95 % interval of 200 evaluations.
 PAPER = {
@@ -30,11 +33,8 @@ PAPER = {
 EXPERT_SEED, JUDGE_SEED = 40_000, 10_000
 
 
-def train(environment: str, number: int, episodes: int) -> "tuple[SACExpert, Any, Any]":
+def train(environment: str, number: int, episodes: int) -> tuple[SACExpert, Any, Any]:
     """(the best of `number` agents on `episodes` episodes, the environment, its parameters)."""
-
-    import scb
-    from scb.analysis.components import train_sac_expert
 
     env, env_params = scb.make(environment)
     key = root_key(EXPERT_SEED)
@@ -43,12 +43,6 @@ def train(environment: str, number: int, episodes: int) -> "tuple[SACExpert, Any
 
 def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None:
     """An environment at a time."""
-    import time
-
-    import jax
-
-    from scb.agents.settings import environment_setting
-    from scb.evaluation import evaluate
 
     found = report.setdefault("environments", {})
     for environment in plan["environments"]:
@@ -74,8 +68,7 @@ def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None
         save()
 
 
-def _earned(report: Mapping[str, Any]) -> "dict[str, Estimate]":
-    from scb.statistics import estimate
+def _earned(report: Mapping[str, Any]) -> dict[str, Estimate]:
 
     return {name: estimate(x["returns"]) for name, x in report["environments"].items()}
 
@@ -100,8 +93,6 @@ def verdict(report: Mapping[str, Any]) -> str:
 
 def body(report: Mapping[str, Any]) -> list[str]:
     """How they were trained, and the table."""
-    from scb.statistics import estimate
-
     plan = report["plan"]
     rows = []
     for name, entry in report["environments"].items():
@@ -139,12 +130,8 @@ def body(report: Mapping[str, Any]) -> list[str]:
     ]
 
 
-def draw(report: Mapping[str, Any]) -> "Figure":
+def draw(report: Mapping[str, Any]) -> Figure:
     """A panel an environment: ours with each evaluation a dot, and the paper's interval."""
-    from matplotlib.figure import Figure
-
-    from scb import plotting
-    from scb.statistics import Estimate, estimate
 
     with plotting.figure_style():
         figure = Figure(figsize=(plotting.WIDTH, 1.1 * len(report["environments"]) + 0.6))

@@ -11,23 +11,35 @@ runs/generality and are resumed.
 
 import sys
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 
+import scb
 from experiments import searches
 from experiments.page import CLASSIC_CONTROL, Experiment, Save, finite, span, table, text
 from experiments.page import main as run
 from experiments.searches import PAPER_SIZES
+from lpo.suite import REFERENCES, random_return
+from scb import plotting
+from scb.agents.hyperparameters import InnerLoop, algorithms_for, inner_loop
+from scb.analysis.optimal_actions import optimal_policy
+from scb.curriculum import paper_curriculum
+from scb.discovery import DiscoveryConfig
+from scb.environments.zoo import bandit_metadata, open_bandit
+from scb.evaluation import evaluate
+from scb.evolution import map_population
 from scb.keys import root_key, split_key
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-    from scb.agents.hyperparameters import InnerLoop
-    from scb.discovery import DiscoveryConfig
-    from scb.neuroevolution import NeuroevolutionConfig
-    from scb.statistics import Estimate
+from scb.neuroevolution import NeuroevolutionConfig, evolve_policy
+from scb.statistics import (
+    Estimate,
+    estimate,
+    normalized_score,
+    paired_difference,
+    stratified_estimate,
+)
 
 ZOO, DRAWN, FIXED, ENVIRONMENT = SOURCES = (
     "bandit of the zoo",
@@ -50,10 +62,8 @@ TICKS = {
 REPORTING_SEED = 10_000
 
 
-def config_of(environment: str, source: str, plan: Mapping[str, Any]) -> "DiscoveryConfig":
+def config_of(environment: str, source: str, plan: Mapping[str, Any]) -> DiscoveryConfig:
     """The search whose inner agents' hyperparameters are drawn, or fixed; nothing else differs."""
-    from scb.curriculum import paper_curriculum
-
     size, curriculum = plan["sizes"][environment], None
     # A bandit that is fitted to an expert reaches MountainCar's goal from the start.
     if plan["init"] == "random":
@@ -71,10 +81,6 @@ def config_of(environment: str, source: str, plan: Mapping[str, Any]) -> "Discov
 
 def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None:
     """One kind of agent from one source at a time."""
-    import scb
-    from lpo.suite import random_return
-    from scb.environments.zoo import bandit_metadata
-
     found, random = report.setdefault("environments", {}), report.setdefault("random", {})
     failed, digests = report.setdefault("failed", {}), report.setdefault("sha256", {})
     generations = report.setdefault("generation", {})
@@ -105,9 +111,6 @@ def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None
 
 def algorithms_of(environment: str) -> tuple[str, ...]:
     """The paper's inner-loop algorithms."""
-    import scb
-    from scb.agents.hyperparameters import algorithms_for
-
     env, env_params = scb.make(environment)
     return algorithms_for(env.action_space(env_params))
 
@@ -123,8 +126,6 @@ class _Trainer:
     """What trains agents in one source and judges them in the environment."""
 
     def __init__(self, environment: str, source: str, plan: Mapping[str, Any]) -> None:
-        import scb
-        from scb.environments.zoo import open_bandit
 
         self.environment, self.plan = environment, plan
         self.env, self.env_params = scb.make(environment)
@@ -147,8 +148,6 @@ class _Trainer:
     def returns(self, agent: str) -> np.ndarray:
         """[N] mean returns of agents of one kind, most likely actions."""
 
-        from scb.agents.hyperparameters import inner_loop
-
         key = root_key(REPORTING_SEED)
         if agent == OPTIMAL:
             return self._optimal(key)
@@ -159,9 +158,7 @@ class _Trainer:
             with_network(inner_loop(algorithm, self.environment, self.space), network), key
         )
 
-    def _trained(self, inner: "InnerLoop", key: Any) -> np.ndarray:
-
-        from scb.evolution import map_population
+    def _trained(self, inner: InnerLoop, key: Any) -> np.ndarray:
 
         agent, episodes = inner.agent(self.trained_in), self.plan["episodes"]
         key_draw, key_agents = split_key(key)
@@ -180,7 +177,6 @@ class _Trainer:
         return np.asarray(judge(hyperparameters, keys, self.trained_in_params))
 
     def _evolved(self, key: Any) -> np.ndarray:
-        from scb.neuroevolution import NeuroevolutionConfig, evolve_policy
 
         config = NeuroevolutionConfig(**self.plan["neuroevolution"])
         if self.trained_in is self.env:
@@ -190,15 +186,11 @@ class _Trainer:
         )
 
     def _optimal(self, key: Any) -> np.ndarray:
-        from scb.analysis.optimal_actions import optimal_policy
 
         policy = optimal_policy(self.trained_in, self.trained_in_params)
         return self._judged_policies(lambda key: policy, key)
 
     def _judged_policies(self, make: Callable[[Any], Any], key: Any) -> np.ndarray:
-
-        from scb.evaluation import evaluate
-        from scb.evolution import map_population
 
         def judged(key: Any) -> Any:
             key_make, key_judge = split_key(key)
@@ -209,19 +201,15 @@ class _Trainer:
         return np.asarray(map_population(judged, number, (0,))(split_key(key, number)))
 
 
-def in_environment(config: "NeuroevolutionConfig", limit: int) -> "NeuroevolutionConfig":
+def in_environment(config: NeuroevolutionConfig, limit: int) -> NeuroevolutionConfig:
     """The neuroevolution of a bandit with as many steps of an environment: one episode a candidate."""
-    from dataclasses import replace
-
     steps = config.population_size * config.num_generations * config.episodes
     generations = max(1, steps // (config.population_size * limit))
     return replace(config, episodes=1, num_generations=generations)
 
 
-def with_network(inner: "InnerLoop", network: str) -> "InnerLoop":
+def with_network(inner: InnerLoop, network: str) -> InnerLoop:
     """The same algorithm with one of the networks that no search saw, or with its own."""
-    from dataclasses import replace
-
     changes: dict[str, dict[str, Any]] = {
         "": {},
         WIDE: {"hidden_sizes": (512,)},
@@ -243,9 +231,6 @@ def columns(entry: Mapping[str, list[float]]) -> dict[str, np.ndarray]:
 
 def normalized(report: Mapping[str, Any], source: str, column: str) -> list[np.ndarray]:
     """Per environment the scores of one kind of agent: 0 a random policy, 1 the paper's expert."""
-    from lpo.suite import REFERENCES
-    from scb.statistics import normalized_score
-
     return [
         normalized_score(columns(entry[source])[column], report["random"][name], REFERENCES[name])
         for name, entry in report["environments"].items()
@@ -257,8 +242,6 @@ def _unseen_worse(report: Mapping[str, Any]) -> list[str]:
 
     Networks differ from the paper's agent by agent; other agents are compared by intervals that lie apart.
     """
-    from scb.statistics import stratified_estimate
-
     together = normalized(report, ZOO, TOGETHER)
     own = stratified_estimate(together)
 
@@ -273,10 +256,8 @@ def _unseen_worse(report: Mapping[str, Any]) -> list[str]:
     return [name for name in UNSEEN if worse(name)]
 
 
-def _differences(report: Mapping[str, Any]) -> "tuple[Estimate, Estimate]":
+def _differences(report: Mapping[str, Any]) -> tuple[Estimate, Estimate]:
     """What the zoo's bandits bring over the environments, and drawn hyperparameters over fixed ones in a search."""
-    from scb.statistics import stratified_estimate
-
     zoo, itself, drawn, fixed = (
         normalized(report, source, TOGETHER) for source in (ZOO, ENVIRONMENT, DRAWN, FIXED)
     )
@@ -292,8 +273,6 @@ def parts(report: Mapping[str, Any]) -> list[bool | None]:
 
 def verdict(report: Mapping[str, Any]) -> str:
     """Robustness to drawn hyperparameters, what drawing them in the search brings, and agents that no search saw."""
-    from scb.statistics import stratified_estimate
-
     scores = {
         source: stratified_estimate(normalized(report, source, TOGETHER)) for source in SOURCES
     }
@@ -321,8 +300,6 @@ def verdict(report: Mapping[str, Any]) -> str:
 
 def _by_environment(report: Mapping[str, Any]) -> str:
     """Where drawing hyperparameters in the search helps or harms, and where neither search left its start."""
-    from scb.statistics import paired_difference
-
     found: dict[str, list[str]] = {}
     for name, entry in report["environments"].items():
         chosen = report["generation"][name]
@@ -338,7 +315,7 @@ def _by_environment(report: Mapping[str, Any]) -> str:
     return "; ".join(f"{said} {' and '.join(names)}" for said, names in found.items())
 
 
-def _sign(difference: "Estimate") -> int:
+def _sign(difference: Estimate) -> int:
     """1 or -1 where the interval excludes zero, else 0."""
     assert difference.low is not None and difference.high is not None
     return int(difference.low > 0) - int(difference.high < 0)
@@ -346,8 +323,6 @@ def _sign(difference: "Estimate") -> int:
 
 def body(report: Mapping[str, Any]) -> list[str]:
     """How it was measured, and a table for each environment."""
-    from scb.statistics import estimate
-
     plan = report["plan"]
     own = plan["neuroevolution"]
     steps = own["num_generations"] * own["population_size"] * own["episodes"]
@@ -393,12 +368,8 @@ def body(report: Mapping[str, Any]) -> list[str]:
     return lines
 
 
-def draw(report: Mapping[str, Any]) -> "Figure":
+def draw(report: Mapping[str, Any]) -> Figure:
     """A panel an environment; right of the dashed line what the paper's inner loop does not have."""
-    from matplotlib.figure import Figure
-
-    from scb import plotting
-    from scb.statistics import estimate
 
     looks = (
         (plotting.BLUE, "o"),

@@ -7,10 +7,13 @@
 
 import sys
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
+from matplotlib.figure import Figure
 
+import scb
 from experiments.page import (
     ACTIONS,
     CLASSIC_CONTROL,
@@ -22,10 +25,15 @@ from experiments.page import (
     unpacked,
 )
 from experiments.page import main as run
+from scb import plotting
+from scb.analysis import figures
+from scb.analysis.explain import explain
+from scb.analysis.importance import reward_variance
+from scb.analysis.planes import Plane
+from scb.analysis.states import bandit_states
+from scb.environments.zoo import bandit_metadata, open_bandit
 from scb.keys import root_key, split_key
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from scb.statistics import estimate
 
 POINTS = 60  # of the grid of best actions, in either direction
 # An entry that causes less than this share of the reward's variance is one that it hardly depends on.
@@ -41,14 +49,6 @@ def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None
 
 
 def _examine(name: str, plan: Mapping[str, Any]) -> dict[str, Any]:
-    import jax.numpy as jnp
-
-    import scb
-    from scb.analysis.explain import explain
-    from scb.analysis.importance import reward_variance
-    from scb.analysis.states import bandit_states
-    from scb.environments.zoo import bandit_metadata, open_bandit
-    from scb.statistics import estimate
 
     bandit = open_bandit(f"Synthetic-{name}")
     env, env_params = scb.make(name)
@@ -173,13 +173,8 @@ def body(report: Mapping[str, Any]) -> list[str]:
     ]
 
 
-def draw(report: Mapping[str, Any]) -> "Figure":
+def draw(report: Mapping[str, Any]) -> Figure:
     """Best actions above, importance below, a column an environment."""
-    from matplotlib.figure import Figure
-
-    from scb import plotting
-    from scb.analysis import figures
-    from scb.analysis.planes import Plane
 
     with plotting.figure_style():
         figure = Figure(figsize=(15.0, 6.0))

@@ -12,16 +12,15 @@ tested is drawn at random among B's optima, ties included, and acts at random wh
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from experiments.page import Experiment, Save, table
 from experiments.page import main as run
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from scb import plotting
 
 Floats = NDArray[np.floating]
 TIE = 1e-9  # below this, two values of an exact solution are equal
@@ -232,11 +231,8 @@ def body(report: Mapping[str, Any]) -> list[str]:
     ]
 
 
-def draw(report: Mapping[str, Any]) -> "Figure":
+def draw(report: Mapping[str, Any]) -> Figure:
     """The share of MDPs where every optimum of the bandit is optimal."""
-    from matplotlib.figure import Figure
-
-    from scb import plotting
 
     found = report["regrets"]
     palette = (plotting.VERMILLION, plotting.BLUE, plotting.GREEN, plotting.GREY)

@@ -17,19 +17,24 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter, LogLocator, NullFormatter, StrMethodFormatter
 
 from experiments.page import exit_status, read, text
 from lpo.cli import configure_jax
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
-    from lpo.objectives import Objective
-    from scb.agents.settings import Setting
+from lpo.generalization import compare, training_setting
+from lpo.learning import objective_of_run
+from lpo.objectives import Objective, load_objective
+from scb import plotting
+from scb.agents.settings import Setting
+from scb.artefacts import machine_description, package_versions
+from scb.errors import UserError
+from scb.runs import write_json
+from scb.statistics import estimate, iqm, pooled_estimate
 
 SOURCES = ("bandit", "environment")
 BANDIT = "LPO (bandit)"
@@ -123,8 +128,6 @@ def search_curve(metrics: Sequence[Mapping[str, Any]], seconds: Sequence[float])
 
 def markdown(report: Mapping[str, Any]) -> str:
     """The page."""
-    from scb.statistics import pooled_estimate
-
     lines = [
         "# Learned policy optimisation on synthetic contextual bandits",
         "",
@@ -192,13 +195,8 @@ def markdown(report: Mapping[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def draw(report: Mapping[str, Any]) -> "Figure":
+def draw(report: Mapping[str, Any]) -> Figure:
     """(i) over generations, (ii) over steps and minutes; (iii) Pendulum; (iv) Hopper."""
-    from matplotlib.figure import Figure
-    from matplotlib.ticker import EngFormatter, LogLocator, NullFormatter, StrMethodFormatter
-
-    from scb import plotting
-    from scb.statistics import iqm
 
     looks = {
         "bandit": plotting.Look(plotting.VERMILLION, "-", "o"),
@@ -253,9 +251,8 @@ def draw(report: Mapping[str, Any]) -> "Figure":
 
 
 def _band(
-    axes: "Axes", x: np.ndarray, returns: Sequence[Sequence[float]], look: Any, label: str
+    axes: Axes, x: np.ndarray, returns: Sequence[Sequence[float]], look: Any, label: str
 ) -> None:
-    from scb.statistics import estimate
 
     found = [estimate(column) for column in np.asarray(returns).T]
     axes.plot(
@@ -271,9 +268,7 @@ def _band(
         axes.fill_between(x, low, high, color=look.color, alpha=0.15, linewidth=0)  # type: ignore[arg-type]
 
 
-def _dots(axes: "Axes", table: Mapping[str, Any]) -> None:
-    from scb import plotting
-    from scb.statistics import pooled_estimate
+def _dots(axes: Axes, table: Mapping[str, Any]) -> None:
 
     for position, (objective, finals) in enumerate(table["finals"].items()):
         learned = objective.startswith("LPO")
@@ -295,7 +290,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--only-render", action="store_true")
     arguments = parser.parse_args(argv)
     configure_jax()
-    from scb import plotting
 
     keys = ("preset", "searches", "evaluations")
     report = read(arguments.out, missing_is_new=not arguments.only_render, keys=keys)
@@ -309,11 +303,6 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def measure(preset: str, runs: Path, out: Path, report: dict[str, Any]) -> None:
     """Does what the report lacks, and writes it after every part."""
-    from lpo.generalization import training_setting
-    from scb.artefacts import machine_description, package_versions
-    from scb.errors import UserError
-    from scb.runs import write_json
-
     plan = PRESETS[preset]
     if report and report["preset"] != preset:
         raise UserError(f"{out} is of preset {report['preset']}: choose another --out.")
@@ -379,8 +368,7 @@ class _Learned:
         return self.runs / f"{self.source}-{self.seed}"
 
     @cached_property
-    def objective(self) -> "Objective":
-        from lpo.learning import objective_of_run
+    def objective(self) -> Objective:
 
         config = {"command": "meta-train", "seed": self.seed, **self.settings}
         found = objective_of_run(config, self.folder)
@@ -395,12 +383,8 @@ def _curve_of(folder: Path) -> dict[str, Any]:
     return search_curve(lines[0], [line["seconds"] for line in lines[1]])
 
 
-def _tuned_clip(setting: "Setting", agents: int) -> dict[str, Any]:
+def _tuned_clip(setting: Setting, agents: int) -> dict[str, Any]:
     """{"tuned": the best of CLIPS on agents that report nothing, "sweep": what each earned}."""
-    from lpo.generalization import compare
-    from lpo.objectives import load_objective
-    from scb.statistics import iqm
-
     curves = compare(
         "Pendulum-v1",
         [load_objective(clip) for clip in CLIPS],
@@ -418,13 +402,10 @@ def _judge(
     tuned: str,
     groups: Mapping[str, Sequence[_Learned]],
     agents: int,
-    setting: "Setting",
+    setting: Setting,
     backend: str | None = None,
 ) -> None:
     """Trains agents with PPO, the tuned clip, DPO and searches that the table lacks, and adds them to it."""
-    from lpo.generalization import compare
-    from lpo.objectives import load_objective
-
     finals, areas = table.setdefault("finals", {}), table.setdefault("areas", {})
     closed_forms = ("ppo", tuned, "dpo")
     lacking = {name: [] if name in finals else [load_objective(name)] for name in closed_forms}

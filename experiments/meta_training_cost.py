@@ -11,11 +11,18 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from experiments.page import exit_status
 from lpo.cli import configure_jax
+from lpo.meta_training import MetaTraining, MetaTrainingConfig
+from lpo.pipeline import environment_problem
+from scb.artefacts import machine_description, package_versions
+from scb.evolution import map_population
 from scb.keys import root_key
+from scb.runs import Stopwatch
 
 
 def main() -> int:
@@ -29,15 +36,6 @@ def main() -> int:
     parser.add_argument("--out", type=Path, default=Path("runs/meta_training_cost.json"))
     arguments = parser.parse_args()
     configure_jax()
-
-    import jax
-    import jax.numpy as jnp
-
-    from lpo.meta_training import MetaTraining, MetaTrainingConfig
-    from lpo.pipeline import environment_problem
-    from scb.artefacts import machine_description, package_versions
-    from scb.evolution import map_population
-    from scb.runs import Stopwatch
 
     default = MetaTrainingConfig()
     config = replace(

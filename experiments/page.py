@@ -13,17 +13,18 @@ import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
 from lpo.cli import configure_jax
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-    from numpy.typing import NDArray
-
-    from scb.statistics import Estimate
+from scb import plotting
+from scb.artefacts import machine_description, package_versions
+from scb.errors import UserError
+from scb.runs import make_folder, write_json
+from scb.statistics import Estimate
 
 DATA = Path("docs/data")
 DOCS = Path("docs")
@@ -82,7 +83,7 @@ class Experiment:
     parts: Callable[[Mapping[str, Any]], Sequence[bool | None]]
     verdict: Callable[[Mapping[str, Any]], str]
     body: Callable[[Mapping[str, Any]], list[str]]
-    draw: Callable[[Mapping[str, Any]], "Figure"]
+    draw: Callable[[Mapping[str, Any]], Figure]
     needs: str = ""
     extras: Callable[[Mapping[str, Any], Path], None] | None = None
 
@@ -135,7 +136,7 @@ def packed(rows: Any) -> list[str]:
     return [" ".join(f"{x:.4g}" for x in row) for row in rows]
 
 
-def unpacked(lines: Sequence[str]) -> "NDArray[np.floating]":
+def unpacked(lines: Sequence[str]) -> NDArray[np.floating]:
     """What `packed` packed, to four digits."""
     return np.array([[float(x) for x in line.split()] for line in lines])
 
@@ -158,7 +159,7 @@ def span(numbers: Iterable[int]) -> str:
     return str(low) if low == high else f"{low} to {high}"
 
 
-def text(estimate: "Estimate | Mapping[str, Any]", places: int = 0, sign: bool = False) -> str:
+def text(estimate: Estimate | Mapping[str, Any], places: int = 0, sign: bool = False) -> str:
     """An estimate with its interval, with a real minus sign."""
     values = estimate if isinstance(estimate, Mapping) else estimate.as_dict()
     value = f"{values['value']:{'+' if sign else ''}.{places}f}"
@@ -202,8 +203,6 @@ def main(experiment: Experiment, argv: Sequence[str] | None = None) -> int:
         docs = DOCS if arguments.out is None else out.parent
 
     def measure_and_render() -> int:
-        from scb.errors import UserError
-        from scb.runs import make_folder
 
         make_folder(docs, "--docs")
         report = read(out, missing_is_new=not arguments.only_render)
@@ -220,8 +219,6 @@ def main(experiment: Experiment, argv: Sequence[str] | None = None) -> int:
 
 def exit_status(name: str, command: Callable[[], int]) -> int:
     """What a command returns; 2 where it raises a UserError, whose sentence goes to stderr behind the name."""
-    from scb.errors import UserError
-
     try:
         return command()
     except UserError as error:
@@ -235,9 +232,6 @@ def render(experiment: Experiment, report: Mapping[str, Any], docs: Path) -> Non
     Raises:
       UserError: the report is not complete.
     """
-    from scb import plotting
-    from scb.errors import UserError
-
     if not complete(report):
         raise UserError(
             f"the report of {experiment.name} is not complete: run python -m experiments.{experiment.name} "
@@ -256,9 +250,6 @@ def complete(report: Mapping[str, Any]) -> bool:
 
 
 def _measure(experiment: Experiment, preset: str, report: dict[str, Any], out: Path) -> None:
-    from scb.artefacts import machine_description, package_versions
-    from scb.errors import UserError
-    from scb.runs import write_json
 
     if report.get("preset", preset) != preset:
         raise UserError(
@@ -286,8 +277,6 @@ def _measure(experiment: Experiment, preset: str, report: dict[str, Any], out: P
 
 def read(path: Path, missing_is_new: bool = False, keys: Iterable[str] = ()) -> dict[str, Any]:
     """A report from its file, with these keys at least; a UserError where there is none."""
-    from scb.errors import UserError
-
     if missing_is_new and not path.exists():
         return {}
     try:

@@ -2,17 +2,17 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from experiments.page import text
-
-if TYPE_CHECKING:
-    from scb.curriculum import CurriculumConfig
-    from scb.discovery import BanditDiscovery, DiscoveryConfig
-    from scb.evolution import Outcome
-    from scb.statistics import Estimate
+from scb.curriculum import CurriculumConfig, paper_curriculum
+from scb.discovery import BanditDiscovery, DiscoveryConfig, discover
+from scb.errors import UserError
+from scb.evolution import EvolutionConfig, Outcome, config_dict
+from scb.runs import Run
+from scb.statistics import Estimate, estimate
 
 NONE = "none"  # the curriculum that is none
 # Of two searches the bootstrap's interval is their range: two such lie apart by chance in every third comparison.
@@ -30,7 +30,7 @@ PAPER_SIZES: dict[str, dict[str, int]] = {
 
 def config_of(
     environment: str, plan: Mapping[str, Any], size: Mapping[str, int], seed: int, **changes: Any
-) -> "DiscoveryConfig":
+) -> DiscoveryConfig:
     """The paper's recipe (SNES from random weights) at a plan's size.
 
     Args:
@@ -39,9 +39,6 @@ def config_of(
       size: "generations", "population_size", "agents_per_candidate".
       changes: what else of the DiscoveryConfig is another.
     """
-    from scb.discovery import DiscoveryConfig
-    from scb.evolution import EvolutionConfig
-
     evolution = EvolutionConfig(
         strategy="SNES",
         population_size=size["population_size"],
@@ -62,16 +59,12 @@ def config_of(
     return DiscoveryConfig(environment, **given | changes)
 
 
-def curriculum_of(environment: str, shape: str, generations: int) -> "CurriculumConfig | None":
+def curriculum_of(environment: str, shape: str, generations: int) -> CurriculumConfig | None:
     """The paper's curriculum for an environment, scaled to a search of this length, in a shape; None for NONE.
 
     Raises:
       UserError: the paper has no curriculum for the environment.
     """
-    from dataclasses import replace
-
-    from scb.curriculum import paper_curriculum
-    from scb.errors import UserError
 
     if shape == NONE:
         return None
@@ -90,12 +83,8 @@ def algorithms_text(
     return ", ".join(name.upper() for name in algorithms) or otherwise
 
 
-def search(config: "DiscoveryConfig", folder: str | Path) -> "tuple[BanditDiscovery, Outcome]":
+def search(config: DiscoveryConfig, folder: str | Path) -> tuple[BanditDiscovery, Outcome]:
     """A discovery in this run folder, resumed where it was begun; where it has ended, no generation is computed."""
-    from scb.discovery import discover
-    from scb.evolution import config_dict
-    from scb.runs import Run
-
     folder = Path(folder)
     run = Run.open(folder, config_dict(config), resume=(folder / "config.json").exists())
     try:
@@ -104,7 +93,7 @@ def search(config: "DiscoveryConfig", folder: str | Path) -> "tuple[BanditDiscov
         run.close()
 
 
-def searched_curve(config: "DiscoveryConfig", folder: str | Path) -> dict[str, Any]:
+def searched_curve(config: DiscoveryConfig, folder: str | Path) -> dict[str, Any]:
     """`curve` of a search, and its "seconds"; searched first where that has not ended yet."""
     _, outcome = search(config, folder)
     return {**curve(outcome.metrics), "seconds": round(outcome.seconds, 1)}
@@ -147,7 +136,7 @@ class Final:
       failed: searches whose last judgement is no number.
     """
 
-    estimate: "Estimate | None"
+    estimate: Estimate | None
     failed: int
 
     @property
@@ -177,8 +166,6 @@ class Final:
 
 def final(curves: Mapping[str, Mapping[str, Any]], statistic: Any) -> Final:
     """The last judgement, over the searches of {seed: curve}."""
-    from scb.statistics import estimate
-
     last = [c["fitness"][-1] for c in curves.values() if c["fitness"][-1] is not None]
     return Final(estimate(last, statistic) if last else None, len(curves) - len(last))
 

@@ -7,18 +7,26 @@ The experts are those of `experiments.experts`, trained again.
 
 import sys
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
+from matplotlib.figure import Figure
 
+from experiments import experts
 from experiments.page import ACTIONS, CLASSIC_CONTROL, Experiment, Save, packed, table, unpacked
 from experiments.page import main as run
+from scb import plotting
+from scb.agents.agent import flat_bounds
+from scb.analysis import figures
+from scb.analysis.components import ReplacedBandit, q_reward
+from scb.analysis.optimal_actions import first_action, optimal_actions
+from scb.analysis.planes import Plane, plane_for
+from scb.analysis.states import bandit_states, follow
+from scb.environments.synthetic import SyntheticBandit
+from scb.environments.zoo import bandit_metadata, open_bandit
 from scb.keys import root_key, split_key
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-    from scb.environments.synthetic import SyntheticBandit
 
 POINTS = 50  # of the grid of best actions, in either direction
 CELLS = 20  # of the grid whose share of visited cells is the coverage
@@ -40,16 +48,6 @@ def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None
 
 
 def _examine(environment: str, plan: Mapping[str, Any]) -> dict[str, Any]:
-    import jax
-    import jax.numpy as jnp
-
-    from experiments import experts
-    from scb.agents.agent import flat_bounds
-    from scb.analysis.components import ReplacedBandit, q_reward
-    from scb.analysis.optimal_actions import first_action, optimal_actions
-    from scb.analysis.planes import plane_for
-    from scb.analysis.states import bandit_states, follow
-    from scb.environments.zoo import bandit_metadata, open_bandit
 
     key_states, key_episodes, key_pick = split_key(root_key(SEED), 3)
     expert, env, env_params = experts.train(environment, plan["agents"], plan["selection_episodes"])
@@ -69,7 +67,7 @@ def _examine(environment: str, plan: Mapping[str, Any]) -> dict[str, Any]:
     )
     _, _, nodes = plane.grid(POINTS)
 
-    def best(rewarding: "SyntheticBandit") -> list[str]:
+    def best(rewarding: SyntheticBandit) -> list[str]:
         actions = jax.jit(jax.vmap(optimal_actions(rewarding, method="grid")))(jnp.asarray(nodes))
         # A map has one number a node: of several action dimensions the first.
         firsts = np.asarray(actions).reshape(POINTS * POINTS, -1)[:, 0]
@@ -200,13 +198,8 @@ def body(report: Mapping[str, Any]) -> list[str]:
     ]
 
 
-def draw(report: Mapping[str, Any]) -> "Figure":
+def draw(report: Mapping[str, Any]) -> Figure:
     """A column an environment: the expert above, the bandit below."""
-    from matplotlib.figure import Figure
-
-    from scb import plotting
-    from scb.analysis import figures
-    from scb.analysis.planes import Plane
 
     with plotting.figure_style():
         figure = Figure(figsize=(3.0 * len(report["environments"]), 6.2))

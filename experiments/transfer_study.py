@@ -15,15 +15,23 @@ import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from experiments.page import exit_status, read, text
 from lpo.cli import configure_jax
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from lpo.generalization import compare, training_setting
+from lpo.learning import objective_of_run
+from lpo.objectives import load_objective
+from scb import plotting
+from scb.artefacts import machine_description, package_versions
+from scb.errors import UserError
+from scb.plotting import BLUE, GREY, VERMILLION, estimate_row, figure_style
+from scb.runs import command_of, write_json
+from scb.statistics import estimate, paired_difference
 
 # Flags of `lpo meta-train`. The first is what the others differ from in one thing each.
 VARIATIONS: dict[str, dict[str, Any]] = {
@@ -96,8 +104,6 @@ def summary(report: Mapping[str, Any]) -> list[dict[str, Any]]:
     A difference is over the searches of one seed in both; a reference, which has one set of agents and
     no search, stands against each search of the default.
     """
-    from scb.statistics import estimate, paired_difference
-
     rows = []
     default = report["objectives"].get("default", {}).get("returns", {})
     for name, entry in report["objectives"].items():
@@ -214,12 +220,8 @@ def markdown(report: Mapping[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def draw(report: Mapping[str, Any]) -> "Figure":
+def draw(report: Mapping[str, Any]) -> Figure:
     """One panel an evaluation, one line an objective: interquartile mean with its interval, each agent a dot."""
-    from matplotlib.figure import Figure
-    from matplotlib.ticker import MaxNLocator
-
-    from scb.plotting import BLUE, GREY, VERMILLION, estimate_row, figure_style
 
     evaluations = [e["name"] for e in report["evaluations"]]
     rows = summary(report)
@@ -267,7 +269,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     report = read(arguments.out, missing_is_new=not arguments.only_render, keys=keys)
     if not arguments.only_render:
         _measure(arguments, report, searches)
-    from scb import plotting
 
     arguments.page.write_text(markdown(report))
     (arguments.page.parent / "figures").mkdir(exist_ok=True)
@@ -278,12 +279,6 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _measure(
     arguments: argparse.Namespace, report: dict[str, Any], searches: Mapping[str, Any]
 ) -> None:
-    from lpo.generalization import compare, training_setting
-    from lpo.objectives import load_objective
-    from scb.artefacts import machine_description, package_versions
-    from scb.errors import UserError
-    from scb.runs import write_json
-    from scb.statistics import estimate
 
     if report and report["searches"] != searches:
         raise UserError(
@@ -332,9 +327,6 @@ def _measure(
 
 def _learn(arguments: argparse.Namespace, name: str, seed: int, entry: dict[str, Any]) -> Any:
     """A variation's objective of one search, and into the entry what it took."""
-    from lpo.learning import objective_of_run
-    from scb.runs import command_of
-
     settings = settings_of(name, seed, arguments.generations, arguments.population_size)
     objective = objective_of_run(settings, arguments.runs / f"{name.replace(' ', '-')}-{seed}")
     entry["command"] = command_of("lpo", {**settings, "seed": None})

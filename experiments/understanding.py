@@ -23,16 +23,22 @@ from typing import Any
 import numpy as np
 
 from experiments.page import exit_status
+from lpo import drift_figures
 from lpo.cli import configure_jax
+from lpo.formula import ClosedFormDrift
+from lpo.objectives import load_objective, zoo_names
+from lpo.understanding import REGIONS, analyze, is_temporal
+from scb import plotting
+from scb.artefacts import package_versions
+from scb.errors import UserError
+from scb.runs import write_json
+from scb.statistics import paired_difference
 
 PROGRESS = (0.0, 0.5, 1.0)
 
 
 def measure(names: Sequence[str]) -> list[dict[str, Any]]:
     """The analyses of these objectives, temporal ones at every fraction of `PROGRESS`."""
-    from lpo.objectives import load_objective
-    from lpo.understanding import analyze, is_temporal
-
     rows = []
     for objective in map(load_objective, names):
         temporal = is_temporal(objective)
@@ -43,10 +49,6 @@ def measure(names: Sequence[str]) -> list[dict[str, Any]]:
 
 def read_formula(path: Path) -> dict[str, Any]:
     """What the page says of a closed form, from its artefact."""
-    from lpo.formula import ClosedFormDrift
-    from lpo.objectives import load_objective
-    from scb.errors import UserError
-
     objective = load_objective(path)
     if not isinstance(objective.drift, ClosedFormDrift):
         raise UserError(f"{path} is no formula: give what lpo distill wrote.")
@@ -67,9 +69,6 @@ def read_formula(path: Path) -> dict[str, Any]:
 
 def read_comparison(path: Path, formulas: Sequence[Mapping[str, Any]] = ()) -> dict[str, Any]:
     """What the page says of a comparison of `lpo evaluate`; formulas are compared with what they were fitted to."""
-    from scb.errors import UserError
-    from scb.statistics import paired_difference
-
     try:
         whole = json.loads(path.read_text())
         curves = whole["curves"]
@@ -102,8 +101,6 @@ def read_comparison(path: Path, formulas: Sequence[Mapping[str, Any]] = ()) -> d
 
 def markdown(report: Mapping[str, Any]) -> str:
     """The page: the figure, the table, what it says in words, and the formulas."""
-    from lpo.understanding import REGIONS
-
     rows = report["analyses"]
     names = list(dict.fromkeys(row["objective"] for row in rows))
     lines = [
@@ -277,12 +274,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--docs", type=Path, default=Path("docs"))
     arguments = parser.parse_args(argv)
     configure_jax()
-
-    from lpo import drift_figures
-    from lpo.objectives import load_objective, zoo_names
-    from scb import plotting
-    from scb.artefacts import package_versions
-    from scb.runs import write_json
 
     out = arguments.docs / "data" / "understanding.json"
 

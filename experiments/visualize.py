@@ -10,17 +10,26 @@ runs/visualize.
 import sys
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import jax
 import numpy as np
+from matplotlib.figure import Figure
 
+import scb
 from experiments.brax_curriculum import STANDING
 from experiments.page import CLASSIC_CONTROL, Experiment, Save, packed, table, text, unpacked
 from experiments.page import main as run
+from lpo.suite import REFERENCES
+from scb import plotting
+from scb.agents.hyperparameters import inner_loop
+from scb.analysis import animation
+from scb.analysis.animation import picture, save_gif
+from scb.analysis.states import follow
+from scb.environments.zoo import open_bandit
+from scb.errors import UserError
 from scb.keys import root_key, split_key
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from scb.statistics import estimate
 
 HOPPER = "hopper (spring)"
 FRAMES = 6  # of the film strip
@@ -40,15 +49,6 @@ def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None
 
 
 def _show(name: str, plan: Mapping[str, Any]) -> dict[str, Any]:
-    import jax
-
-    import scb
-    from scb.agents.hyperparameters import inner_loop
-    from scb.analysis import animation
-    from scb.analysis.states import follow
-    from scb.environments.zoo import open_bandit
-    from scb.errors import UserError
-    from scb.statistics import estimate
 
     brax = name == HOPPER
     environment = "hopper" if brax else name
@@ -100,8 +100,6 @@ def film(entry: Mapping[str, Any]) -> np.ndarray:
 
 def animate(report: Mapping[str, Any], docs: Path) -> None:
     """Writes the GIFs."""
-    from scb.analysis.animation import save_gif
-
     for name, entry in report["environments"].items():
         if "film" in entry:
             path = docs / "figures" / f"visualize_{name}.gif"
@@ -114,8 +112,6 @@ def _number(value: float, places: int) -> str:
 
 def _good(report: Mapping[str, Any]) -> list[str]:
     """Where agents earn at most a tenth less than the paper's SAC expert; on Hopper what standing still does."""
-    from lpo.suite import REFERENCES
-
     levels = {name: x - 0.1 * abs(x) for name, x in REFERENCES.items()} | {HOPPER: STANDING}
     found = report["environments"].items()
     return [name for name, entry in found if entry["agents"]["value"] >= levels[name]]
@@ -173,12 +169,8 @@ def body(report: Mapping[str, Any]) -> list[str]:
     ]
 
 
-def draw(report: Mapping[str, Any]) -> "Figure":
+def draw(report: Mapping[str, Any]) -> Figure:
     """A film strip: a row an environment, from the first step to the last."""
-    from matplotlib.figure import Figure
-
-    from scb import plotting
-    from scb.analysis.animation import picture
 
     films = {n: e for n, e in report["environments"].items() if "film" in e}
     with plotting.figure_style():

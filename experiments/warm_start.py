@@ -17,9 +17,19 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from experiments.page import exit_status
 from lpo.cli import configure_jax
+from scb import make
+from scb.agents.hyperparameters import algorithms_for, inner_loop
+from scb.artefacts import machine_description, package_versions
+from scb.discovery import SyntheticTraining, judge
+from scb.environments.synthetic import BanditConfig, bandit_for
 from scb.keys import root_key, split_key
+from scb.runs import write_json
+from scb.statistics import estimate
+from scb.warm_start import WarmStartConfig, expert_dataset, find_expert, fit_bandit
 
 # Not the seeds that results are reported on.
 SEED = 7_000
@@ -66,17 +76,6 @@ def main() -> int:
     parser.add_argument("--out", type=Path, default=Path("runs/warm_start.json"))
     arguments = parser.parse_args()
     configure_jax()
-
-    import numpy as np
-
-    from scb import make
-    from scb.agents.hyperparameters import algorithms_for, inner_loop
-    from scb.artefacts import machine_description, package_versions
-    from scb.discovery import SyntheticTraining, judge
-    from scb.environments.synthetic import BanditConfig, bandit_for
-    from scb.runs import write_json
-    from scb.statistics import estimate
-    from scb.warm_start import WarmStartConfig, expert_dataset, find_expert, fit_bandit
 
     report: dict[str, Any] = {
         "seed": SEED,

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from experiments.page import exit_status
+from scb.environments.zoo import bandit_metadata, load_bandit, save_bandit
 
 
 def results_of(table: Mapping[str, Any], sha256: str, backend: str | None = None) -> dict[str, Any]:
@@ -47,8 +48,6 @@ def main() -> int:
     parser.add_argument("--table", type=Path, default=Path("docs/data/zoo_table.json"))
     parser.add_argument("--folder", type=Path, default=Path("scb/zoo"))
     arguments = parser.parse_args()
-
-    from scb.environments.zoo import bandit_metadata, load_bandit, save_bandit
 
     table = json.loads(arguments.table.read_text()) if arguments.table.exists() else {}
     for path in arguments.bandits:

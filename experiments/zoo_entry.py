@@ -13,6 +13,9 @@ from pathlib import Path
 from typing import Any
 
 from experiments.page import exit_status, run_name
+from lpo.drift import LearnedDrift
+from lpo.objectives import load_objective, save_objective
+from scb.errors import UserError
 
 
 def _short(name: str, file: Path, zoo_name: str) -> str:
@@ -34,10 +37,6 @@ def main() -> int:
     parser.add_argument("--comparisons", type=Path, nargs="*", default=[])
     parser.add_argument("--folder", type=Path, default=Path("lpo/zoo"))
     arguments = parser.parse_args()
-
-    from lpo.drift import LearnedDrift
-    from lpo.objectives import load_objective, save_objective
-    from scb.errors import UserError
 
     objective = load_objective(arguments.objective)
     if not isinstance(objective.drift, LearnedDrift):

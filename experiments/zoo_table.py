@@ -20,7 +20,7 @@ import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -36,9 +36,18 @@ from experiments.zoo_table_page import (
     render,
 )
 from lpo.cli import configure_jax
-
-if TYPE_CHECKING:
-    from scb.environments.synthetic import SyntheticBandit
+from scb.agents.hyperparameters import algorithms_for, inner_loop
+from scb.artefacts import machine_description, package_versions
+from scb.commands import FIRST_REPORTING_SEED
+from scb.discovery import SyntheticTraining, check_fits, judge
+from scb.environments.brax import BRAX_NAMES
+from scb.environments.registry import make
+from scb.environments.synthetic import BanditConfig, SyntheticBandit
+from scb.environments.zoo import bandit_metadata, home_of, open_bandit, zoo_names
+from scb.errors import UserError
+from scb.importer import PUBLISHED_BANDITS, published_bandit
+from scb.runs import write_json
+from scb.statistics import estimate, paired_difference
 
 DEFAULT_PUBLISHED = Path("../shared/published_scbs")
 
@@ -56,7 +65,7 @@ class Candidate:
 
     environment: str
     kind: str
-    bandit: "SyntheticBandit"
+    bandit: SyntheticBandit
     sha256: str
 
 
@@ -70,7 +79,6 @@ class Protocol:
     backend: str = "generalized"
 
     def __post_init__(self) -> None:
-        from scb.errors import UserError
 
         for name in ("agents", "episodes", "brax_episodes"):
             if getattr(self, name) < 1:
@@ -91,11 +99,6 @@ def candidates(
     Raises:
       UserError: an unknown name, or nothing to measure.
     """
-    from scb.environments.brax import BRAX_NAMES
-    from scb.environments.zoo import bandit_metadata, home_of, open_bandit, zoo_names
-    from scb.errors import UserError
-    from scb.importer import PUBLISHED_BANDITS, published_bandit
-
     paths = {}
     if published is not None:
         stored = {
@@ -147,14 +150,6 @@ def measure(
 
     An entry that is there already, of the same bandit under the same protocol, stays as it is.
     """
-    from scb.agents.hyperparameters import algorithms_for, inner_loop
-    from scb.commands import FIRST_REPORTING_SEED
-    from scb.discovery import SyntheticTraining, check_fits, judge
-    from scb.environments.brax import BRAX_NAMES
-    from scb.environments.registry import make
-    from scb.environments.synthetic import BanditConfig
-    from scb.runs import write_json
-
     out.parent.mkdir(parents=True, exist_ok=True)
     entries: list[dict[str, Any]] = report.setdefault("entries", [])
     environment = ""
@@ -213,8 +208,6 @@ def _comparable(entry: Mapping[str, Any]) -> dict[str, Any]:
 
 def summary(returns: np.ndarray) -> dict[str, Any]:
     """{"iqm", "failed", "agents"} of [N] returns; one that is not finite is None, and counts as the worst."""
-    from scb.statistics import estimate
-
     agents = [round(float(r), 3) if np.isfinite(r) else None for r in returns]
     finite = [r for r in agents if r is not None]
     iqm = estimate(_counted(agents)).as_dict() if finite else None
@@ -228,8 +221,6 @@ def _counted(agents: Sequence[float | None]) -> list[float]:
 
 def differences(entries: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """Ours - published, by environment and algorithm, where both were measured under one protocol."""
-    from scb.statistics import paired_difference
-
     protocol = ("agents", "episodes", "seed", "backend", "inner_loop")
     rows = []
     for (name, algorithm), pair in pairs(entries).items():
@@ -286,8 +277,6 @@ def parser() -> argparse.ArgumentParser:
 def main(argv: Sequence[str] | None = None) -> int:
     arguments = parser().parse_args(argv)
     configure_jax()
-
-    from scb.artefacts import machine_description, package_versions
 
     def measure_and_render() -> int:
         if not arguments.only_render:

@@ -4,10 +4,15 @@ import math
 import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import MaxNLocator
+
+from scb import plotting
+from scb.errors import UserError
+from scb.statistics import Estimate
 
 ACTIONS = {"mode_actions": "most likely actions", "sampled_actions": "sampled actions"}
 BANDITS = ("ours", "published")
@@ -215,8 +220,6 @@ def _protocol_text(entries: Sequence[Mapping[str, Any]]) -> str:
 
 def cell(interval: Mapping[str, Any] | None, signed: bool = False) -> str:
     """An estimate as the documentation writes it: −194.2 [−262.8, −167.9]."""
-    from scb.statistics import Estimate
-
     if interval is None:
         return "none"
     text = str(Estimate(**interval)).rsplit(" (n=", 1)[0].replace("-", "−")
@@ -246,14 +249,8 @@ def _target_cell(environment: str, ours: Mapping[str, Any] | None) -> str:
     return f"{target}: {' / '.join(answers)}"
 
 
-def figure(report: Mapping[str, Any]) -> "Figure":
+def figure(report: Mapping[str, Any]) -> Figure:
     """One panel an environment: every algorithm's interquartile mean and interval, ours and published."""
-    from matplotlib.figure import Figure
-    from matplotlib.lines import Line2D
-    from matplotlib.ticker import MaxNLocator
-
-    from scb import plotting
-    from scb.errors import UserError
 
     entries = report["entries"]
     if not entries:
@@ -353,8 +350,6 @@ def _panel_title(environment: str, entries: Sequence[Mapping[str, Any]]) -> str:
 
 def render(report: Mapping[str, Any], docs: Path) -> None:
     """Writes docs/zoo_table.md and docs/figures/zoo_table.png."""
-    from scb import plotting
-
     docs.mkdir(parents=True, exist_ok=True)
     (docs / "zoo_table.md").write_text(markdown(report))
     plotting.save(figure(report), docs / "figures" / "zoo_table.png")
