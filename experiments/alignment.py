@@ -26,7 +26,6 @@ import numpy as np
 from experiments.page import exit_status, run_name
 from lpo import figures
 from lpo.alignment import (
-    FITNESSES,
     Regime,
     correlation_text,
     forget_programs,
@@ -36,6 +35,7 @@ from lpo.alignment import (
     regime_label,
 )
 from lpo.cli import configure_jax
+from lpo.fitness import LABELS
 from lpo.objectives import Objective, load_objective
 from scb import plotting
 from scb.errors import UserError
@@ -141,12 +141,12 @@ def markdown(report: dict[str, Any]) -> str:
             "",
             f"![Correlations with {stage['environment']}](figures/{figure_name(name)})",
             "",
-            "| regime | " + " | ".join(FITNESSES) + " |",
-            "| --- |" + " --- |" * len(FITNESSES),
+            "| regime | " + " | ".join(LABELS) + " |",
+            "| --- |" + " --- |" * len(LABELS),
             *(
                 f"| {regime_label(row, stage['environment'])} | "
                 + " | ".join(
-                    correlation_text(row["alignment"][f]).replace("-", "\u2212") for f in FITNESSES
+                    correlation_text(row["alignment"][f]).replace("-", "\u2212") for f in LABELS
                 )
                 + " |"
                 for row in stage["regimes"]

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lpo.drift import ClipDrift, DPODrift, Drift, NoDrift
+from lpo.fitness import FITNESSES, LABELS
 from lpo.generalization import (
     check_names,
     check_seeds,
@@ -36,14 +37,6 @@ from scb.evolution import map_population
 from scb.keys import root_key, split_key
 from scb.runs import Stopwatch
 from scb.statistics import iqm, spearman
-
-# What an agent trained in a regime can be judged by.
-FITNESSES = (
-    "return, sampled actions",
-    "return, mode actions",
-    "area under the curve",
-    "transfer",
-)
 
 
 @dataclass(frozen=True)
@@ -156,10 +149,9 @@ def outcomes(
 def regime_fitness(
     regime: Regime, objectives: Sequence[Objective], seeds: Sequence[int]
 ) -> dict[str, dict[str, np.ndarray]]:
-    """{objective: {fitness: [S]}} of agents trained in a regime with each, one a seed; see `FITNESSES`.
+    """{objective: {fitness: [S]}} of agents trained in a regime with each, one a seed.
 
-    Returns are without reward noise. "area under the curve" is the mean over the training of the
-    return with mode actions; "transfer" is the return in the bandit's evaluation environment.
+    Fitnesses go by their labels, in the order of `lpo.fitness.FITNESSES`.
     """
     check_names(objectives)
     check_seeds(seeds)
@@ -167,7 +159,7 @@ def regime_fitness(
     for family in families(objectives):
         of_family = np.asarray(_family_fitness(regime, family, seeds), np.float64)
         for objective, of_it in zip(family, of_family, strict=True):
-            found[objective.name] = dict(zip(FITNESSES, of_it.T, strict=True))
+            found[objective.name] = dict(zip(LABELS, of_it.T, strict=True))
     return found
 
 
@@ -192,6 +184,10 @@ def _program(regime: Regime, drift: Drift, size: int) -> Callable[..., Any]:
     """
     task = regime.task(Objective("any", drift, None))
     home, home_params = make(task.home)
+    along = list(dict.fromkeys(f.judge for f in FITNESSES.values() if f.along))
+    at_end = [
+        judge for judge in dict.fromkeys(f.judge for f in FITNESSES.values()) if judge not in along
+    ]
 
     def train(
         parameters: Any,
@@ -200,29 +196,29 @@ def _program(regime: Regime, drift: Drift, size: int) -> Callable[..., Any]:
         env_params: Any,
         training_params: Any,
     ) -> jax.Array:
-        def returns(state: Any, key: jax.Array, mode: bool) -> jax.Array:
-            episodes = task.agent.evaluate(
-                state, key, task.evaluation_episodes, task.env, env_params, mode=mode
-            )
-            return episodes.returns.mean()
+        def returns(
+            state: Any, key: jax.Array, judges: Sequence[tuple[bool, bool]]
+        ) -> dict[tuple[bool, bool], jax.Array]:
+            """{judge: mean return}."""
+            found = {}
+            for judge, key_judge in zip(judges, split_key(key, len(judges)), strict=True):
+                at_home, mode = judge
+                env, params = (home, home_params) if at_home else (task.env, env_params)
+                number = 20 if at_home else task.evaluation_episodes
+                episodes = task.agent.evaluate(state, key_judge, number, env, params, mode=mode)
+                found[judge] = episodes.returns.mean()
+            return found
 
-        key_train, key_sampled, key_home = split_key(root_key(seed), 3)
-        state, curve = task.agent.train_with_evaluations(
+        key_train, key_end = split_key(root_key(seed))
+        state, measured = task.agent.train_with_evaluations(
             key_train,
             replace(hyperparameters, drift=parameters),
             training_params,
-            lambda state, key: returns(state, key, mode=True),
+            lambda state, key: returns(state, key, along),
             every=task.area_every,
         )
-        transferred = task.agent.evaluate(state, key_home, 20, home, home_params, mode=True)
-        return jnp.stack(
-            [
-                returns(state, key_sampled, mode=False),
-                curve[-1],
-                curve[1:].mean(),
-                transferred.returns.mean(),
-            ]
-        )
+        measured |= {judge: x[None] for judge, x in returns(state, key_end, at_end).items()}
+        return jnp.stack([f.of(measured[f.judge]) for f in FITNESSES.values()])
 
     return map_population(train, size, (0, 0, None, None, None))
 
@@ -350,7 +346,7 @@ def measure_alignment(
         fitness = regime_fitness(regime, objectives, seeds)
         correlations = {
             name: asdict(alignment({o: x[name] for o, x in fitness.items()}, outcome))
-            for name in FITNESSES
+            for name in LABELS
         }
         report["regimes"].append(
             {
@@ -358,8 +354,7 @@ def measure_alignment(
                 **asdict(regime),
                 "alignment": correlations,
                 "mean_fitness": {
-                    o: {name: float(x[name].mean()) for name in FITNESSES}
-                    for o, x in fitness.items()
+                    o: {name: float(x[name].mean()) for name in LABELS} for o, x in fitness.items()
                 },
                 "seconds": round(watch.lap(), 1),
             }

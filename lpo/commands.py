@@ -14,9 +14,10 @@ import tyro
 from rich.table import Table
 
 from lpo import figures, learning
-from lpo.alignment import FITNESSES, Regime, correlation_text, known_drifts, measure_alignment
+from lpo.alignment import Regime, correlation_text, known_drifts, measure_alignment
 from lpo.certificate import certify
 from lpo.distill import DistillConfig, distill
+from lpo.fitness import LABELS
 from lpo.generalization import (
     Comparison,
     LearningCurves,
@@ -122,9 +123,9 @@ def meta_train_command(
       out: folder to write; must be new or empty.
       resume: a run folder to continue; its settings apply, and a flag that contradicts them is an
         error.
-      fitness: return (of the trained agent where it was trained, without noise), area (the mean of
-        that over the training), or transfer (return of the bandit-trained agent in the bandit's
-        evaluation environment).
+      fitness: return (of the trained agent where it was trained, without noise), return-sampled (with
+        sampled actions rather than the most likely ones), area (the mean over the training), or
+        transfer (return of the bandit-trained agent in the bandit's evaluation environment).
       reward_noise: noise on the bandit's reward, in its standard deviations. Without it the drift
         overfits the bandit.
       base: ppo (the network corrects PPO's clip) or none.
@@ -448,9 +449,9 @@ def align(
     report = measure_alignment(
         regimes, family, target, seeds, steps, backend, policy_output_scale, printer.print
     )
-    table = Table("regime", *FITNESSES, title=f"Spearman's correlation with {target} [95 %]")
+    table = Table("regime", *LABELS, title=f"Spearman's correlation with {target} [95 %]")
     for row in report["regimes"]:
-        cells = (row["alignment"][fitness] for fitness in FITNESSES)
+        cells = (row["alignment"][fitness] for fitness in LABELS)
         table.add_row(row["name"], *(correlation_text(cell) for cell in cells))
     printer.print(table)
     if out is not None:

@@ -12,13 +12,14 @@ makes it rank objectives almost as the environment does.
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
 
 from lpo.drift import Drift, LearnedDrift
+from lpo.fitness import FITNESSES, Fitness
 from lpo.suite import REFERENCES, random_return
 from scb.agents.hyperparameters import check_lists, sample_hyperparameters
 from scb.agents.ppo import PPO, PPOConfig, PPOHyperparameters, PPOState
@@ -32,10 +33,8 @@ from scb.evolution import EnvironmentSteps, EvolutionConfig, Outcome, evolve
 from scb.keys import key_at, root_key, split_key
 from scb.runs import Run
 
-Fitness = Literal["return", "area", "transfer"]
 # Agents that judge a mean on the environment, where each costs a training there.
 VALIDATION_AGENTS = 16
-FITNESSES: tuple[Fitness, ...] = ("return", "area", "transfer")
 
 
 @dataclass(frozen=True)
@@ -48,8 +47,9 @@ class MetaTrainingConfig:
       drift: the learned drift's family.
       initial_scale: factor on the output layer's random start, so that the search begins near the
         base.
-      fitness: "return": of the trained agent where it was trained, without reward noise; "area":
-        the mean of that over the training; "transfer": in the bandit's evaluation environment.
+      fitness: one of `lpo.fitness.FITNESSES`, by name. "return": of the trained agent where it was
+        trained, without reward noise; "area": the mean of that over the training; "transfer": in
+        the bandit's evaluation environment.
       agent: PPO's static configuration; None takes `inner_loop(environment, contexts)`.
       contexts: size of a batch on a bandit.
       horizons: how long inner agents train, as fractions of the setting's number of updates; one is
@@ -63,7 +63,6 @@ class MetaTrainingConfig:
         take none.
       agents_per_candidate: inner agents whose mean is a candidate's fitness.
       evaluation_episodes: of each inner agent; None takes 50 where they are of one step, else 20.
-      mode_actions: evaluate the most likely actions rather than sampled ones.
       validation: judge the mean of the search distribution by agents trained with it in the tasks'
         evaluation environments, on the settings of those, rather than by fitness; several count by
         their normalised scores (`lpo.suite`). The longer a search
@@ -78,7 +77,7 @@ class MetaTrainingConfig:
     tasks: tuple[str, ...] = ("Synthetic-Pendulum-v1",)
     drift: LearnedDrift = field(default_factory=LearnedDrift)
     initial_scale: float = 0.1
-    fitness: Fitness = "return"
+    fitness: str = "return"
     agent: PPOConfig | None = None
     contexts: int = 200
     horizons: tuple[float, ...] = ()
@@ -88,7 +87,6 @@ class MetaTrainingConfig:
     reward_noise: float = 5.0
     agents_per_candidate: int = 4
     evaluation_episodes: int | None = None
-    mode_actions: bool = True
     validation: bool = False
     backend: str | None = None
     evolution: EvolutionConfig = field(
@@ -105,9 +103,9 @@ class MetaTrainingConfig:
         for name in self.tasks:
             if self.tasks.count(name) > 1:
                 raise UserError(f"the task {name} is there twice: give each once.")
-            if self.fitness == "transfer" and home_of(name) is None:
+            if self.judgement.at_home and home_of(name) is None:
                 raise UserError(
-                    f"fitness 'transfer' asks for a bandit, and {name!r} is none: use 'return' or 'area', or "
+                    f"fitness {self.fitness!r} asks for a bandit, and {name!r} is none: use 'return' or 'area', or "
                     f"train on 'Synthetic-{name}'."
                 )
         unknown = [name for name in self.homes if name not in REFERENCES]
@@ -120,9 +118,9 @@ class MetaTrainingConfig:
             raise UserError(
                 "one agent configuration does not fit several tasks: leave it out, and each takes its own."
             )
-        if self.horizons and self.fitness == "area":
+        if self.horizons and self.judgement.along:
             raise UserError(
-                "fitness 'area' needs trainings of one length: leave out the horizons, or use 'return'."
+                f"fitness {self.fitness!r} needs trainings of one length: leave out the horizons, or use 'return'."
             )
         for horizon in self.horizons:
             if not 0 < horizon < math.inf:
@@ -144,6 +142,11 @@ class MetaTrainingConfig:
             raise UserError(
                 f"reward_noise is {self.reward_noise}: it must be 0 or larger, and finite."
             )
+
+    @property
+    def judgement(self) -> Fitness:
+        """What `fitness` names."""
+        return FITNESSES[self.fitness]
 
     @property
     def homes(self) -> tuple[str, ...]:
@@ -192,7 +195,7 @@ class TaskTraining:
             elsewhere = len(config.tasks) > 1 and name not in BRAX_NAMES
             return {} if config.backend is None or elsewhere else {"backend": config.backend}
 
-        if config.fitness == "transfer":
+        if config.judgement.at_home:
             # The bandit has no physics; the environment that it stands for may.
             self.env, self.env_params = make(environment)
             self.evaluation_env, self.evaluation_params = make(self.home, **physics(self.home))
@@ -232,7 +235,7 @@ class TaskTraining:
         key: jax.Array,
         horizon: ArrayLike,
     ) -> jax.Array:
-        config = self.config
+        config, fitness = self.config, self.config.judgement
         key_train, key_evaluate = split_key(key)
         hyperparameters = replace(hyperparameters, drift=drift_parameters)
 
@@ -243,17 +246,17 @@ class TaskTraining:
                 self.evaluation_episodes,
                 self.evaluation_env,
                 self.evaluation_params,
-                mode=config.mode_actions,
+                mode=fitness.mode,
             ).returns.mean()
 
-        if config.fitness == "area":
+        if fitness.along:
             _, returns = self.agent.train_with_evaluations(
                 key_train, hyperparameters, self.training_params, judge, every=self.area_every
             )
-            return returns[1:].mean()
+            return fitness.of(returns)
         if not config.horizons:
             state = self.agent.train(key_train, hyperparameters, self.training_params)
-            return judge(state, key_evaluate)
+            return fitness.of(judge(state, key_evaluate)[None])
         iterations = jnp.round(jnp.asarray(horizon) * self.agent_config.num_iterations)
         iterations = jnp.maximum(1, iterations.astype(jnp.int32))
         hyperparameters = replace(hyperparameters, horizon=iterations)
@@ -261,7 +264,7 @@ class TaskTraining:
         state = self.agent.train_iterations(
             state, hyperparameters, self.training_params, iterations
         )
-        return judge(state, key_evaluate)
+        return fitness.of(judge(state, key_evaluate)[None])
 
     @property
     def area_every(self) -> int:
@@ -272,7 +275,7 @@ class TaskTraining:
     def steps(self) -> EnvironmentSteps:
         """Of one candidate; with random horizons the mean over them."""
         config, points = self.config, 1
-        if config.fitness == "area":
+        if config.judgement.along:
             points = self.agent_config.num_iterations // self.area_every + 1
         agents = config.agents_per_candidate
         share = sum(config.horizons) / len(config.horizons) if config.horizons else 1.0

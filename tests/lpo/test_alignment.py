@@ -10,7 +10,6 @@ import pytest
 from lpo import alignment as module
 from lpo import figures
 from lpo.alignment import (
-    FITNESSES,
     Regime,
     alignment,
     correlation_text,
@@ -19,6 +18,7 @@ from lpo.alignment import (
     other_drifts,
     regime_fitness,
 )
+from lpo.fitness import LABELS
 from lpo.generalization import training_setting
 from scb import plotting
 from scb.errors import UserError
@@ -130,7 +130,7 @@ def test_agents_of_a_regime_are_judged_in_every_way():
     ppo = known_drifts()[2]
     dpo = known_drifts()[-1]
     fitness = regime_fitness(TINY, [ppo, dpo], [1, 2, 3])[ppo.name]
-    assert tuple(fitness) == FITNESSES
+    assert tuple(fitness) == LABELS
     assert all(x.shape == (3,) and np.isfinite(x).all() for x in fitness.values())
     # In the bandit a return is one reward; on Pendulum 200 of down to -16.3.
     assert np.abs(fitness["return, mode actions"]).max() < 100
@@ -172,7 +172,7 @@ def test_the_report_holds_every_regime_and_is_drawn(monkeypatch, tmp_path):
         module,
         "regime_fitness",
         lambda regime, objectives, seeds: {
-            o.name: {name: regime.reward_noise * fixed[o.name] for name in FITNESSES}
+            o.name: {name: regime.reward_noise * fixed[o.name] for name in LABELS}
             for o in objectives
         },
     )

@@ -16,8 +16,8 @@ from gymnax.environments import spaces
 
 import lpo
 from lpo import cli, commands, learning
-from lpo.alignment import FITNESSES
 from lpo.drift import NoDrift
+from lpo.fitness import LABELS
 from lpo.generalization import LearningCurves
 from lpo.meta_training import MetaTrainingConfig
 from lpo.objectives import Objective, load_objective
@@ -630,7 +630,7 @@ def test_align_measures_every_combination_and_stores_it(monkeypatch, working_fol
         assert {"ppo-0.2", "none", "lpo-pendulum"} <= {o.name for o in objectives}
         assert (environment, seeds) == ("Pendulum-v1", [500, 501])
         cell = {"spearman": 0.5, "low": 0.25, "high": 0.75}
-        measured = {"alignment": dict.fromkeys(FITNESSES, cell)}
+        measured = {"alignment": dict.fromkeys(LABELS, cell)}
         rows = [{"name": str(r), "bandit": r.bandit, **measured} for r in regimes]
         return {
             "environment": environment,

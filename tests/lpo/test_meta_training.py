@@ -10,6 +10,7 @@ from gymnax.environments import spaces
 
 from lpo import meta_training
 from lpo.drift import LearnedDrift
+from lpo.fitness import FITNESSES, Fitness
 from lpo.meta_training import (
     MetaTraining,
     MetaTrainingConfig,
@@ -103,15 +104,45 @@ def test_the_same_code_trains_on_the_environment_itself(config):
     assert WORST_PENDULUM_RETURN < min(values) <= max(values) < -100
 
 
-def test_area_is_the_mean_over_the_training_without_the_untrained_agent(config):
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        # (1 + 2 + 6) / 3 = 3, and 27.25 with the untrained agent's 100.
+        ("area", 3.0),
+        ("worst", 1.0),
+    ],
+)
+def test_area_is_the_mean_over_the_training_and_a_new_fitness_is_one_entry(
+    config, monkeypatch, name, value
+):
+    worst = Fitness("worst", "worst point", along=True, of=lambda returns: returns.min())
+    monkeypatch.setitem(FITNESSES, "worst", worst)
+
     class Recorded:
         def train_with_evaluations(self, *arguments, every):
             return None, jnp.array([100.0, 1.0, 2.0, 6.0])
 
-    problem = TaskTraining(replace(config, fitness="area", reward_noise=0.0), PENDULUM)
+    problem = TaskTraining(replace(config, fitness=name, reward_noise=0.0), PENDULUM)
     problem.agent = Recorded()
-    # (1 + 2 + 6) / 3 = 3, and 27.25 with the untrained agent's 100.
-    assert problem.fitness({}, jax.random.key(0), 1).tolist() == [3.0]
+    assert problem.fitness({}, jax.random.key(0), 1).tolist() == [value]
+
+
+def test_a_fitness_says_which_actions_judge_and_where(config):
+    seen = []
+
+    class Recorded:
+        def train(self, *arguments):
+            return None
+
+        def evaluate(self, state, key, episodes, env, env_params, mode):
+            seen.append((type(env).__name__, mode))
+            return Episodes(*[jnp.full(episodes, -1.0)] * 2)
+
+    for name in ("return", "return-sampled", "transfer"):
+        problem = TaskTraining(replace(config, fitness=name, reward_noise=0.0), PENDULUM)
+        problem.agent = Recorded()
+        assert problem.fitness({}, jax.random.key(0), 1).tolist() == [-1.0]
+    assert seen == [("SyntheticBandit", True), ("SyntheticBandit", False), ("Pendulum", True)]
 
 
 # -- where it starts ----------------------------------------------------------------------------
