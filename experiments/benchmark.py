@@ -38,7 +38,7 @@ import numpy as np
 import scb
 from experiments.page import exit_status
 from lpo.cli import configure_jax
-from scb.agents.hyperparameters import inner_loop
+from scb.agents.spec import bandit_agent
 from scb.artefacts import flatten, machine_description, package_versions
 from scb.environments.zoo import PREFIX, open_bandit, space_description
 from scb.evolution import map_population
@@ -74,10 +74,9 @@ def bandit_of(task: Task) -> Any:
     return open_bandit(PREFIX + task.environment)
 
 
-def inner_loop_of(task: Task, bandit: Any, steps: int) -> Any:
+def spec_of(task: Task, steps: int) -> Any:
 
-    inner = inner_loop(task.algorithm, task.environment, bandit.action_space(), sampled=False)
-    return replace(inner, config=replace(inner.config, total_steps=steps))
+    return bandit_agent(task.algorithm, task.environment, sampled=False).with_steps(steps)
 
 
 def measure_this_project(task: Task, steps: int) -> dict[str, list[float]]:
@@ -89,12 +88,12 @@ def measure_this_project(task: Task, steps: int) -> dict[str, list[float]]:
 
     bandit = bandit_of(task)
     params = bandit.default_params
-    inner = inner_loop_of(task, bandit, steps)
-    agent = inner.agent(bandit)
+    spec = spec_of(task, steps)
+    agent = spec.agent(bandit)
     env, env_params = scb.make(task.environment)
 
     def train(key: jax.Array) -> Any:
-        state = agent.train(key, inner.hyperparameters, params)
+        state = agent.train(key, spec.hyperparameters, params)
         # What acting takes no part in stays behind.
         unused = {"optimizer", "environment", "buffer", "key"} & set(state.__dataclass_fields__)
         return replace(state, **dict.fromkeys(unused))
@@ -121,8 +120,8 @@ def measure_this_project(task: Task, steps: int) -> dict[str, list[float]]:
 def write_rejax_job(folder: Path, task: Task, steps: int) -> Path:
     """Writes the bandit and rejax's settings where the peer, which can't import this project, finds them."""
     bandit = bandit_of(task)
-    inner = inner_loop_of(task, bandit, steps)
-    algorithm, settings = rejax_settings(task.algorithm, inner, bandit.action_space())
+    spec = spec_of(task, steps)
+    algorithm, settings = rejax_settings(task.algorithm, spec, bandit.action_space())
     weights = folder / "bandit.npz"
     arrays: dict[str, Any] = {
         **flatten({k: dict(v) for k, v in bandit.default_params.weights.items()})
@@ -147,9 +146,9 @@ def write_rejax_job(folder: Path, task: Task, steps: int) -> Path:
     return path
 
 
-def rejax_settings(algorithm: str, inner: Any, space: Any) -> tuple[str, dict[str, Any]]:
+def rejax_settings(algorithm: str, spec: Any, space: Any) -> tuple[str, dict[str, Any]]:
     """rejax's algorithm and its arguments for this project's configuration and hyperparameters."""
-    config, numbers = inner.config, inner.hyperparameters
+    config, numbers = spec.config, spec.hyperparameters
     activation = {"activation": config.activation}
     settings: dict[str, Any] = {
         "num_envs": config.num_envs,

@@ -24,8 +24,7 @@ from experiments import zoo_table, zoo_table_page
 from experiments.page import Experiment, Save, table, text
 from experiments.page import main as run
 from scb import plotting
-from scb.agents.hyperparameters import inner_loop
-from scb.agents.settings import environment_setting
+from scb.agents.spec import bandit_agent, environment_agent
 from scb.environments.zoo import bandit_metadata, open_bandit
 from scb.evolution import map_population
 from scb.importer import PUBLISHED_BANDITS, published_bandit
@@ -104,10 +103,10 @@ def _in_bandit(
         assert folder is not None
         bandit = published_bandit(folder / f"{name}.npz")
         digest = zoo_table.arrays_digest(folder / f"{name}.npz")
-    inner = inner_loop(algorithm, environment, env.action_space(env_params))
+    spec = bandit_agent(algorithm, environment)
     curves = _curves(
-        inner.agent(bandit),
-        inner.hyperparameters,
+        spec.agent(bandit),
+        spec.hyperparameters,
         bandit.default_params,
         env,
         env_params,
@@ -122,14 +121,11 @@ def _in_environment(
 ) -> dict[str, Any]:
 
     env, env_params = scb.make(environment, backend)
-    setting = environment_setting(environment, algorithm)
-    setting = replace(
-        setting, config=replace(setting.config, total_steps=plan["environment_steps"])
-    )
+    spec = environment_agent(algorithm, environment).with_steps(plan["environment_steps"])
     return _curves(
-        setting.agent(env),
-        setting.hyperparameters,
-        setting.training_params(env_params),
+        spec.agent(env),
+        spec.hyperparameters,
+        spec.training_params(env_params),
         env,
         env_params,
         plan["environment_agents"],

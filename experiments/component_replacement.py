@@ -19,7 +19,7 @@ import scb
 from experiments.page import Experiment, Save, finite, table, text
 from experiments.page import main as run
 from scb import plotting
-from scb.agents.hyperparameters import inner_loop
+from scb.agents.spec import bandit_agent
 from scb.analysis import components
 from scb.analysis.states import follow
 from scb.discovery import SyntheticTraining, judge
@@ -64,7 +64,7 @@ def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None
     env, env_params = scb.make(ENVIRONMENT)
     space = env.action_space(env_params)
     bandit = open_bandit(f"Synthetic-{ENVIRONMENT}")
-    inner = inner_loop("ppo", ENVIRONMENT, space)
+    spec = bandit_agent("ppo", ENVIRONMENT)
     key_random, key_experts = split_key(root_key(EXPERT_SEED))
 
     def counted(returns: Any) -> list[float]:
@@ -76,7 +76,7 @@ def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None
     def learn(reward: Any, states: Any) -> list[float]:
         """Returns of agents trained in the bandit with these parts replaced."""
         replaced = components.ReplacedBandit(bandit, reward, states)
-        training = SyntheticTraining(replaced, env, env_params, inner)
+        training = SyntheticTraining(replaced, env, env_params, spec)
         weights = bandit.default_params.weights
         (returns,) = judge(
             training, weights, REPORTING_SEED, plan["agents"], plan["episodes"], mode=True
@@ -93,9 +93,9 @@ def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None
             env,
             env_params,
             key_agents,
-            inner.sample(key_draw, plan["agents"]).learning_rate,
+            spec.sample(key_draw, plan["agents"]).learning_rate,
             plan["episodes"],
-            inner.config.activation,
+            spec.config.activation,
         )
         return counted(returns)
 

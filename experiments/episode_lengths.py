@@ -20,7 +20,7 @@ from experiments.page import main as run
 from experiments.searches import PAPER_SIZES
 from lpo.suite import REFERENCES, random_return
 from scb import plotting
-from scb.agents.hyperparameters import algorithms_for, inner_loop
+from scb.agents.spec import algorithms_for, bandit_agent
 from scb.curriculum import paper_curriculum
 from scb.discovery import DiscoveryConfig, SyntheticTraining
 from scb.evolution import map_population
@@ -74,7 +74,7 @@ def _measure_limit(
             problem.bandit,
             problem.env,
             problem.env_params,
-            inner_loop(algorithm, environment, space),
+            bandit_agent(algorithm, environment),
         )
         judged, lengths = returns_and_lengths(
             training, outcome.mean, root_key(JUDGE_SEED), plan["agents"], plan["episodes"]
@@ -105,7 +105,7 @@ def returns_and_lengths(
         episodes = training.agent.evaluate(state, key_act, num_episodes, env_params=params)
         return returns.mean(), episodes.lengths
 
-    hyperparameters = training.inner.sample(key_draw, num_agents)
+    hyperparameters = training.spec.sample(key_draw, num_agents)
     keys = split_key(key_agents, num_agents)
     returns, lengths = map_population(one, num_agents, (0, 0, None))(hyperparameters, keys, weights)
     return np.asarray(returns), np.asarray(lengths)

@@ -16,7 +16,7 @@ import scb
 from experiments.page import CLASSIC_CONTROL, Experiment, Save, table, text
 from experiments.page import main as run
 from scb import plotting
-from scb.agents.settings import environment_setting
+from scb.agents.spec import environment_agent
 from scb.analysis.components import SACExpert, train_sac_expert
 from scb.evaluation import evaluate
 from scb.keys import root_key
@@ -56,13 +56,13 @@ def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None
                 evaluate(env, env_params, expert.policy(), key, plan["evaluations"]).returns
             )
         )(root_key(JUDGE_SEED))
-        setting = environment_setting(environment, "sac")
+        spec = environment_agent("sac", environment)
         found[environment] = {
             "returns": np.round(np.asarray(returns), 2).tolist(),
             "selection": round(expert.mean_return, 2),
-            "steps": setting.num_environment_steps,
-            "episode_limit": setting.episode_limit,
-            "setting": setting.source,
+            "steps": spec.steps,
+            "episode_limit": spec.episode_limit,
+            "setting": spec.source,
             "seconds": round(seconds, 1),
         }
         save()

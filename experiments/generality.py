@@ -24,7 +24,7 @@ from experiments.page import main as run
 from experiments.searches import PAPER_SIZES
 from lpo.suite import REFERENCES, random_return
 from scb import plotting
-from scb.agents.hyperparameters import InnerLoop, algorithms_for, inner_loop
+from scb.agents.spec import AgentSpec, algorithms_for, bandit_agent
 from scb.analysis.optimal_actions import optimal_policy
 from scb.curriculum import paper_curriculum
 from scb.discovery import DiscoveryConfig
@@ -154,13 +154,11 @@ class _Trainer:
         if agent == EVOLVED:
             return self._evolved(key)
         algorithm, _, network = agent.partition(", ")
-        return self._trained(
-            with_network(inner_loop(algorithm, self.environment, self.space), network), key
-        )
+        return self._trained(with_network(bandit_agent(algorithm, self.environment), network), key)
 
-    def _trained(self, inner: InnerLoop, key: Any) -> np.ndarray:
+    def _trained(self, spec: AgentSpec, key: Any) -> np.ndarray:
 
-        agent, episodes = inner.agent(self.trained_in), self.plan["episodes"]
+        agent, episodes = spec.agent(self.trained_in), self.plan["episodes"]
         key_draw, key_agents = split_key(key)
         number = self.plan["agents"]
 
@@ -171,7 +169,7 @@ class _Trainer:
                 state, key_judge, episodes, self.env, self.env_params, mode=True
             ).returns.mean()
 
-        hyperparameters = inner.sample(key_draw, number)
+        hyperparameters = spec.sample(key_draw, number)
         keys = split_key(key_agents, number)
         judge = map_population(judged, number, (0, 0, None))
         return np.asarray(judge(hyperparameters, keys, self.trained_in_params))
@@ -208,14 +206,15 @@ def in_environment(config: NeuroevolutionConfig, limit: int) -> NeuroevolutionCo
     return replace(config, episodes=1, num_generations=generations)
 
 
-def with_network(inner: InnerLoop, network: str) -> InnerLoop:
+def with_network(spec: AgentSpec, network: str) -> AgentSpec:
     """The same algorithm with one of the networks that no search saw, or with its own."""
+
     changes: dict[str, dict[str, Any]] = {
         "": {},
         WIDE: {"hidden_sizes": (512,)},
         SWISH: {"activation": "swish"},
     }
-    return replace(inner, config=replace(inner.config, **changes[network]))
+    return spec.with_values(**changes[network])
 
 
 def columns(entry: Mapping[str, list[float]]) -> dict[str, np.ndarray]:

@@ -26,11 +26,11 @@ from matplotlib.ticker import EngFormatter, LogLocator, NullFormatter, StrMethod
 
 from experiments.page import exit_status, read, text
 from lpo.cli import configure_jax
-from lpo.generalization import compare, training_setting
+from lpo.generalization import compare
 from lpo.learning import objective_of_run
 from lpo.objectives import Objective, load_objective
 from scb import plotting
-from scb.agents.settings import Setting
+from scb.agents.spec import AgentSpec, environment_agent
 from scb.artefacts import machine_description, package_versions
 from scb.errors import UserError
 from scb.runs import write_json
@@ -332,10 +332,10 @@ def measure(preset: str, runs: Path, out: Path, report: dict[str, Any]) -> None:
             write_json(out, report)
     for label, scale in SCALES.items():
         table = evaluations.setdefault(f"Pendulum, {label}", {})
-        setting = training_setting("Pendulum-v1", policy_output_scale=scale)
+        spec = environment_agent("ppo", "Pendulum-v1").with_values(policy_output_scale=scale)
         if "tuned" not in table:
-            table |= _tuned_clip(setting, plan["tuning_agents"])
-        _judge(table, "Pendulum-v1", table["tuned"], groups, plan["agents"], setting)
+            table |= _tuned_clip(spec, plan["tuning_agents"])
+        _judge(table, "Pendulum-v1", table["tuned"], groups, plan["agents"], spec)
         write_json(out, report)
     hopper = plan["hopper"]
     backend, steps = hopper["backend"], hopper["steps"]
@@ -348,7 +348,7 @@ def measure(preset: str, runs: Path, out: Path, report: dict[str, Any]) -> None:
         carried,
         first,
         hopper["agents"],
-        training_setting("hopper", steps, 1.0),
+        environment_agent("ppo", "hopper").with_steps(steps).with_values(policy_output_scale=1.0),
         backend,
     )
     write_json(out, report)
@@ -383,13 +383,13 @@ def _curve_of(folder: Path) -> dict[str, Any]:
     return search_curve(lines[0], [line["seconds"] for line in lines[1]])
 
 
-def _tuned_clip(setting: Setting, agents: int) -> dict[str, Any]:
+def _tuned_clip(spec: AgentSpec, agents: int) -> dict[str, Any]:
     """{"tuned": the best of CLIPS on agents that report nothing, "sweep": what each earned}."""
     curves = compare(
         "Pendulum-v1",
         [load_objective(clip) for clip in CLIPS],
         list(range(TUNING_SEED, TUNING_SEED + agents)),
-        setting=setting,
+        spec=spec,
         points=1,
     ).curves
     sweep = {c.objective: float(iqm(c.final)) for c in curves}
@@ -402,7 +402,7 @@ def _judge(
     tuned: str,
     groups: Mapping[str, Sequence[_Learned]],
     agents: int,
-    setting: Setting,
+    spec: AgentSpec,
     backend: str | None = None,
 ) -> None:
     """Trains agents with PPO, the tuned clip, DPO and searches that the table lacks, and adds them to it."""
@@ -420,7 +420,7 @@ def _judge(
         environment,
         [objective for group in lacking.values() for objective in group],
         seeds,
-        setting=setting,
+        spec=spec,
         backend=backend,
         points=15,
     ).curves
@@ -436,7 +436,7 @@ def _judge(
     table["seeds"] = seeds
     table["protocol"] = (
         f"{environment}{physics}: {agents} agents an objective (and search), {curves[0].steps[-1]:,} steps, policy's "
-        f"last layer times {setting.hyperparameters.policy_output_scale:g} at initialisation."
+        f"last layer times {spec.hyperparameters.policy_output_scale:g} at initialisation."
     )
 
 

@@ -23,10 +23,11 @@ from matplotlib.ticker import MaxNLocator
 
 from experiments.page import exit_status, read, text
 from lpo.cli import configure_jax
-from lpo.generalization import compare, training_setting
+from lpo.generalization import compare
 from lpo.learning import objective_of_run
 from lpo.objectives import load_objective
 from scb import plotting
+from scb.agents.spec import environment_agent
 from scb.artefacts import machine_description, package_versions
 from scb.errors import UserError
 from scb.plotting import BLUE, GREY, VERMILLION, estimate_row, figure_style
@@ -298,9 +299,9 @@ def _measure(
             evaluation.environment,
             list(objectives.values()),
             evaluation.seed_list(),
-            setting=training_setting(
-                evaluation.environment, evaluation.steps, evaluation.policy_output_scale
-            ),
+            spec=environment_agent("ppo", evaluation.environment)
+            .with_steps(evaluation.steps)
+            .with_values(policy_output_scale=evaluation.policy_output_scale),
             backend=evaluation.backend,
             points=1,
         )

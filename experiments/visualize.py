@@ -22,7 +22,7 @@ from experiments.page import CLASSIC_CONTROL, Experiment, Save, packed, table, t
 from experiments.page import main as run
 from lpo.suite import REFERENCES
 from scb import plotting
-from scb.agents.hyperparameters import inner_loop
+from scb.agents.spec import bandit_agent
 from scb.analysis import animation
 from scb.analysis.animation import picture, save_gif
 from scb.analysis.states import follow
@@ -54,15 +54,15 @@ def _show(name: str, plan: Mapping[str, Any]) -> dict[str, Any]:
     environment = "hopper" if brax else name
     env, env_params = scb.make(environment, **({"backend": "spring"} if brax else {}))
     bandit = open_bandit(f"Synthetic-{environment}")
-    inner = inner_loop("ppo", environment, env.action_space(env_params), sampled=False)
-    agent = inner.agent(bandit)
+    spec = bandit_agent("ppo", environment, sampled=False)
+    agent = spec.agent(bandit)
     key_train, key_choose, key_show = split_key(root_key(plan["seed"]), 3)
     episodes = plan["brax_episodes"] if brax else plan["episodes"]
 
     @jax.jit
     @jax.vmap
     def train(key: Any) -> Any:
-        state = agent.train(key, inner.hyperparameters, bandit.default_params)
+        state = agent.train(key, spec.hyperparameters, bandit.default_params)
         found = agent.evaluate(state, key_choose, episodes, env, env_params, mode=True)
         return state, found.returns.mean()
 

@@ -22,7 +22,7 @@ import numpy as np
 from experiments.page import exit_status
 from lpo.cli import configure_jax
 from scb import make
-from scb.agents.hyperparameters import algorithms_for, inner_loop
+from scb.agents.spec import algorithms_for, bandit_agent
 from scb.artefacts import machine_description, package_versions
 from scb.discovery import SyntheticTraining, judge
 from scb.environments.synthetic import BanditConfig, bandit_for
@@ -108,7 +108,7 @@ def main() -> int:
                 bandit_for(env, env_params, BanditConfig(), name),
                 env,
                 env_params,
-                inner_loop(algorithm, name, space),
+                bandit_agent(algorithm, name),
             )
             for algorithm in arguments.algorithms or algorithms_for(space)
         }

@@ -36,7 +36,7 @@ from experiments.zoo_table_page import (
     render,
 )
 from lpo.cli import configure_jax
-from scb.agents.hyperparameters import algorithms_for, inner_loop
+from scb.agents.spec import algorithms_for, bandit_agent
 from scb.artefacts import machine_description, package_versions
 from scb.commands import FIRST_REPORTING_SEED
 from scb.discovery import SyntheticTraining, check_fits, judge
@@ -163,7 +163,7 @@ def measure(
         check_fits(candidate.bandit, env, env_params, environment)
         space = env.action_space(env_params)
         for algorithm in algorithms_for(space):
-            inner = inner_loop(algorithm, environment, space)
+            spec = bandit_agent(algorithm, environment)
             row: dict[str, Any] = {
                 "environment": environment,
                 "algorithm": algorithm,
@@ -173,14 +173,14 @@ def measure(
                 "episodes": protocol.brax_episodes if brax else protocol.episodes,
                 "seed": FIRST_REPORTING_SEED,
                 "backend": protocol.backend if brax else None,
-                "training_steps": inner.steps,
-                "inner_loop": repr(inner),
+                "training_steps": spec.steps,
+                "inner_loop": repr(spec),
             }
             if any(row.items() <= _comparable(entry).items() for entry in entries):
                 continue
             key = (candidate.bandit.config, algorithm)
             if key not in trainings:
-                trainings[key] = SyntheticTraining(candidate.bandit, env, env_params, inner)
+                trainings[key] = SyntheticTraining(candidate.bandit, env, env_params, spec)
             start = time.perf_counter()
             returns = judge(
                 trainings[key],

@@ -23,12 +23,11 @@ from lpo.generalization import (
     compare,
     families,
     over_objectives,
-    training_setting,
 )
-from lpo.meta_training import MetaTrainingConfig, TaskTraining, inner_loop
+from lpo.meta_training import MetaTrainingConfig, TaskTraining, task_agent
 from lpo.objectives import Objective
 from scb.agents.ppo import PPOHyperparameters
-from scb.agents.settings import environment_setting
+from scb.agents.spec import AgentSpec, environment_agent
 from scb.artefacts import machine_description, package_versions
 from scb.environments.registry import make
 from scb.environments.zoo import home_of
@@ -71,25 +70,22 @@ class Regime:
             if value is not None and value < 1:
                 raise UserError(f"{name} is {value}: it must be at least 1.")
 
+    def spec(self) -> AgentSpec:
+        """Of its agents: the setting's own but for what is given here."""
+        return task_agent(self.bandit, self.contexts).with_values(
+            total_steps=None if self.iterations is None else self.contexts * self.iterations,
+            num_epochs=self.epochs,
+            num_minibatches=self.minibatches,
+            learning_rate=self.learning_rate,
+            policy_output_scale=self.policy_output_scale,
+        )
+
     def task(self, objective: Objective) -> TaskTraining:
         """The inner loop with this objective."""
-        agent = inner_loop(self.bandit, self.contexts)
-        agent = replace(
-            agent,
-            total_steps=self.contexts * (self.iterations or agent.num_iterations),
-            num_epochs=self.epochs or agent.num_epochs,
-            num_minibatches=self.minibatches or agent.num_minibatches,
-        )
         config = MetaTrainingConfig(
-            tasks=(self.bandit,), agent=agent, reward_noise=self.reward_noise
+            tasks=(self.bandit,), agent=self.spec().config, reward_noise=self.reward_noise
         )
         return TaskTraining(config, self.bandit, objective.drift)
-
-    def hyperparameters(self) -> PPOHyperparameters:
-        """Of its agents: the setting's own but for what is given here."""
-        own = environment_setting(str(home_of(self.bandit))).hyperparameters
-        given = {name: getattr(self, name) for name in ("learning_rate", "policy_output_scale")}
-        return replace(own, **{name: x for name, x in given.items() if x is not None})
 
     def static(self) -> "Regime":
         """The regime without what is traced: those that are equal here share a program."""
@@ -141,8 +137,12 @@ def outcomes(
     policy_output_scale: float | None = None,
 ) -> dict[str, np.ndarray]:
     """{objective: [S] return of PPO trained with it}, mode actions; arguments as `learning_curves`."""
-    setting = training_setting(environment, steps, policy_output_scale)
-    comparison = compare(environment, objectives, seeds, setting=setting, backend=backend, points=1)
+    spec = (
+        environment_agent("ppo", environment)
+        .with_steps(steps)
+        .with_values(policy_output_scale=policy_output_scale)
+    )
+    comparison = compare(environment, objectives, seeds, spec=spec, backend=backend, points=1)
     return {curves.objective: curves.final for curves in comparison.curves}
 
 
@@ -169,7 +169,11 @@ def _family_fitness(regime: Regime, family: Sequence[Objective], seeds: Sequence
     program = _program(regime.static(), family[0].drift, len(family) * len(seeds))
     return over_objectives(
         lambda parameters, every_seed: program(
-            parameters, every_seed, regime.hyperparameters(), task.env_params, task.training_params
+            parameters,
+            every_seed,
+            regime.spec().hyperparameters,
+            task.env_params,
+            task.training_params,
         ),
         family,
         seeds,

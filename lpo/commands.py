@@ -24,7 +24,6 @@ from lpo.generalization import (
     check_names,
     compare,
     learning_curves,
-    training_setting,
 )
 from lpo.objectives import Objective, load_objective, save_objective
 from lpo.pipeline import PRESETS as RUN_PRESETS
@@ -32,6 +31,7 @@ from lpo.pipeline import check_settings, run_pipeline
 from lpo.suite import run_suite
 from lpo.suite import suite as suite_environments
 from scb import plotting
+from scb.agents.spec import environment_agent
 from scb.artefacts import machine_description, package_versions
 from scb.console import console
 from scb.environments.zoo import home_of
@@ -223,7 +223,9 @@ def train(
         environment,
         load_objective(objective),
         seed_list(seeds, seed),
-        setting=training_setting(environment, steps, policy_output_scale),
+        spec=environment_agent("ppo", environment)
+        .with_steps(steps)
+        .with_values(policy_output_scale=policy_output_scale),
         backend=backend,
         mode_actions=not sampled_actions,
     )
@@ -289,7 +291,9 @@ def evaluate(
         environment,
         loaded,
         seed_list(seeds, seed),
-        setting=training_setting(environment, steps, policy_output_scale),
+        spec=environment_agent("ppo", environment)
+        .with_steps(steps)
+        .with_values(policy_output_scale=policy_output_scale),
         backend=backend,
         mode_actions=not sampled_actions,
     )

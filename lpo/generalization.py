@@ -5,7 +5,6 @@ episodes, so that differences are paired. Final scores are interquartile means w
 intervals.
 """
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -16,7 +15,7 @@ import numpy as np
 
 from lpo.objectives import Objective
 from scb.agents.ppo import PPO, PPOConfig
-from scb.agents.settings import Setting, environment_setting
+from scb.agents.spec import AgentSpec, environment_agent
 from scb.environments.registry import make
 from scb.errors import UserError
 from scb.evolution import map_population
@@ -90,29 +89,6 @@ def evaluation_interval(num_iterations: int, points: int) -> int:
     return min(divisors, key=lambda n: abs(num_iterations / n - points))
 
 
-def training_setting(
-    environment: str, total_steps: int | None = None, policy_output_scale: float | None = None
-) -> Setting:
-    """The environment's PPO setting, with another number of steps or initialisation where one is given."""
-    setting = environment_setting(environment)
-    if total_steps is not None:
-        if total_steps < 1:
-            raise UserError(f"steps is {total_steps}: it must be at least 1.")
-        setting = replace(setting, config=replace(setting.config, total_steps=total_steps))
-    if policy_output_scale is not None:
-        if not 0 <= policy_output_scale < math.inf:
-            raise UserError(
-                f"policy_output_scale is {policy_output_scale}: it must be 0 or larger, and finite."
-            )
-        setting = replace(
-            setting,
-            hyperparameters=replace(
-                setting.hyperparameters, policy_output_scale=policy_output_scale
-            ),
-        )
-    return setting
-
-
 def _rounded_to_points(config: PPOConfig, points: int) -> PPOConfig:
     evaluations = config.num_iterations / evaluation_interval(config.num_iterations, points)
     if points / 2 <= evaluations <= points * 2:
@@ -136,7 +112,7 @@ def learning_curves(
     environment: str,
     objective: Objective,
     seeds: Sequence[int],
-    setting: Setting | None = None,
+    spec: AgentSpec | None = None,
     backend: str | None = None,
     points: int = 15,
     episodes: int = 20,
@@ -148,7 +124,7 @@ def learning_curves(
       environment: a name that `scb.make` takes.
       objective: what replaces PPO's surrogate.
       seeds: one agent each; the same seeds pair agents of different objectives.
-      setting: PPO's; the environment's own where None. Where its number of batches has no divisor that
+      spec: PPO's; the environment's own where None. Where its number of batches has no divisor that
         gives about `points` evaluations, it is rounded up to a multiple of `points`.
       backend: Brax physics ("generalized", "positional", "spring"); only for Brax environments.
       points: about how many evaluations along the training, the untrained agent not counted.
@@ -159,7 +135,7 @@ def learning_curves(
         environment,
         [objective],
         seeds,
-        setting,
+        spec,
         backend,
         points,
         episodes,
@@ -203,7 +179,7 @@ def _family_curves(
     environment: str,
     objectives: Sequence[Objective],
     seeds: Sequence[int],
-    setting: Setting | None = None,
+    spec: AgentSpec | None = None,
     backend: str | None = None,
     points: int = 15,
     episodes: int = 20,
@@ -215,8 +191,8 @@ def _family_curves(
         if value < 1:
             raise UserError(f"{name} is {value}: it must be at least 1.")
     env, env_params = make(environment, backend)
-    setting = setting or environment_setting(environment)
-    config = _rounded_to_points(setting.config, min(points, setting.config.num_iterations))
+    spec = spec or environment_agent("ppo", environment)
+    config = _rounded_to_points(spec.config, min(points, spec.config.num_iterations))
     agent = PPO(env, config, objectives[0].drift)
     every = evaluation_interval(config.num_iterations, points)
 
@@ -226,7 +202,7 @@ def _family_curves(
                 state, key, episodes, env_params=env_params, mode=mode_actions
             ).returns.mean()
 
-        hyperparameters = replace(setting.hyperparameters, drift=parameters)
+        hyperparameters = replace(spec.hyperparameters, drift=parameters)
         _, returns = agent.train_with_evaluations(
             root_key(seed), hyperparameters, env_params, judge, every
         )
@@ -246,7 +222,7 @@ def _family_curves(
             list(seeds),
             episodes,
             mode_actions,
-            float(setting.hyperparameters.policy_output_scale),
+            float(spec.hyperparameters.policy_output_scale),
         )
         for objective, of_it in zip(objectives, returns, strict=True)
     ]

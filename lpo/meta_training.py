@@ -21,9 +21,8 @@ from jax.typing import ArrayLike
 from lpo.drift import Drift, LearnedDrift
 from lpo.fitness import FITNESSES, Fitness
 from lpo.suite import REFERENCES, random_return
-from scb.agents.hyperparameters import check_lists, sample_hyperparameters
-from scb.agents.ppo import PPO, PPOConfig, PPOHyperparameters, PPOState
-from scb.agents.settings import environment_setting
+from scb.agents.ppo import PPOConfig, PPOHyperparameters, PPOState
+from scb.agents.spec import AgentSpec, check_lists, environment_agent
 from scb.environments.brax import BRAX_NAMES
 from scb.environments.registry import make
 from scb.environments.synthetic import SyntheticBandit
@@ -50,7 +49,7 @@ class MetaTrainingConfig:
       fitness: one of `lpo.fitness.FITNESSES`, by name. "return": of the trained agent where it was
         trained, without reward noise; "area": the mean of that over the training; "transfer": in
         the bandit's evaluation environment.
-      agent: PPO's static configuration; None takes `inner_loop(environment, contexts)`.
+      agent: PPO's static configuration; None takes `task_agent`'s.
       contexts: size of a batch on a bandit.
       horizons: how long inner agents train, as fractions of the setting's number of updates; one is
         drawn for each generation. Empty: always in full. A temporally-aware drift learns here that
@@ -154,24 +153,11 @@ class MetaTrainingConfig:
         return tuple(dict.fromkeys(home_of(name) or name for name in self.tasks))
 
 
-def inner_loop(environment: str, contexts: int) -> PPOConfig:
-    """The inner loop's static configuration: the evaluation environment's own setting, or its image on a bandit.
-
-    On a bandit the number of updates (iterations, epochs, minibatches) stays that of the
-    environment's setting, so that the objective meets the regime in which it will be used, while a
-    batch holds a fraction of the transitions: contexts are independent, consecutive steps are not.
-    """
-    home = home_of(environment)
-    if home is None:
-        return environment_setting(environment).config
-    setting = environment_setting(home).config
-    return replace(
-        setting,
-        num_envs=contexts,
-        num_steps=1,
-        total_steps=contexts * setting.num_iterations,
-        normalize_observations=False,
-    )
+def task_agent(task: str, contexts: int) -> AgentSpec:
+    """PPO as the evaluation environment has it, or on a bandit its image (`AgentSpec.on_bandit`)."""
+    home = home_of(task)
+    spec = environment_agent("ppo", home or task)
+    return spec if home is None else spec.on_bandit(contexts)
 
 
 class TaskTraining:
@@ -202,15 +188,15 @@ class TaskTraining:
         else:
             self.env, self.env_params = make(environment, **physics(environment))
             self.evaluation_env, self.evaluation_params = self.env, self.env_params
-        self.agent_config = config.agent or inner_loop(environment, config.contexts)
-        self.agent = PPO(self.env, self.agent_config, drift or config.drift)
+        spec = task_agent(environment, config.contexts)
+        self.spec = replace(spec, config=config.agent or spec.config, lists=config.hyperparameters)
+        self.agent = self.spec.agent(self.env, drift or config.drift)
         one_step = isinstance(self.evaluation_env, SyntheticBandit)
         self.evaluation_episodes = config.evaluation_episodes or (50 if one_step else 20)
         self.training_params = self.env_params
         if isinstance(self.env, SyntheticBandit) and config.reward_noise:
             scale = self.env.reward_scale(self.env_params, root_key(0))
             self.training_params = self.env_params.replace(reward_noise=config.reward_noise * scale)
-        self.base_hyperparameters = environment_setting(self.home).hyperparameters
 
     def fitness(
         self, drift_parameters: Any, key: jax.Array, number: int, horizon: ArrayLike = 1.0
@@ -221,9 +207,7 @@ class TaskTraining:
           horizon: how long they train, as a fraction of the inner loop's iterations; traced.
         """
         key_draw, key_agents = split_key(key)
-        hyperparameters = sample_hyperparameters(
-            key_draw, self.config.hyperparameters, number, self.base_hyperparameters
-        )
+        hyperparameters = self.spec.sample(key_draw, number)
         return jax.vmap(lambda h, k: self._train_one(drift_parameters, h, k, horizon))(
             hyperparameters, split_key(key_agents, number)
         )
@@ -257,7 +241,7 @@ class TaskTraining:
         if not config.horizons:
             state = self.agent.train(key_train, hyperparameters, self.training_params)
             return fitness.of(judge(state, key_evaluate)[None])
-        iterations = jnp.round(jnp.asarray(horizon) * self.agent_config.num_iterations)
+        iterations = jnp.round(jnp.asarray(horizon) * self.spec.config.num_iterations)
         iterations = jnp.maximum(1, iterations.astype(jnp.int32))
         hyperparameters = replace(hyperparameters, horizon=iterations)
         state = self.agent.init(key_train, hyperparameters, self.training_params)
@@ -269,17 +253,17 @@ class TaskTraining:
     @property
     def area_every(self) -> int:
         """Iterations between about five points of the curve, at equal distances that divide the training."""
-        iterations = self.agent_config.num_iterations
+        iterations = self.spec.config.num_iterations
         return next(n for n in range(max(1, iterations // 5), 0, -1) if iterations % n == 0)
 
     def steps(self) -> EnvironmentSteps:
         """Of one candidate; with random horizons the mean over them."""
         config, points = self.config, 1
         if config.judgement.along:
-            points = self.agent_config.num_iterations // self.area_every + 1
+            points = self.spec.config.num_iterations // self.area_every + 1
         agents = config.agents_per_candidate
         share = sum(config.horizons) / len(config.horizons) if config.horizons else 1.0
-        training = self.agent_config.num_environment_steps
+        training = self.spec.steps
         return EnvironmentSteps(
             training=round(agents * training * share),
             evaluation=agents

@@ -19,11 +19,11 @@ from lpo.generalization import (
     check_names,
     check_seeds,
     learning_curves,
-    training_setting,
 )
 from lpo.meta_training import VALIDATION_AGENTS, MetaTraining, MetaTrainingConfig, chosen_mean
 from lpo.objectives import Objective, load_objective, save_objective
 from scb import plotting
+from scb.agents.spec import environment_agent
 from scb.artefacts import machine_description, package_versions
 from scb.environments.registry import make
 from scb.environments.synthetic import SyntheticBandit
@@ -282,7 +282,9 @@ def _compare(
             evaluation["environment"],
             objective,
             seeds,
-            setting=training_setting(evaluation["environment"], evaluation["steps"]),
+            spec=environment_agent("ppo", evaluation["environment"]).with_steps(
+                evaluation["steps"]
+            ),
             backend=evaluation["backend"],
             points=evaluation.get("points", 15),
             episodes=evaluation.get("episodes", 20),

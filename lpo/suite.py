@@ -13,10 +13,11 @@ import jax
 import numpy as np
 from gymnax.environments import environment
 
-from lpo.generalization import Comparison, check_names, compare, training_setting
+from lpo.generalization import Comparison, check_names, compare
 from lpo.objectives import Objective
-from scb.agents.settings import MINATAR
+from scb.agents.spec import environment_agent
 from scb.environments.brax import BRAX_NAMES
+from scb.environments.gymnax import MinAtarFamily
 from scb.environments.registry import make
 from scb.errors import UserError, unknown_name
 from scb.evaluation import evaluate
@@ -31,7 +32,7 @@ SUITES: dict[str, tuple[str, ...]] = {
         "MountainCarContinuous-v0",
         "Pendulum-v1",
     ),
-    "minatar": MINATAR,
+    "minatar": MinAtarFamily.suite,
     "brax": (
         "hopper",
         "walker2d",
@@ -263,7 +264,9 @@ def run_suite(
             environment_name,
             objectives,
             seeds,
-            setting=training_setting(environment_name, steps, policy_output_scale),
+            spec=environment_agent("ppo", environment_name)
+            .with_steps(steps)
+            .with_values(policy_output_scale=policy_output_scale),
             backend=physics,
             points=points,
             **arguments,

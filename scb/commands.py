@@ -10,7 +10,7 @@ import numpy as np
 from gymnax.environments import environment as environments
 from rich.table import Column, Table
 
-from scb.agents.hyperparameters import ALGORITHMS, algorithms_for, inner_loop
+from scb.agents.spec import ALGORITHMS, algorithms_for, bandit_agent, tables_of
 from scb.artefacts import machine_description
 from scb.console import console
 from scb.curriculum import CurriculumConfig, paper_curriculum
@@ -287,10 +287,10 @@ def judge_all(
     results = {}
     for algorithm in algorithms_for(space):
         training = SyntheticTraining(
-            synthetic, env, env_params, inner_loop(algorithm, name, space, sampled)
+            synthetic, env, env_params, bandit_agent(algorithm, name, sampled)
         )
         returns = judge(training, weights, seed, num_agents, num_episodes)
-        lists = training.inner.lists
+        lists = training.spec.lists
         results[algorithm.upper()] = {
             "agents": num_agents,
             "episodes": num_episodes,
@@ -423,8 +423,7 @@ def read_lists(path: Path) -> dict[str, dict[str, tuple[float, ...]]]:
     ):
         raise UserError(f"{path} holds no hyperparameter lists: {wanted}.")
     for algorithm, lists in content.items():
-        if algorithm not in ALGORITHMS:
-            raise unknown_name("algorithm", algorithm, ALGORITHMS)
+        tables_of(algorithm)
         for name, values in lists.items():
             if not isinstance(values, list) or not values:
                 raise UserError(
@@ -480,8 +479,8 @@ def train(
     target = evaluation_environment or loaded.name.removeprefix(PREFIX)
     env, env_params = make(target, backend)
     check_fits(loaded, env, env_params, target)
-    inner = inner_loop(algorithm, target, loaded.action_space(), not fixed_hyperparameters)
-    training = SyntheticTraining(loaded, env, env_params, inner)
+    spec = bandit_agent(algorithm, target, not fixed_hyperparameters)
+    training = SyntheticTraining(loaded, env, env_params, spec)
     weights = loaded.default_params.weights
     by_actions = judge(training, weights, seed, agents, episodes, mode=not sampled_actions)
     (returns,) = by_actions.values()
@@ -491,7 +490,7 @@ def train(
 
 def list_command() -> None:
     """List the bandits that ship with the library, with what they are worth and what they cost."""
-    algorithms = [name.upper() for name in ALGORITHMS if name != "ddqn"]
+    algorithms = [name.upper() for name in algorithms_for()]
     table = Table(
         # In a narrow terminal names are broken, and numbers are not.
         Column("bandit", overflow="fold"),

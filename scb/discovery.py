@@ -17,14 +17,14 @@ import numpy as np
 from gymnax.environments import environment
 from jax.typing import ArrayLike
 
-from scb.agents.hyperparameters import (
-    InnerLoop,
-    Lists,
+from scb.agents.spec import (
+    AgentSpec,
     algorithms_for,
+    bandit_agent,
     check_algorithms,
-    check_lists,
-    inner_loop,
+    kind_of_actions,
 )
+from scb.agents.tables import Lists
 from scb.curriculum import CurriculumConfig, check_curriculum, horizon, with_limit
 from scb.environments.registry import make
 from scb.environments.synthetic import (
@@ -41,8 +41,8 @@ from scb.keys import key_at, root_key, split_key
 from scb.runs import Run, Stopwatch
 from scb.warm_start import (
     WarmStartConfig,
+    expert_agent,
     expert_dataset,
-    expert_setting,
     find_expert,
     fit_bandit,
 )
@@ -138,7 +138,7 @@ class SyntheticTraining:
     Args:
       synthetic: the bandit or MDP, whose weights are given at each call.
       env, env_params: the evaluation environment.
-      inner: the algorithm, its configuration and hyperparameter lists.
+      spec: what its agents are trained with.
     """
 
     def __init__(
@@ -146,10 +146,10 @@ class SyntheticTraining:
         synthetic: SyntheticBandit | SyntheticMDP,
         env: environment.Environment[Any, Any],
         env_params: Any,
-        inner: InnerLoop,
+        spec: AgentSpec,
     ) -> None:
-        self.synthetic, self.inner = synthetic, inner
-        self.agent = inner.agent(synthetic)
+        self.synthetic, self.spec = synthetic, spec
+        self.agent = spec.agent(synthetic)
         self.env, self.env_params = env, env_params
         self._populations: dict[tuple[int, int, tuple[bool, ...]], Callable[..., Any]] = {}
 
@@ -219,7 +219,7 @@ class BanditDiscovery:
         space = self.env.action_space(self.env_params)
         if not config.algorithms:
             config = replace(config, algorithms=algorithms_for(space))
-        check_algorithms(config.algorithms, space)
+        check_algorithms(config.algorithms, kind_of_actions(space))
         if config.mode == "all" and len(set(config.algorithms)) < len(config.algorithms):
             raise UserError(
                 f"an algorithm stands twice in {', '.join(config.algorithms)}: name each once, or use the mode "
@@ -232,7 +232,7 @@ class BanditDiscovery:
                 f"{', '.join(config.algorithms)}: give lists for that."
             )
         if config.init == "expert" and config.start is None:
-            expert_setting(config.environment, space, config.warm_start)
+            expert_agent(config.environment, space, config.warm_start)
         self.config = config
         self.bandit = synthetic_for(
             self.env,
@@ -243,9 +243,7 @@ class BanditDiscovery:
             config.max_steps,
         )
         self.trainings = {
-            name: SyntheticTraining(
-                self.bandit, self.env, self.env_params, self._inner_loop(name, space)
-            )
+            name: SyntheticTraining(self.bandit, self.env, self.env_params, self._spec(name))
             for name in dict.fromkeys(config.algorithms)
         }
         self._horizon, self._longest = None, None
@@ -257,13 +255,14 @@ class BanditDiscovery:
         # Read now, so that a wrong name is told before anything is computed or written.
         self._start = None if config.start is None else self._weights_of(config.start)
 
-    def _inner_loop(self, name: str, space: Any) -> InnerLoop:
+    def _spec(self, name: str) -> AgentSpec:
         config = self.config
-        inner = inner_loop(name, config.environment, space, config.sampled_hyperparameters)
-        if name in config.lists:
-            check_lists(config.lists[name], inner.hyperparameters)
-            inner = replace(inner, lists=config.lists[name])
-        return replace(inner, config=config.configs.get(name, inner.config))
+        spec = bandit_agent(name, config.environment, config.sampled_hyperparameters)
+        return replace(
+            spec,
+            lists=config.lists.get(name, spec.lists),
+            config=config.configs.get(name, spec.config),
+        )
 
     def _weights_of(self, name: str) -> Weights:
         start = open_bandit(name)
@@ -326,7 +325,7 @@ class BanditDiscovery:
                     limit,
                     self._longest,
                 ).mean()
-            )(training.inner.sample(key_draw, number), split_key(key_agents, number))
+            )(training.spec.sample(key_draw, number), split_key(key_agents, number))
 
         names = list(self.trainings)
         if config.mode == "all":
@@ -352,7 +351,7 @@ class BanditDiscovery:
         results = {}
         for i, (name, training) in enumerate(self.trainings.items()):
             key_draw, key_agent = split_key(key if i == 0 else key_at(key, i))
-            hyperparameters = jax.tree.map(lambda x: x[0], training.inner.sample(key_draw, 1))
+            hyperparameters = jax.tree.map(lambda x: x[0], training.spec.sample(key_draw, 1))
             results[f"fitness/{name}"] = training.returns(
                 candidate,
                 hyperparameters,
@@ -367,10 +366,10 @@ class BanditDiscovery:
         config = self.config
         agents = config.agents_per_candidate
         if config.mode == "all":
-            training = sum(t.inner.steps for t in self.trainings.values())
+            training = sum(t.spec.steps for t in self.trainings.values())
             evaluations = len(self.trainings)
         else:
-            turns = [self.trainings[name].inner.steps for name in config.algorithms]
+            turns = [self.trainings[name].spec.steps for name in config.algorithms]
             training, evaluations = sum(turns) // len(turns), 1
         limit = self._longest or int(self.env_params.max_steps_in_episode)
         return EnvironmentSteps(
@@ -444,7 +443,7 @@ def judge(
     key_draw, key_agents = split_key(root_key(seed))
     names = {False: "sampled_actions", True: "mode_actions"}
     modes = tuple(names) if mode is None else (mode,)
-    hyperparameters = training.inner.sample(key_draw, num_agents)
+    hyperparameters = training.spec.sample(key_draw, num_agents)
     keys = split_key(key_agents, num_agents)
     population = training.population(num_agents, num_episodes, modes)
     returns = population(weights, hyperparameters, keys)

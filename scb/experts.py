@@ -17,7 +17,7 @@ from gymnax.environments import environment
 
 from scb.agents.agent import Agent
 from scb.agents.normalization import RunningStatistics, normalize, update_statistics
-from scb.agents.settings import Setting
+from scb.agents.spec import AgentSpec
 from scb.curriculum import CurriculumConfig, horizon, with_limit
 from scb.errors import UserError
 from scb.evaluation import evaluate
@@ -62,7 +62,7 @@ def judged(
 
 def best_agent(
     agent: Agent,
-    setting: Setting,
+    spec: AgentSpec,
     env_params: Any,
     key: jax.Array,
     num_agents: int,
@@ -73,12 +73,12 @@ def best_agent(
     Raises:
       UserError: no agent has a finite return.
     """
-    training_params = setting.training_params(env_params)
+    training_params = spec.training_params(env_params)
 
     @jax.jit
     def train(key: jax.Array) -> tuple[Any, jax.Array]:
         key_train, key_evaluate = split_key(key)
-        state = agent.train(key_train, setting.hyperparameters, training_params)
+        state = agent.train(key_train, spec.hyperparameters, training_params)
         episodes = agent.evaluate(
             state, key_evaluate, num_episodes, env_params=env_params, mode=True
         )
@@ -87,7 +87,7 @@ def best_agent(
     states, returns = jax.vmap(train)(split_key(key, num_agents))
     if not bool(jnp.isfinite(returns).any()):
         raise UserError(
-            f"none of {num_agents} agents has a finite return: lower the setting's learning rate."
+            f"none of {num_agents} agents has a finite return: lower the learning rate."
         )
     best = int(jnp.argmax(jnp.where(jnp.isfinite(returns), returns, -jnp.inf)))
     return jax.tree.map(lambda x: x[best], states), float(returns[best])
@@ -96,18 +96,18 @@ def best_agent(
 def train_expert(
     env: environment.Environment[Any, Any],
     env_params: Any,
-    setting: Setting,
+    spec: AgentSpec,
     key: jax.Array,
     num_experts: int,
 ) -> Expert:
     """The best of `num_experts` agents trained on the environment itself, by 20 episodes of mode actions."""
-    agent = setting.agent(env)
-    state, best = best_agent(agent, setting, env_params, key, num_experts, EPISODES)
+    agent = spec.agent(env)
+    state, best = best_agent(agent, spec, env_params, key, num_experts, EPISODES)
 
     def policy(observation: jax.Array) -> jax.Array:
         return agent.act(state, observation, key, env_params, mode=True)
 
-    steps = setting.num_environment_steps * num_experts
+    steps = spec.steps * num_experts
     evaluation = num_experts * EPISODES * int(env_params.max_steps_in_episode)
     return Expert(policy, best, steps + evaluation)
 

@@ -15,15 +15,21 @@ import numpy as np
 import optax
 from gymnax.environments import environment, spaces
 
-from scb.agents.hyperparameters import ALGORITHMS, check_algorithms
-from scb.agents.settings import Setting, environment_setting, environment_settings
+from scb.agents.spec import (
+    ALGORITHMS,
+    AgentSpec,
+    check_algorithms,
+    environment_agent,
+    has_values_for,
+    kind_of_actions,
+)
+from scb.agents.tables import WARM_START
 from scb.curriculum import paper_curriculum
 from scb.environments.synthetic import BanditParams, SyntheticBandit, Weights
 from scb.errors import UserError, unknown_name
 from scb.experts import Expert, PolicySearchConfig, evolve_expert, train_expert
 from scb.keys import split_key
 
-EXPERTS = ("auto", "evolution", *ALGORITHMS)
 CONSTRUCTIONS = ("advantage", "q", "action_distance")
 
 
@@ -66,8 +72,9 @@ class WarmStartConfig:
     def __post_init__(self) -> None:
         if self.construction not in CONSTRUCTIONS:
             raise unknown_name("warm-start construction", self.construction, CONSTRUCTIONS)
-        if self.expert not in EXPERTS:
-            raise unknown_name("expert", self.expert, EXPERTS)
+        experts = ("auto", "evolution", *ALGORITHMS)
+        if self.expert not in experts:
+            raise unknown_name("expert", self.expert, experts)
         if not 0 <= self.min_spread < np.inf:
             raise UserError(f"min_spread is {self.min_spread}: it must be 0 or larger, and finite.")
         if self.min_spread > 0 and self.construction != "action_distance":
@@ -96,9 +103,9 @@ class ExpertDataset(NamedTuple):
     expert_action: jax.Array  # [S, ...]
 
 
-def expert_setting(
+def expert_agent(
     name: str, space: spaces.Box | spaces.Discrete, config: WarmStartConfig
-) -> Setting | None:
+) -> AgentSpec | None:
     """How the expert of an environment is trained; None where evolution finds it.
 
     Raises:
@@ -107,7 +114,7 @@ def expert_setting(
     """
     algorithm = config.expert
     if algorithm == "auto":
-        algorithm = "ppo" if name in environment_settings("ppo") else "evolution"
+        algorithm = "ppo" if has_values_for("ppo", name) else "evolution"
     if algorithm == "evolution":
         if config.expert_steps is not None:
             raise UserError(
@@ -115,16 +122,9 @@ def expert_setting(
                 "agent: leave it out, or choose an algorithm for the expert."
             )
         return None
-    check_algorithms([algorithm], space)
-    setting = environment_setting(name, algorithm)
-    if config.expert_steps is not None:
-        setting = replace(setting, config=replace(setting.config, total_steps=config.expert_steps))
-    if name == "Pendulum-v1" and algorithm == "ppo":
-        # Episodes without end and a reward at every step: a short horizon learns the swing-up
-        # several times faster.
-        short = replace(setting.hyperparameters, discount=0.95)
-        setting = replace(setting, hyperparameters=short)
-    return setting
+    check_algorithms([algorithm], kind_of_actions(space))
+    spec = environment_agent(algorithm, name).with_values(**WARM_START.get((algorithm, name), {}))
+    return spec.with_values(total_steps=config.expert_steps)
 
 
 def find_expert(
@@ -135,8 +135,8 @@ def find_expert(
     config: WarmStartConfig,
 ) -> Expert:
     """An expert for an environment, by name as `scb.make` takes it."""
-    setting = expert_setting(name, env.action_space(env_params), config)
-    if setting is None:
+    spec = expert_agent(name, env.action_space(env_params), config)
+    if spec is None:
         search = PolicySearchConfig()
         search = replace(
             search,
@@ -144,7 +144,7 @@ def find_expert(
             evolution=replace(search.evolution, num_generations=config.expert_generations),
         )
         return evolve_expert(env, env_params, search, key)
-    return train_expert(env, env_params, setting, key, config.num_experts)
+    return train_expert(env, env_params, spec, key, config.num_experts)
 
 
 def expert_dataset(

@@ -178,3 +178,22 @@ def scale_to_space(squashed: jax.Array, space: spaces.Box) -> jax.Array:
     """[..., A] in [-1, 1] -> [..., A] between the bounds of the flattened action."""
     low, high = flat_bounds(space)
     return low + (squashed + 1.0) * 0.5 * (high - low)
+
+
+@dataclass(frozen=True)
+class Algorithm:
+    """An algorithm as its module exports it and the tables name it.
+
+    Attributes:
+      name: as the command line takes it.
+      agent: its class, called with (environment, configuration).
+      config, hyperparameters: called without arguments for the defaults, which are the paper's inner
+        loop.
+      actions: the kinds of actions that it fits.
+    """
+
+    name: str
+    agent: type[Agent]
+    config: Callable[[], Any]
+    hyperparameters: Callable[[], Any]
+    actions: tuple[str, ...] = ("discrete", "continuous")

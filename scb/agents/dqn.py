@@ -1,6 +1,7 @@
 """Deep Q-learning (Mnih et al., 2015) and double Q-learning (van Hasselt et al., 2015), one traced flag apart."""
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import jax
@@ -10,6 +11,7 @@ from flax import struct
 from jax.typing import ArrayLike
 
 from scb.agents import networks
+from scb.agents.agent import Algorithm
 from scb.agents.off_policy import (
     OffPolicyAgent,
     OffPolicyConfig,
@@ -161,3 +163,9 @@ def _optimizer(hyperparameters: DQNHyperparameters) -> optax.GradientTransformat
         optax.clip_by_global_norm(hyperparameters.max_grad_norm),
         optax.adam(hyperparameters.learning_rate),
     )
+
+
+DQN_ALGORITHM = Algorithm("dqn", DQN, DQNConfig, DQNHyperparameters, actions=("discrete",))
+DDQN_ALGORITHM = Algorithm(
+    "ddqn", DQN, DQNConfig, partial(DQNHyperparameters, double=1.0), actions=("discrete",)
+)

@@ -22,7 +22,7 @@ from gymnax.environments import spaces
 from jax.typing import ArrayLike
 
 from scb.agents import networks
-from scb.agents.agent import Agent, clip_to_space
+from scb.agents.agent import Agent, Algorithm, clip_to_space
 from scb.agents.normalization import RunningStatistics, normalize, update_statistics
 from scb.errors import UserError, unknown_name
 from scb.keys import split_key
@@ -453,3 +453,6 @@ def _optimizer(hyperparameters: PPOHyperparameters) -> optax.GradientTransformat
         optax.clip_by_global_norm(hyperparameters.max_grad_norm),
         optax.adam(hyperparameters.learning_rate, eps=1e-5),
     )
+
+
+PPO_ALGORITHM = Algorithm("ppo", PPO, PPOConfig, PPOHyperparameters)

@@ -14,7 +14,7 @@ from gymnax.environments import spaces
 from jax.typing import ArrayLike
 
 from scb.agents import networks
-from scb.agents.agent import scale_to_space
+from scb.agents.agent import Algorithm, scale_to_space
 from scb.agents.off_policy import (
     OffPolicyAgent,
     OffPolicyConfig,
@@ -246,3 +246,6 @@ def _sample(key: jax.Array, mean: jax.Array, std: jax.Array) -> tuple[jax.Array,
     unsquashed, log_prob = distrax.MultivariateNormalDiag(mean, std).sample_and_log_prob(seed=key)
     squashed, log_det = distrax.Tanh().forward_and_log_det(unsquashed)
     return squashed, log_prob - jnp.sum(log_det, axis=-1)
+
+
+SAC_ALGORITHM = Algorithm("sac", SAC, SACConfig, SACHyperparameters)

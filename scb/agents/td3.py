@@ -1,6 +1,7 @@
 """Twin delayed DDPG (Fujimoto et al., 2018); DDPG (Lillicrap et al., 2015) is its case of one critic and no delay."""
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import jax
@@ -12,7 +13,7 @@ from flax import struct
 from jax.typing import ArrayLike
 
 from scb.agents import networks
-from scb.agents.agent import scale_to_space
+from scb.agents.agent import Algorithm, scale_to_space
 from scb.agents.off_policy import (
     OffPolicyAgent,
     OffPolicyConfig,
@@ -210,3 +211,13 @@ def _optimizer(hyperparameters: TD3Hyperparameters) -> optax.GradientTransformat
         optax.clip_by_global_norm(hyperparameters.max_grad_norm),
         optax.adam(hyperparameters.learning_rate),
     )
+
+
+TD3_ALGORITHM = Algorithm("td3", TD3, TD3Config, TD3Hyperparameters, actions=("continuous",))
+DDPG_ALGORITHM = Algorithm(
+    "ddpg",
+    TD3,
+    ddpg_config,
+    partial(TD3Hyperparameters, target_noise=0.0),
+    actions=("continuous",),
+)

@@ -19,7 +19,7 @@ from jax.typing import ArrayLike
 from scb.agents import networks
 from scb.agents.agent import clip_to_space, scale_to_space
 from scb.agents.sac import SAC
-from scb.agents.settings import environment_setting
+from scb.agents.spec import environment_agent
 from scb.environments.synthetic import BanditParams, BanditState, SyntheticBandit
 from scb.evaluation import Policy, evaluate
 from scb.experts import best_agent
@@ -97,11 +97,11 @@ def train_sac_expert(
     num_episodes: int = 50,
 ) -> SACExpert:
     """The best of several SAC agents with an environment's own setting, by episodes of most likely actions."""
-    setting = environment_setting(name, "sac")
-    agent = setting.agent(env)
+    spec = environment_agent("sac", name)
+    agent = spec.agent(env)
     assert isinstance(agent, SAC)
 
-    state, mean_return = best_agent(agent, setting, env_params, key, num_agents, num_episodes)
+    state, mean_return = best_agent(agent, spec, env_params, key, num_agents, num_episodes)
     return SACExpert(agent, state, env_params, mean_return)
 
 

@@ -1,5 +1,4 @@
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +17,7 @@ from experiments.component_replacement import (
     Q,
     cell,
 )
-from scb.agents.settings import environment_setting
+from scb.agents.spec import environment_agent
 from scb.analysis import components
 from scb.statistics import iqm
 
@@ -88,11 +87,10 @@ def test_the_page_and_the_figure_show_every_combination(report):
 
 
 def test_a_run_goes_on_with_the_expert_that_it_was_at(monkeypatch):
-    def short(name, algorithm):
-        setting = environment_setting(name, algorithm)
-        return replace(setting, config=replace(setting.config, total_steps=3000))
+    def short(algorithm, name):
+        return environment_agent(algorithm, name).with_steps(3000)
 
-    monkeypatch.setattr(components, "environment_setting", short)
+    monkeypatch.setattr(components, "environment_agent", short)
     chosen = ((CLONING, SYNTHETIC), (BANDIT, EXPERT))
     monkeypatch.setattr(experiment, "REPLACED", chosen)
     report, saved = {}, []

@@ -75,7 +75,7 @@ def test_the_page_and_the_figure_show_both_distributions(report):
 
 
 def test_states_and_best_actions_of_one_environment(monkeypatch):
-    monkeypatch.setattr(components, "environment_setting", short)
+    monkeypatch.setattr(components, "environment_agent", short)
     plan = {
         "environments": ["MountainCar-v0"],
         "agents": 2,

@@ -1,12 +1,11 @@
 """The table says what was measured, and nothing is measured twice."""
 
 import json
-from dataclasses import replace
 
 import numpy as np
 import pytest
 
-import scb.agents.hyperparameters as tables
+import scb.agents.spec as specs
 from experiments import zoo_table, zoo_table_page
 from scb.discovery import SyntheticTraining, judge
 from scb.environments.brax import BRAX_NAMES
@@ -128,7 +127,7 @@ def test_every_target_and_paper_figure_is_of_a_fitting_algorithm():
             assert tuple(figures) == ("ppo", "sac", "ddpg", "td3")
             continue
         env, params = make(environment)
-        assert tuple(figures) == tables.algorithms_for(env.action_space(params))
+        assert tuple(figures) == specs.algorithms_for(env.action_space(params))
 
 
 @pytest.fixture
@@ -139,17 +138,14 @@ def tiny(tmp_path, monkeypatch):
     metadata = {"seeds": {}, "results": {}, "cost": {}, "command": "none"}
     metadata["config"] = {"evaluation_environment": "CartPole-v1"}
     save_bandit(path, bandit, bandit.init_weights(zoo_key()), metadata)
-    full = tables.inner_loop
+    full = specs.bandit_agent
 
     def small(*arguments, **keywords):
-        inner = full(*arguments, **keywords)
         sizes = {"num_envs": 2, "num_steps": 8, "num_epochs": 1, "num_minibatches": 1}
-        return replace(
-            inner, config=replace(inner.config, total_steps=16, hidden_sizes=(4,), **sizes)
-        )
+        return full(*arguments, **keywords).with_values(total_steps=16, hidden_sizes=(4,), **sizes)
 
-    monkeypatch.setattr(tables, "inner_loop", small)
-    monkeypatch.setattr(tables, "algorithms_for", lambda space: ("ppo",))
+    monkeypatch.setattr(specs, "bandit_agent", small)
+    monkeypatch.setattr(specs, "algorithms_for", lambda space: ("ppo",))
     monkeypatch.setattr(zoo_table, "DEFAULT_PUBLISHED", tmp_path / "nothing")
     arguments = ["--bandits", str(path), "--agents", "2", "--episodes", "2"]
     arguments += ["--out", str(tmp_path / "data" / "zoo_table.json"), "--docs", str(tmp_path)]
@@ -170,8 +166,8 @@ def test_a_measurement_is_what_judging_gives_and_is_not_repeated(tiny, tmp_path,
 
     env, params = make("CartPole-v1")
     bandit = load_bandit(path)
-    inner = small("ppo", "CartPole-v1", env.action_space(params))
-    training = SyntheticTraining(bandit, env, params, inner)
+    spec = small("ppo", "CartPole-v1")
+    training = SyntheticTraining(bandit, env, params, spec)
     expected = judge(training, bandit.default_params.weights, 10_000, 2, 2)
     for actions, returns in expected.items():
         assert made[actions]["agents"] == pytest.approx(returns, abs=1e-3)

@@ -19,8 +19,8 @@ from lpo.alignment import (
     regime_fitness,
 )
 from lpo.fitness import LABELS
-from lpo.generalization import training_setting
 from scb import plotting
+from scb.agents.spec import environment_agent
 from scb.errors import UserError
 from scb.evolution import map_population
 
@@ -86,16 +86,16 @@ def test_a_regime_that_cannot_be_is_refused(arguments, message, one_sentence):
 
 def test_a_regime_changes_what_it_names_and_keeps_the_settings_own():
     ppo = known_drifts()[2]
-    own = training_setting("Pendulum-v1")
+    own = environment_agent("ppo", "Pendulum-v1")
     plain = Regime().task(ppo)
-    assert plain.agent_config.num_iterations == own.config.num_iterations == 15
-    assert plain.agent_config.batch_size == 200
-    assert Regime().hyperparameters() == own.hyperparameters
+    assert plain.spec.config.num_iterations == own.config.num_iterations == 15
+    assert plain.spec.config.batch_size == 200
+    assert Regime().spec().hyperparameters == own.hyperparameters
     regime = replace(TINY, learning_rate=0.5, policy_output_scale=0.25)
-    config = regime.task(ppo).agent_config
+    config = regime.task(ppo).spec.config
     assert (config.num_iterations, config.batch_size) == (4, 10)
     assert (config.num_epochs, config.num_minibatches) == (1, 1)
-    hyperparameters = regime.hyperparameters()
+    hyperparameters = regime.spec().hyperparameters
     assert (hyperparameters.learning_rate, hyperparameters.policy_output_scale) == (0.5, 0.25)
     assert hyperparameters.discount == own.hyperparameters.discount
     assert str(Regime()) == "default"

@@ -17,11 +17,10 @@ from lpo.generalization import (
     compare,
     evaluation_interval,
     learning_curves,
-    training_setting,
 )
 from lpo.objectives import Objective, load_objective
 from scb.agents.ppo import PPOConfig, PPOHyperparameters
-from scb.agents.settings import Setting
+from scb.agents.spec import AgentSpec
 from scb.errors import UserError
 
 SEEDS = (7, 8, 9)
@@ -104,31 +103,19 @@ def test_evaluation_interval_gives_about_as_many_points_as_asked(num_iterations,
     assert evaluation_interval(num_iterations, points) == every
 
 
-def test_training_setting_is_the_environments_own_but_for_the_steps():
-    own = training_setting("Pendulum-v1")
-    shorter = training_setting("Pendulum-v1", 20_000)
-    assert own.config.total_steps == 150_000
-    assert shorter.config == replace(own.config, total_steps=20_000)
-    assert shorter.hyperparameters is not None
-    assert shorter.hyperparameters == own.hyperparameters
-    small = training_setting("Pendulum-v1", policy_output_scale=0.01)
-    assert small.config == own.config
-    assert small.hyperparameters == replace(own.hyperparameters, policy_output_scale=0.01)
-
-
 # -- trained ------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
 def arguments(tiny_agent):
     # Seven batches of eight contexts.
-    setting = Setting(
-        replace(tiny_agent, total_steps=56), PPOHyperparameters(learning_rate=0.03), "a test"
+    spec = AgentSpec(
+        "ppo", replace(tiny_agent, total_steps=56), PPOHyperparameters(learning_rate=0.03)
     )
     return {
         "environment": "Synthetic-Pendulum-v1",
         "seeds": SEEDS,
-        "setting": setting,
+        "spec": spec,
         "points": 3,
     }
 
@@ -177,13 +164,6 @@ def test_objectives_of_one_drift_share_a_program_and_keep_their_order(arguments,
     assert np.abs(curves["ppo-0.01"].returns - curves["ppo"].returns).max() > 1e-3
 
 
-@pytest.mark.parametrize("scale", [-1.0, float("inf"), float("nan")])
-def test_a_scale_that_cannot_be_is_refused(scale, one_sentence):
-    with pytest.raises(UserError) as error:
-        training_setting("Pendulum-v1", policy_output_scale=scale)
-    assert "policy_output_scale is" in one_sentence(str(error.value))
-
-
 def test_seeds_differ_from_each_other(trained):
     assert len(set(trained["ppo"].returns[:, 1])) == len(SEEDS)
 
@@ -229,13 +209,6 @@ def test_what_cannot_be_trained_is_refused(arguments, changes, message, one_sent
     with pytest.raises(UserError) as error:
         learning_curves(objective=load_objective("ppo"), **{**arguments, **changes})
     assert message in one_sentence(str(error.value))
-
-
-@pytest.mark.parametrize("steps", [0, -5])
-def test_no_steps_are_refused(steps, one_sentence):
-    with pytest.raises(UserError) as error:
-        training_setting("Pendulum-v1", steps)
-    assert one_sentence(str(error.value)) == f"steps is {steps}: it must be at least 1."
 
 
 def test_two_objectives_of_one_name_are_refused(arguments, one_sentence):

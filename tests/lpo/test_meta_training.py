@@ -15,11 +15,11 @@ from lpo.meta_training import (
     MetaTraining,
     MetaTrainingConfig,
     TaskTraining,
-    inner_loop,
     meta_train,
+    task_agent,
 )
 from scb.agents.ppo import PPOConfig
-from scb.agents.settings import environment_setting
+from scb.agents.spec import environment_agent
 from scb.environments.synthetic import BanditConfig, SyntheticBandit
 from scb.errors import UserError
 from scb.evaluation import Episodes
@@ -160,7 +160,9 @@ def test_the_search_starts_near_the_base_but_not_at_zero(config):
 def test_the_inner_loop_on_a_bandit_keeps_the_number_of_updates():
     # Pendulum's setting has 100 environments x 100 steps a batch and 150 000 steps: 15 batches.
     # With 200 contexts a batch, 15 batches are 3000 transitions, fifty times fewer.
-    there, here = inner_loop("Pendulum-v1", 200), inner_loop("Synthetic-Pendulum-v1", 200)
+    there, here = (
+        task_agent(name, 200).config for name in ("Pendulum-v1", "Synthetic-Pendulum-v1")
+    )
     assert (there.num_iterations, there.batch_size) == (15, 10_000)
     assert (here.num_iterations, here.batch_size) == (15, 200)
     for name in ("num_epochs", "num_minibatches", "hidden_sizes", "activation"):
@@ -171,7 +173,7 @@ def test_the_inner_loop_on_a_bandit_keeps_the_number_of_updates():
 def test_hyperparameters_are_the_evaluation_environments_own(config, environment):
     # An objective is learned under the learning rate under which it will be used.
     problem = TaskTraining(replace(config, reward_noise=0.0), environment)
-    assert problem.base_hyperparameters == environment_setting("Pendulum-v1").hyperparameters
+    assert problem.spec.hyperparameters == environment_agent("ppo", "Pendulum-v1").hyperparameters
 
 
 def test_inner_agents_draw_from_the_lists_or_take_the_settings_own(config):
@@ -290,12 +292,13 @@ def test_validation_judges_the_mean_on_the_environment_and_the_search_never_sees
     config, monkeypatch
 ):
     validated = replace(config, validation=True)
-    setting = environment_setting("Pendulum-v1").config
-    short = replace(setting, num_envs=2, num_steps=10, total_steps=20, num_minibatches=2)
+    short = environment_agent("ppo", "Pendulum-v1").with_values(
+        num_envs=2, num_steps=10, total_steps=20, num_minibatches=2
+    )
     monkeypatch.setattr(
         meta_training,
-        "inner_loop",
-        lambda name, contexts, own=inner_loop: (
+        "task_agent",
+        lambda name, contexts, own=task_agent: (
             short if name == "Pendulum-v1" else own(name, contexts)
         ),
     )
@@ -339,7 +342,7 @@ def test_inner_agents_train_for_the_horizon_and_know_how_far_they_are(config):
 
     task = TaskTraining(replace(config, horizons=(0.5, 1.0, 2.0), reward_noise=0.0), PENDULUM)
     task.agent = replace(task.agent, drift=watch)
-    hyperparameters = task.base_hyperparameters
+    hyperparameters = task.spec.hyperparameters
     fitness = jax.jit(task.fitness, static_argnums=2)
     for horizon, fractions in (
         (1 / 3, {0.0}),  # one batch of three

@@ -10,13 +10,13 @@ import pytest
 from lpo import cli, pipeline
 from lpo.objectives import load_objective
 from scb.agents.ppo import PPOConfig, PPOHyperparameters
-from scb.agents.settings import Setting
+from scb.agents.spec import AgentSpec
 
 
 @pytest.fixture(scope="module", autouse=True)
 def small(tiny_agent, tiny_drift):
     """The preset "tiny" with smaller networks, fewer contexts and steps than any preset has."""
-    on_bandit, on_environment = pipeline.pipeline_config, pipeline.training_setting
+    on_bandit, on_environment = pipeline.pipeline_config, pipeline.environment_agent
 
     def config(settings):
         default = on_bandit(settings)
@@ -29,8 +29,8 @@ def small(tiny_agent, tiny_drift):
             evolution=replace(default.evolution, population_size=2, mean_evaluations=2),
         )
 
-    def setting(environment, total_steps):
-        on_environment(environment, total_steps)
+    def spec(algorithm, environment):
+        on_environment(algorithm, environment)
         agent = PPOConfig(
             num_envs=2,
             num_steps=8,
@@ -39,11 +39,11 @@ def small(tiny_agent, tiny_drift):
             total_steps=32,
             hidden_sizes=(4,),
         )
-        return Setting(agent, PPOHyperparameters(), "a test")
+        return AgentSpec(algorithm, agent, PPOHyperparameters())
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(pipeline, "pipeline_config", config)
-        patch.setattr(pipeline, "training_setting", setting)
+        patch.setattr(pipeline, "environment_agent", spec)
         yield
 
 

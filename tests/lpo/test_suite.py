@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from lpo import commands, figures, suite
-from lpo.generalization import Comparison, LearningCurves, learning_curves, training_setting
+from lpo.generalization import Comparison, LearningCurves, learning_curves
 from lpo.objectives import load_objective
 from lpo.suite import RESAMPLES, SUITES, SuiteScores, random_return, run_suite, suite_scores
 from scb import plotting
+from scb.agents.spec import environment_agent
 from scb.environments.registry import environment_names, make
 from scb.errors import UserError
 
@@ -180,7 +181,7 @@ def test_scores_are_drawn(tmp_path):
 
 @pytest.mark.slow
 def test_minatars_setting_learns_breakout():
-    setting = training_setting("Breakout-MinAtar", 65_536)
-    curves = learning_curves("Breakout-MinAtar", load_objective("ppo"), [3, 4], setting, points=4)
+    spec = environment_agent("ppo", "Breakout-MinAtar").with_steps(65_536)
+    curves = learning_curves("Breakout-MinAtar", load_objective("ppo"), [3, 4], spec, points=4)
     assert curves.returns[:, 0].max() < 2.0  # random actions earn half a brick
     assert curves.final.min() > 3.0

@@ -19,8 +19,8 @@ import pytest
 import scb
 from lpo.cli import scb_main
 from scb import artefacts
-from scb.agents.hyperparameters import inner_loop
 from scb.agents.ppo import PPOConfig
+from scb.agents.spec import bandit_agent
 from scb.commands import discovery_config
 from scb.curriculum import CurriculumConfig
 from scb.discovery import BanditDiscovery, DiscoveryConfig
@@ -50,12 +50,11 @@ def call(*arguments):
 
 
 def small(*arguments):
-    inner = inner_loop(*arguments)
-    if inner.name == "ppo":
-        return replace(inner, config=TINY)
+    spec = bandit_agent(*arguments)
+    if spec.algorithm == "ppo":
+        return replace(spec, config=TINY)
     sizes = {"buffer_size": 16, "prefill": 8, "batch_size": 4, "hidden_sizes": (4,)}
-    config = replace(inner.config, num_envs=2, gradient_steps=1, total_steps=16, **sizes)
-    return replace(inner, config=config)
+    return spec.with_values(num_envs=2, gradient_steps=1, total_steps=16, **sizes)
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -63,7 +62,7 @@ def small_inner_loop():
     """The commands take the paper's 10 000 steps; here 16 must do."""
     with pytest.MonkeyPatch.context() as patch:
         for module in ("scb.discovery", "scb.commands"):
-            patch.setattr(f"{module}.inner_loop", small)
+            patch.setattr(f"{module}.bandit_agent", small)
         patch.setattr("scb.discovery.EvolutionConfig.mean_evaluations", 2)
         yield
 
@@ -261,7 +260,7 @@ def test_a_file_gives_the_lists_to_draw_from(asked_for, tmp_path):
     path.write_text('{"ppo": {"learning_rate": [0.25, 1]}, "sac": {"polyak": [0.5]}}')
     config = asked_for("discover", "--hyperparameters", path)
     assert config.lists == {"ppo": {"learning_rate": (0.25, 1)}, "sac": {"polyak": (0.5,)}}
-    drawn = BanditDiscovery(config).trainings["ppo"].inner.sample(jax.random.key(0), 2)
+    drawn = BanditDiscovery(config).trainings["ppo"].spec.sample(jax.random.key(0), 2)
     assert sorted(drawn.learning_rate.tolist()) == [0.25, 1.0]
 
 

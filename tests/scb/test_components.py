@@ -8,7 +8,7 @@ import pytest
 
 import scb
 from scb.agents.sac import SAC, SACConfig, SACHyperparameters
-from scb.agents.settings import Setting
+from scb.agents.spec import AgentSpec
 from scb.analysis import components
 from scb.analysis.components import ReplacedBandit, SACExpert
 from scb.environments.synthetic import BanditConfig, bandit_for
@@ -141,8 +141,8 @@ def test_cloning_comes_close_to_the_expert(name, request):
 
 @pytest.mark.slow
 def test_the_best_of_several_agents_is_the_expert(monkeypatch):
-    setting = Setting(replace(SMALL, prefill=4, total_steps=8), SACHyperparameters(), "test")
-    monkeypatch.setattr(components, "environment_setting", lambda name, algorithm: setting)
+    spec = AgentSpec("sac", replace(SMALL, prefill=4, total_steps=8), SACHyperparameters())
+    monkeypatch.setattr(components, "environment_agent", lambda algorithm, name: spec)
     env, env_params = scb.make("CartPole-v1")
     key = jax.random.key(0)
     best = components.train_sac_expert("CartPole-v1", env, env_params, key, 3, 4)
@@ -152,7 +152,7 @@ def test_the_best_of_several_agents_is_the_expert(monkeypatch):
     @jax.vmap
     def returns_of(key):
         key_train, key_evaluate = jax.random.split(key)
-        state = agent.train(key_train, setting.hyperparameters, env_params)
+        state = agent.train(key_train, spec.hyperparameters, env_params)
         episodes = agent.evaluate(state, key_evaluate, 4, env_params=env_params, mode=True)
         return episodes.returns.mean()
 

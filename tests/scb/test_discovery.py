@@ -7,9 +7,8 @@ import pytest
 from gymnax.environments import spaces
 
 from scb.agents.dqn import DQNConfig
-from scb.agents.hyperparameters import InnerLoop, algorithms_for, inner_loop
 from scb.agents.ppo import PPO, PPOConfig, PPOHyperparameters
-from scb.agents.settings import Setting
+from scb.agents.spec import AgentSpec, algorithms_for, bandit_agent
 from scb.curriculum import CurriculumConfig, paper_curriculum
 from scb.discovery import (
     BanditDiscovery,
@@ -106,8 +105,8 @@ def test_agents_trained_in_a_bandit_do_in_the_environment_what_the_bandit_reward
     bad = {**good, "reward": {**good["reward"], "Dense_1": turned}}
     corridor = CorridorParams(rewards=jnp.array([[0.0, 1.0], [1.0, 0.0]]), last=1)
     config = replace(TINY, num_steps=64, num_epochs=4, num_minibatches=4, total_steps=128 * 20)
-    inner = InnerLoop("ppo", config, PPOHyperparameters(), lists={})
-    training = SyntheticTraining(bandit, Corridor(cells=2), corridor, inner)
+    spec = AgentSpec("ppo", config, PPOHyperparameters())
+    training = SyntheticTraining(bandit, Corridor(cells=2), corridor, spec)
 
     def returns(reward_weights, key):
         hyperparameters = PPOHyperparameters(learning_rate=0.02)
@@ -128,8 +127,8 @@ def test_a_bandit_of_the_zoo_is_worth_what_it_says(name):
     target, physics = name.removeprefix(PREFIX), metadata["config"].get("backend")
     env, env_params = make(target, **({} if physics is None else {"backend": physics}))
     bandit, params = make(name)
-    inner = inner_loop("ppo", target, bandit.action_space())
-    training = SyntheticTraining(bandit, env, env_params, inner)
+    spec = bandit_agent("ppo", target)
+    training = SyntheticTraining(bandit, env, env_params, spec)
     returns = judge(training, params.weights, seed=123_456, mode=False)
     measured = iqm(returns["sampled_actions"])
     width = claimed["high"] - claimed["low"]
@@ -195,8 +194,8 @@ def test_judging_takes_new_agents_for_another_seed(discovered):
 @pytest.mark.slow
 def test_judging_trains_once_and_evaluates_twice(discovered, monkeypatch):
     problem, outcome = discovered
-    bandit, inner = problem.bandit, problem.trainings["ppo"].inner
-    training = SyntheticTraining(bandit, problem.env, problem.env_params, inner)
+    bandit, spec = problem.bandit, problem.trainings["ppo"].spec
+    training = SyntheticTraining(bandit, problem.env, problem.env_params, spec)
     calls = []
 
     def counted(name):
@@ -471,8 +470,8 @@ def test_a_random_start_is_drawn_from_the_key():
 
 @pytest.mark.slow
 def test_an_expert_start_is_fitted_once_and_from_the_seed_alone(monkeypatch):
-    setting = Setting(TINY, PPOHyperparameters(), source="this test")
-    monkeypatch.setattr("scb.warm_start.environment_setting", lambda name, algorithm: setting)
+    spec = AgentSpec("ppo", TINY, PPOHyperparameters())
+    monkeypatch.setattr("scb.warm_start.environment_agent", lambda algorithm, name: spec)
     warm = WarmStartConfig(
         construction="q", expert="ppo", num_experts=2, num_states=16, horizon=3, fit_steps=20
     )
@@ -573,7 +572,7 @@ def test_hyperparameters_are_drawn_from_the_papers_lists_or_fixed():
     sampled, fixed = (
         BanditDiscovery(replace(CONFIG, sampled_hyperparameters=yes))
         .trainings["ppo"]
-        .inner.sample(jax.random.key(0), 5)
+        .spec.sample(jax.random.key(0), 5)
         for yes in (True, False)
     )
     np.testing.assert_array_equal(fixed.learning_rate, np.full(5, 5e-3, np.float32))
@@ -586,25 +585,24 @@ def test_hyperparameters_are_drawn_from_the_papers_lists_or_fixed():
 def test_own_lists_take_the_place_of_the_papers():
     lists = {"ppo": {"learning_rate": (0.25,), "discount": (0.5, 0.75)}}
     problem = BanditDiscovery(replace(ALL, lists=lists))
-    own = problem.trainings["ppo"].inner.sample(jax.random.key(0), 4)
+    own = problem.trainings["ppo"].spec.sample(jax.random.key(0), 4)
     np.testing.assert_array_equal(own.learning_rate, np.full(4, 0.25))
     assert sorted(own.discount.tolist()) == [0.5, 0.5, 0.75, 0.75]
     # What the lists leave out keeps its default, and an algorithm that they leave out the paper's.
     np.testing.assert_array_equal(own.gae_lambda, np.full(4, np.float32(0.95)))
-    paper = inner_loop("dqn", "CartPole-v1", problem.env.action_space(problem.env_params))
-    assert problem.trainings["dqn"].inner.lists == paper.lists
+    paper = bandit_agent("dqn", "CartPole-v1")
+    assert problem.trainings["dqn"].spec.lists == paper.lists
 
 
 def test_the_inner_loop_is_the_papers_where_no_agent_is_given():
     problem = BanditDiscovery(replace(CONFIG, environment="Pendulum-v1", configs={}))
-    space = problem.env.action_space(problem.env_params)
     training = problem.trainings["ppo"]
-    assert training.inner == inner_loop("ppo", "Pendulum-v1", space)
+    assert training.spec == bandit_agent("ppo", "Pendulum-v1")
     assert training.agent.config == PPOConfig(activation="relu")
     # 10 000 steps each, and 2 episodes of Pendulum's 200.
     assert problem.steps().training == 3 * 10_000
     assert problem.steps().evaluation == 3 * 2 * 200
-    assert 0.01 not in training.inner.lists["learning_rate"]
+    assert 0.01 not in training.spec.lists["learning_rate"]
 
 
 @pytest.mark.parametrize(

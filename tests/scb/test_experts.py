@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from scb.agents.dqn import DQNConfig, DQNHyperparameters
-from scb.agents.settings import Setting
+from scb.agents.spec import AgentSpec
 from scb.curriculum import CurriculumConfig
 from scb.environments.registry import make
 from scb.errors import UserError
@@ -159,8 +159,8 @@ def test_any_agent_can_be_the_expert():
         total_steps=480,
         hidden_sizes=(16,),
     )
-    setting = Setting(config, DQNHyperparameters(learning_rate=0.02), source="this test")
-    expert = train_expert(Corridor(cells=4), CELLS, setting, jax.random.key(0), num_experts=2)
+    spec = AgentSpec("dqn", config, DQNHyperparameters(learning_rate=0.02))
+    expert = train_expert(Corridor(cells=4), CELLS, spec, jax.random.key(0), num_experts=2)
     assert expert.mean_return == 4.0
     assert actions(expert) == BEST
     # Two agents of 480 steps, each judged by 20 episodes of 4.

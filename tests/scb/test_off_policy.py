@@ -20,7 +20,7 @@ from scb.agents.dqn import DQN, DQNConfig, DQNHyperparameters
 from scb.agents.normalization import RunningStatistics
 from scb.agents.off_policy import Transition, polyak_average, target_values
 from scb.agents.sac import SAC, SACConfig, SACHyperparameters
-from scb.agents.settings import environment_setting
+from scb.agents.spec import environment_agent
 from scb.agents.td3 import TD3, TD3Config, TD3Hyperparameters, ddpg_config
 from scb.environments.registry import environment_names
 from scb.environments.synthetic import BanditConfig, SyntheticBandit
@@ -946,9 +946,9 @@ def test_cartpole_is_solved_with_the_general_settings(algorithm):
 def evaluated_along_the_training(environment, algorithm, num_seeds):
     """[S, P] returns at about ten points of the training."""
     env, params = scb.make(environment)
-    setting = environment_setting(environment, algorithm)
-    agent = setting.agent(env)
-    iterations = setting.config.num_iterations
+    spec = environment_agent(algorithm, environment)
+    agent = spec.agent(env)
+    iterations = spec.config.num_iterations
     every = min(
         (n for n in range(1, iterations + 1) if iterations % n == 0),
         key=lambda n: abs(iterations / n - 10),
@@ -958,7 +958,7 @@ def evaluated_along_the_training(environment, algorithm, num_seeds):
         def judge(state, key):
             return agent.evaluate(state, key, 10, mode=True).returns.mean()
 
-        return agent.train_with_evaluations(key, setting.hyperparameters, params, judge, every)[1]
+        return agent.train_with_evaluations(key, spec.hyperparameters, params, judge, every)[1]
 
     keys = jax.random.split(jax.random.key(7), num_seeds)
     return map_population(returns, num_seeds, (0,))(keys)

@@ -6,7 +6,7 @@ from gymnax.environments import spaces
 
 from scb.agents.dqn import DQNConfig
 from scb.agents.ppo import PPOConfig, PPOHyperparameters
-from scb.agents.settings import Setting, environment_setting
+from scb.agents.spec import ALGORITHMS, AgentSpec, environment_agent
 from scb.agents.td3 import TD3Config
 from scb.curriculum import CurriculumConfig
 from scb.environments.registry import make
@@ -14,7 +14,6 @@ from scb.environments.synthetic import BanditConfig, BanditParams, SyntheticBand
 from scb.errors import UserError
 from scb.experts import Expert, judged, train_expert
 from scb.warm_start import (
-    EXPERTS,
     ExpertDataset,
     WarmStartConfig,
     energy_distance,
@@ -338,8 +337,8 @@ def test_the_expert_is_the_best_of_those_that_were_trained():
     # One in six earns 7 or more, but of 32 all but one in 400 times somebody does.
     env, key = Corridor(cells=10), jax.random.key(0)
     params = CorridorParams(rewards=jnp.tile(jnp.array([0.0, 1.0]), (10, 1)), last=9)
-    setting = Setting(TINY, PPOHyperparameters(), source="this test")
-    best = train_expert(env, params, setting, key, 32)
+    spec = AgentSpec("ppo", TINY, PPOHyperparameters())
+    best = train_expert(env, params, spec, key, 32)
     assert best.mean_return >= 7
     # 32 agents with one batch of 2 x 8 steps, each judged by 20 episodes of at most 100.
     assert best.environment_steps == 32 * (16 + 20 * 100)
@@ -375,9 +374,9 @@ def test_experts_are_trained_as_the_environment_is_but_for_pendulums_discount():
         return expert_setting(name, env.action_space(env_params), WarmStartConfig(**arguments))
 
     assert of("Pendulum-v1").hyperparameters.discount == 0.95
-    assert environment_setting("Pendulum-v1").hyperparameters.discount == 0.995
-    assert of("Pendulum-v1", expert="sac") == environment_setting("Pendulum-v1", "sac")
-    assert of("CartPole-v1", expert="ppo") == environment_setting("CartPole-v1")
+    assert environment_agent("ppo", "Pendulum-v1").hyperparameters.discount == 0.995
+    assert of("Pendulum-v1", expert="sac") == environment_agent("sac", "Pendulum-v1")
+    assert of("CartPole-v1", expert="ppo") == environment_agent("ppo", "CartPole-v1")
     assert of("CartPole-v1", expert="ppo", expert_steps=3000).config.num_iterations == 3
     assert isinstance(of("CartPole-v1", expert="ddqn").config, DQNConfig)
     assert isinstance(of("Pendulum-v1", expert="ddpg").config, TD3Config)
@@ -385,7 +384,7 @@ def test_experts_are_trained_as_the_environment_is_but_for_pendulums_discount():
 
 
 def test_every_expert_has_an_environment_that_it_fits():
-    for expert in EXPERTS:
+    for expert in ("auto", "evolution", *ALGORITHMS):
         for name in ("Pendulum-v1", "CartPole-v1"):
             env, env_params = make(name)
             space = env.action_space(env_params)

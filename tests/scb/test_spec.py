@@ -1,4 +1,6 @@
+import math
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import chex
@@ -9,44 +11,51 @@ import pytest
 from gymnax.environments import spaces
 from scipy import stats
 
-from scb.agents.hyperparameters import (
+from scb.agents.ppo import PPOConfig, PPOHyperparameters
+from scb.agents.spec import (
     ALGORITHMS,
+    AgentSpec,
+    algorithms_for,
+    bandit_agent,
+    check_algorithms,
+    check_lists,
+    environment_agent,
+)
+from scb.agents.tables import (
     DDPG_INNER_LOOP,
     DQN_INNER_LOOP,
     PPO_INNER_LOOP,
     SAC_INNER_LOOP,
     TD3_INNER_LOOP,
-    algorithms_for,
-    check_algorithms,
-    check_lists,
-    inner_loop,
-    sample_hyperparameters,
 )
-from scb.agents.ppo import PPOConfig, PPOHyperparameters
-from scb.agents.settings import environment_setting, environment_settings
 from scb.agents.td3 import TD3Config, TD3Hyperparameters
 from scb.environments.brax import BRAX_NAMES
-from scb.environments.registry import environment_names, make
+from scb.environments.registry import environment_names, families, make
 from scb.errors import UserError
 from tests.scb.probes import ContinuousCorridor, Corridor
 
 DISCRETE, BOX = spaces.Discrete(2), spaces.Box(-1.0, 1.0, (1,), jnp.float32)
-# {algorithm: (its lists, a space that it fits)}
+# {algorithm: (its lists, an environment of classic control that it fits)}
 TABLES = {
-    "ppo": (PPO_INNER_LOOP, DISCRETE),
-    "sac": (SAC_INNER_LOOP, DISCRETE),
-    "dqn": (DQN_INNER_LOOP, DISCRETE),
-    "ddpg": (DDPG_INNER_LOOP, BOX),
-    "td3": (TD3_INNER_LOOP, BOX),
+    "ppo": (PPO_INNER_LOOP, "CartPole-v1"),
+    "sac": (SAC_INNER_LOOP, "CartPole-v1"),
+    "dqn": (DQN_INNER_LOOP, "CartPole-v1"),
+    "ddpg": (DDPG_INNER_LOOP, "MountainCarContinuous-v0"),
+    "td3": (TD3_INNER_LOOP, "MountainCarContinuous-v0"),
 }
 DRAWS, AGENTS = 2000, 3
+
+
+def ppo(lists):
+    """PPO on its defaults, but for what is drawn."""
+    return AgentSpec("ppo", PPOConfig(), PPOHyperparameters(), lists)
 
 
 @pytest.fixture(scope="module")
 def draws():
     """[DRAWS, AGENTS] hyperparameters."""
     keys = jax.random.split(jax.random.key(0), DRAWS)
-    return jax.vmap(lambda key: sample_hyperparameters(key, PPO_INNER_LOOP, AGENTS))(keys)
+    return jax.vmap(lambda key: ppo(PPO_INNER_LOOP).sample(key, AGENTS))(keys)
 
 
 @pytest.mark.parametrize("name", PPO_INNER_LOOP)
@@ -72,7 +81,7 @@ def test_agents_share_the_values_out(draws, name):
 @pytest.mark.parametrize("number", [1, 5, 13])
 def test_no_value_is_dealt_more_than_once_more_than_another(number):
     # 13 agents and 5 values: two or three agents each.
-    drawn = sample_hyperparameters(jax.random.key(number), PPO_INNER_LOOP, number)
+    drawn = ppo(PPO_INNER_LOOP).sample(jax.random.key(number), number)
     for name, values in PPO_INNER_LOOP.items():
         array = np.asarray(getattr(drawn, name))
         assert array.shape == (number,)
@@ -81,9 +90,9 @@ def test_no_value_is_dealt_more_than_once_more_than_another(number):
 
 
 def test_what_has_no_list_keeps_its_default():
-    drawn = sample_hyperparameters(jax.random.key(0), {"discount": [0.5]}, 2)
+    drawn = ppo({"discount": [0.5]}).sample(jax.random.key(0), 2)
     np.testing.assert_array_equal(drawn.discount, 0.5)
-    nothing_drawn = sample_hyperparameters(jax.random.key(0), {}, 2)
+    nothing_drawn = ppo({}).sample(jax.random.key(0), 2)
     for name, default in vars(PPOHyperparameters()).items():
         if default is None:
             assert getattr(nothing_drawn, name) is getattr(drawn, name) is None
@@ -95,7 +104,7 @@ def test_what_has_no_list_keeps_its_default():
 
 def test_the_order_of_the_lists_does_not_matter():
     backwards = dict(reversed(PPO_INNER_LOOP.items()))
-    a, b = (sample_hyperparameters(jax.random.key(3), x, 4) for x in (PPO_INNER_LOOP, backwards))
+    a, b = (ppo(x).sample(jax.random.key(3), 4) for x in (PPO_INNER_LOOP, backwards))
     chex.assert_trees_all_equal(a, b)
 
 
@@ -108,21 +117,26 @@ def test_algorithms_are_the_papers_for_each_kind_of_action():
     assert algorithms_for(BOX) == ("ppo", "sac", "ddpg", "td3")
 
 
-@pytest.mark.parametrize("space", [DISCRETE, BOX])
-def test_the_papers_algorithms_fit_and_make_agents_of_their_own_configuration(space):
+@pytest.mark.parametrize(
+    ("space", "kind", "environment"),
+    [(DISCRETE, "discrete", "CartPole-v1"), (BOX, "continuous", "MountainCarContinuous-v0")],
+)
+def test_the_papers_algorithms_fit_and_make_agents_of_their_own_configuration(
+    space, kind, environment
+):
     env = Corridor() if space is DISCRETE else ContinuousCorridor()
     for algorithm in algorithms_for(space):
-        check_algorithms([algorithm], space)
-        loop = inner_loop(algorithm, "CartPole-v1", space)
+        check_algorithms([algorithm], kind)
+        loop = bandit_agent(algorithm, environment)
         agent = loop.agent(env)
         assert agent.env is env and agent.config is loop.config
-        assert loop.name == algorithm
+        assert loop.algorithm == algorithm
 
 
 @pytest.mark.parametrize("algorithm", TABLES)
 def test_the_defaults_are_values_of_the_lists(algorithm):
-    lists, space = TABLES[algorithm]
-    hyperparameters = inner_loop(algorithm, "CartPole-v1", space).hyperparameters
+    lists, environment = TABLES[algorithm]
+    hyperparameters = bandit_agent(algorithm, environment).hyperparameters
     for name, values in lists.items():
         assert getattr(hyperparameters, name) in values
 
@@ -132,29 +146,29 @@ def test_continuous_actions_drop_the_largest_learning_rate(algorithm):
     # Liesen et al. (2024), in the tables: 0.01 is left out for continuous environments.
     table = dict(TABLES[algorithm][0])
     assert 0.01 in table["learning_rate"]
-    assert inner_loop(algorithm, "CartPole-v1", DISCRETE).lists == table
+    assert bandit_agent(algorithm, "CartPole-v1").lists == table
     table["learning_rate"] = (0.005, 0.001, 0.0005, 0.0001)
-    assert inner_loop(algorithm, "MountainCarContinuous-v0", BOX).lists == table
+    assert bandit_agent(algorithm, "MountainCarContinuous-v0").lists == table
 
 
 @pytest.mark.parametrize("algorithm", ["ddpg", "td3"])
 def test_algorithms_for_continuous_actions_never_draw_the_largest_learning_rate(algorithm):
-    lists = inner_loop(algorithm, "Pendulum-v1", BOX).lists
+    lists = bandit_agent(algorithm, "Pendulum-v1").lists
     assert lists["learning_rate"] == (0.005, 0.001, 0.0005, 0.0001)
 
 
 @pytest.mark.parametrize("algorithm", algorithms_for(BOX))
 def test_only_pendulum_has_relu_networks(algorithm):
-    assert inner_loop(algorithm, "Pendulum-v1", BOX).config.activation == "relu"
+    assert bandit_agent(algorithm, "Pendulum-v1").config.activation == "relu"
     for environment in ("MountainCarContinuous-v0", "hopper"):
-        assert inner_loop(algorithm, environment, BOX).config.activation == "tanh"
+        assert bandit_agent(algorithm, environment).config.activation == "tanh"
 
 
 @pytest.mark.parametrize("algorithm", algorithms_for(BOX))
 def test_nothing_is_drawn_in_brax_or_where_it_is_not_asked_for(algorithm):
     for loop in (
-        inner_loop(algorithm, "hopper", BOX),
-        inner_loop(algorithm, "Pendulum-v1", BOX, sampled=False),
+        bandit_agent(algorithm, "hopper"),
+        bandit_agent(algorithm, "Pendulum-v1", sampled=False),
     ):
         assert loop.lists == {}
         drawn = loop.sample(jax.random.key(0), 3)
@@ -166,7 +180,7 @@ def test_nothing_is_drawn_in_brax_or_where_it_is_not_asked_for(algorithm):
 
 
 def test_ddqn_is_a_dqn_that_is_always_double():
-    ddqn, dqn = (inner_loop(name, "CartPole-v1", DISCRETE) for name in ("ddqn", "dqn"))
+    ddqn, dqn = (bandit_agent(name, "CartPole-v1") for name in ("ddqn", "dqn"))
     assert ddqn.config == dqn.config
     assert set(dqn.lists) - set(ddqn.lists) == {"double"}
     np.testing.assert_array_equal(ddqn.sample(jax.random.key(0), 8).double, 1.0)
@@ -175,7 +189,7 @@ def test_ddqn_is_a_dqn_that_is_always_double():
 
 @pytest.mark.parametrize("algorithm", ["ddpg", "td3"])
 def test_ddpg_is_a_td3_of_one_critic_no_delay_and_no_target_noise(algorithm):
-    loop = inner_loop(algorithm, "Pendulum-v1", BOX)
+    loop = bandit_agent(algorithm, "Pendulum-v1")
     assert isinstance(loop.config, TD3Config)
     drawn = loop.sample(jax.random.key(0), 5)
     assert isinstance(drawn, TD3Hyperparameters)
@@ -191,8 +205,8 @@ def test_ddpg_is_a_td3_of_one_critic_no_delay_and_no_target_noise(algorithm):
 
 def test_the_steps_of_an_inner_loop_are_the_tables():
     # PPO: 20 batches of 5 x 100. Off-policy: 1000 of prefill, 9000 / num_envs steps of num_envs.
-    for algorithm, (_, space) in TABLES.items():
-        assert inner_loop(algorithm, "CartPole-v1", space).steps == 10_000
+    for algorithm, (_, environment) in TABLES.items():
+        assert bandit_agent(algorithm, environment).steps == 10_000
 
 
 # -- what is refused
@@ -203,9 +217,9 @@ def test_an_unknown_hyperparameter_or_an_empty_list_is_refused():
     with pytest.raises(
         UserError, match="unknown hyperparameter 'momentum': known are learning_rate"
     ):
-        sample_hyperparameters(jax.random.key(0), {"momentum": [0.9]}, 1)
+        ppo({"momentum": [0.9]})
     with pytest.raises(UserError, match="the list of values for discount is empty"):
-        sample_hyperparameters(jax.random.key(0), {"discount": []}, 1)
+        ppo({"discount": []})
 
 
 @pytest.mark.parametrize(
@@ -224,17 +238,25 @@ def test_lists_are_checked_against_the_algorithms_own_hyperparameters(lists, mes
 
 
 @pytest.mark.parametrize(
-    ("names", "space", "message"),
+    ("names", "kind", "message"),
     [
-        ([], DISCRETE, "the list of algorithms is empty: give one or more of ppo, sac, dqn, ddqn"),
-        (["tdd"], BOX, "unknown algorithm 'tdd': did you mean td3"),
-        (["ppo", "td3"], DISCRETE, "td3 does not fit .* discrete actions: use ppo, sac, dqn, ddqn"),
-        (["dqn"], BOX, "dqn does not fit .* continuous actions: use ppo, sac, ddpg, td3"),
+        (
+            [],
+            "discrete",
+            "the list of algorithms is empty: give one or more of ppo, sac, dqn, ddqn",
+        ),
+        (["tdd"], "continuous", "unknown algorithm 'tdd': did you mean td3"),
+        (
+            ["ppo", "td3"],
+            "discrete",
+            "td3 does not fit .* discrete actions: use ppo, sac, dqn, ddqn",
+        ),
+        (["dqn"], "continuous", "dqn does not fit .* continuous actions: use ppo, sac, ddpg, td3"),
     ],
 )
-def test_algorithms_that_cannot_be_trained_are_refused(names, space, message):
+def test_algorithms_that_cannot_be_trained_are_refused(names, kind, message):
     with pytest.raises(UserError, match=message):
-        check_algorithms(names, space)
+        check_algorithms(names, kind)
 
 
 # -- settings for environments themselves
@@ -243,37 +265,69 @@ def test_algorithms_that_cannot_be_trained_are_refused(names, space, message):
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 def test_settings_are_for_environments_that_exist_and_have_numbers_in_their_range(algorithm):
-    settings = environment_settings(algorithm)
-    assert set(settings) <= set(environment_names())
-    for name in (*settings, "CartPole-v1"):
-        setting = environment_setting(name, algorithm)
-        assert 0 < setting.hyperparameters.learning_rate <= 0.01
-        assert 0 < setting.hyperparameters.discount <= 1
-        assert 0 <= setting.num_environment_steps - setting.config.total_steps < 20_000
-        assert setting.config.batch_size <= setting.config.total_steps
-        assert setting.source
+    own = ALGORITHMS[algorithm].environments
+    assert set(own) <= {*environment_names(), *families()}
+    for name in (*set(own) - {"minatar"}, "Breakout-MinAtar", "CartPole-v1"):
+        spec = environment_agent(algorithm, name)
+        assert 0 < spec.hyperparameters.learning_rate <= 0.01
+        assert 0 < spec.hyperparameters.discount <= 1
+        assert 0 <= spec.steps - spec.config.total_steps < 20_000
+        assert spec.config.batch_size <= spec.config.total_steps
+        assert spec.source
 
 
 def test_only_mountain_cars_training_has_longer_episodes_than_the_environment():
     limits = {
-        (name, algorithm): setting.episode_limit
-        for algorithm in ALGORITHMS
-        for name, setting in environment_settings(algorithm).items()
+        (name, algorithm): row.episode_limit
+        for algorithm, tables in ALGORITHMS.items()
+        for name, row in tables.environments.items()
     }
     assert {k: v for k, v in limits.items() if v is not None} == {("MountainCar-v0", "sac"): 1000}
     _, params = make("MountainCar-v0")
-    longer = environment_setting("MountainCar-v0", "sac").training_params(params)
+    longer = environment_agent("sac", "MountainCar-v0").training_params(params)
     assert longer.max_steps_in_episode == 1000 and params.max_steps_in_episode == 200
-    assert environment_setting("Acrobot-v1", "sac").training_params(params) is params
+    assert environment_agent("sac", "Acrobot-v1").training_params(params) is params
 
 
 def test_an_unknown_algorithm_has_no_settings():
     with pytest.raises(UserError, match="unknown algorithm 'tdd': did you mean td3"):
-        environment_setting("CartPole-v1", "tdd")
+        environment_agent("tdd", "CartPole-v1")
 
 
 def test_an_environment_without_a_setting_gets_ten_times_the_inner_loops_steps():
-    assert environment_setting("CartPole-v1").config.total_steps == 10 * PPOConfig().total_steps
+    assert (
+        environment_agent("ppo", "CartPole-v1").config.total_steps == 10 * PPOConfig().total_steps
+    )
+
+
+def test_other_values_take_the_place_of_a_settings_own():
+    own = environment_agent("ppo", "Pendulum-v1")
+    shorter, small = own.with_steps(20_000), own.with_values(policy_output_scale=0.01)
+    assert own.config.total_steps == 150_000
+    assert shorter == replace(own, config=replace(own.config, total_steps=20_000))
+    numbers = replace(own.hyperparameters, policy_output_scale=0.01)
+    assert small == replace(own, hyperparameters=numbers)
+    assert own.with_steps(None).with_values(policy_output_scale=None) == own
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"policy_output_scale": -1.0}, "policy_output_scale is -1.0: it must be 0 or larger"),
+        ({"learning_rate": math.inf}, "learning_rate is inf: it must be 0 or larger, and finite"),
+        ({"discount": math.nan}, "discount is nan: it must be 0 or larger, and finite"),
+        ({"polyak": 0.9}, "ppo has no polyak: known are num_envs, .*learning_rate"),
+    ],
+)
+def test_values_that_cannot_be_are_refused(values, message):
+    with pytest.raises(UserError, match=message):
+        ppo({}).with_values(**values)
+
+
+@pytest.mark.parametrize("steps", [0, -5])
+def test_no_steps_are_refused(steps):
+    with pytest.raises(UserError, match=f"^steps is {steps}: it must be at least 1.$"):
+        ppo({}).with_steps(steps)
 
 
 # -- the paper's own tables
@@ -396,12 +450,11 @@ def assert_field(loop, field, expected, where):
 @needs_paper
 @pytest.mark.parametrize("algorithm", TABLES)
 def test_the_inner_loop_is_the_papers_table(algorithm):
-    lists, space = TABLES[algorithm]
+    lists, classic = TABLES[algorithm]
     heading, *rows = table(f"tab:hyper_se_{algorithm}")
     listed = {}
     for column, title in enumerate(heading[1:], 1):
-        environment = "hopper" if title == "brax" else "CartPole-v1"
-        loop = inner_loop(algorithm, environment, BOX if title == "brax" else space)
+        loop = bandit_agent(algorithm, "hopper" if title == "brax" else classic)
         for row in rows:
             if row[column] == "n.a.":
                 continue
@@ -419,12 +472,17 @@ def test_the_inner_loop_is_the_papers_table(algorithm):
 def test_the_brax_experts_are_the_papers_tables(algorithm):
     heading, *rows = table(f"tab:{algorithm}_expert_brax")
     names = [title.lower() for title in heading[1:]]
-    settings = environment_settings(algorithm)
+    settings = ALGORITHMS[algorithm].environments
     # Classic control has settings from elsewhere.
     assert set(names) == set(settings) & set(BRAX_NAMES) and len(names) == 5
     for column, name in enumerate(names, 1):
         for row in rows:
             assert len(row) == 6, row
             _, expected = value(row[column])
-            assert_field(settings[name], FIELDS[row[0]], expected, (algorithm, name, row[0]))
+            assert_field(
+                environment_agent(algorithm, name),
+                FIELDS[row[0]],
+                expected,
+                (algorithm, name, row[0]),
+            )
     assert len(rows) >= 12
