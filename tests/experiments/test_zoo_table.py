@@ -144,8 +144,8 @@ def tiny(tmp_path, monkeypatch):
         sizes = {"num_envs": 2, "num_steps": 8, "num_epochs": 1, "num_minibatches": 1}
         return full(*arguments, **keywords).with_values(total_steps=16, hidden_sizes=(4,), **sizes)
 
-    monkeypatch.setattr(specs, "bandit_agent", small)
-    monkeypatch.setattr(specs, "algorithms_for", lambda space: ("ppo",))
+    monkeypatch.setattr(zoo_table, "bandit_agent", small)
+    monkeypatch.setattr(zoo_table, "algorithms_for", lambda space: ("ppo",))
     monkeypatch.setattr(zoo_table, "DEFAULT_PUBLISHED", tmp_path / "nothing")
     arguments = ["--bandits", str(path), "--agents", "2", "--episodes", "2"]
     arguments += ["--out", str(tmp_path / "data" / "zoo_table.json"), "--docs", str(tmp_path)]
@@ -184,7 +184,7 @@ def test_a_measurement_is_what_judging_gives_and_is_not_repeated(tiny, tmp_path,
         calls.append((seed, num_agents, num_episodes))
         return {"sampled_actions": np.ones(num_agents), "mode_actions": np.ones(num_agents)}
 
-    monkeypatch.setattr("scb.discovery.judge", counted)
+    monkeypatch.setattr(zoo_table, "judge", counted)
     assert zoo_table.main(arguments) == 0
     assert calls == []
     # Another number of episodes is another measurement, and takes the old one's place.

@@ -18,7 +18,7 @@ from scb.warm_start import (
     WarmStartConfig,
     energy_distance,
     expert_dataset,
-    expert_setting,
+    expert_agent,
     find_expert,
     fit_bandit,
     reward_targets,
@@ -362,7 +362,7 @@ def test_the_expert_is_the_best_of_those_that_were_trained():
 def test_an_expert_is_ppos_where_it_has_a_setting_of_its_own_and_evolutions_elsewhere(
     name, algorithm
 ):
-    setting = expert_setting(name, spaces.Box(-1.0, 1.0, (1,), jnp.float32), WarmStartConfig())
+    setting = expert_agent(name, spaces.Box(-1.0, 1.0, (1,), jnp.float32), WarmStartConfig())
     assert (setting is None) == (algorithm is None)
     if setting is not None:
         assert isinstance(setting.config, PPOConfig)
@@ -371,7 +371,7 @@ def test_an_expert_is_ppos_where_it_has_a_setting_of_its_own_and_evolutions_else
 def test_experts_are_trained_as_the_environment_is_but_for_pendulums_discount():
     def of(name, **arguments):
         env, env_params = make(name)
-        return expert_setting(name, env.action_space(env_params), WarmStartConfig(**arguments))
+        return expert_agent(name, env.action_space(env_params), WarmStartConfig(**arguments))
 
     assert of("Pendulum-v1").hyperparameters.discount == 0.95
     assert environment_agent("ppo", "Pendulum-v1").hyperparameters.discount == 0.995
@@ -392,10 +392,10 @@ def test_every_expert_has_an_environment_that_it_fits():
             fits = {"dqn": "CartPole-v1", "ddqn": "CartPole-v1"}
             fits |= {"ddpg": "Pendulum-v1", "td3": "Pendulum-v1"}
             if fits.get(expert, name) == name:
-                expert_setting(name, space, config)
+                expert_agent(name, space, config)
             else:
                 with pytest.raises(UserError, match=f"{expert} does not fit the environment's"):
-                    expert_setting(name, space, config)
+                    expert_agent(name, space, config)
 
 
 def test_evolution_gets_the_papers_curriculum_at_its_own_length(monkeypatch):
@@ -452,7 +452,7 @@ def test_impossible_configurations_are_refused(arguments, message):
 def test_an_expert_that_cannot_be_trained_is_refused(name, arguments, message):
     env, env_params = make(name)
     with pytest.raises(UserError, match=message):
-        expert_setting(name, env.action_space(env_params), WarmStartConfig(**arguments))
+        expert_agent(name, env.action_space(env_params), WarmStartConfig(**arguments))
 
 
 def test_an_action_space_of_one_number_has_scalar_shapes():
