@@ -25,9 +25,9 @@ import numpy as np
 from experiments.page import exit_status
 from lpo import drift_figures
 from lpo.cli import configure_jax
-from lpo.formula import ClosedFormDrift
+from lpo.drifts import ClosedFormDrift
 from lpo.objectives import load_objective, zoo_names
-from lpo.understanding import REGIONS, analyze, is_temporal
+from lpo.understanding import REGIONS, analyze
 from scb import plotting
 from scb.artefacts import package_versions
 from scb.errors import UserError
@@ -41,7 +41,7 @@ def measure(names: Sequence[str]) -> list[dict[str, Any]]:
     """The analyses of these objectives, temporal ones at every fraction of `PROGRESS`."""
     rows = []
     for objective in map(load_objective, names):
-        temporal = is_temporal(objective)
+        temporal = objective.drift.temporal
         for fraction in PROGRESS if temporal else (0.5,):
             rows.append({**analyze(objective, fraction).as_dict(), "temporal": temporal})
     return rows

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 from experiments.page import exit_status, run_name
-from lpo.drift import LearnedDrift
 from lpo.objectives import load_objective, save_objective
 from scb.errors import UserError
 
@@ -39,7 +38,7 @@ def main() -> int:
     arguments = parser.parse_args()
 
     objective = load_objective(arguments.objective)
-    if not isinstance(objective.drift, LearnedDrift):
+    if not objective.drift.learned:
         raise UserError(f"{objective.name} is a closed form: the zoo holds learned objectives.")
     metadata: dict[str, Any] = dict(objective.metadata)
     results = dict(metadata["results"])

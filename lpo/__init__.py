@@ -5,57 +5,22 @@ imports it for good.
 """
 
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
-
-if TYPE_CHECKING:
-    from lpo.certificate import Certificate, certify
-    from lpo.drift import ClipDrift, DPODrift, Drift, LearnedDrift, NoDrift
-    from lpo.generalization import compare, learning_curves
-    from lpo.meta_training import MetaTrainingConfig, meta_train
-    from lpo.objectives import Objective, load_objective, save_objective
-    from lpo.portable import drift_function, numpy_drift, torch_drift, torch_loss
+from typing import Any
 
 _HOME = {
-    "Certificate": "lpo.certificate",
-    "certify": "lpo.certificate",
-    "ClipDrift": "lpo.drift",
-    "DPODrift": "lpo.drift",
-    "Drift": "lpo.drift",
-    "LearnedDrift": "lpo.drift",
-    "NoDrift": "lpo.drift",
-    "compare": "lpo.generalization",
-    "learning_curves": "lpo.generalization",
-    "MetaTrainingConfig": "lpo.meta_training",
-    "meta_train": "lpo.meta_training",
-    "Objective": "lpo.objectives",
-    "load_objective": "lpo.objectives",
-    "save_objective": "lpo.objectives",
-    "drift_function": "lpo.portable",
-    "numpy_drift": "lpo.portable",
-    "torch_drift": "lpo.portable",
-    "torch_loss": "lpo.portable",
+    name: f"lpo.{module}"
+    for module, names in {
+        "certificate": ("Certificate", "certify"),
+        "drifts": ("ClipDrift", "DPODrift", "Drift", "LearnedDrift", "NoDrift"),
+        "generalization": ("compare", "learning_curves"),
+        "meta_training": ("MetaTrainingConfig", "meta_train"),
+        "objectives": ("Objective", "load_objective", "save_objective"),
+        "portable": ("drift_function", "numpy_drift", "torch_drift", "torch_loss"),
+    }.items()
+    for name in names
 }
 
-__all__ = [
-    "Certificate",
-    "ClipDrift",
-    "DPODrift",
-    "Drift",
-    "LearnedDrift",
-    "MetaTrainingConfig",
-    "NoDrift",
-    "Objective",
-    "certify",
-    "compare",
-    "drift_function",
-    "learning_curves",
-    "load_objective",
-    "meta_train",
-    "numpy_drift",
-    "save_objective",
-    "torch_drift",
-    "torch_loss",
-]
+__all__ = list(_HOME)
 
 
 def __getattr__(name: str) -> Any:

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lpo.drift import ClipDrift, DPODrift, Drift, NoDrift
+from lpo.drifts import ClipDrift, DPODrift, Drift, NoDrift
 from lpo.fitness import FITNESSES, LABELS
 from lpo.generalization import (
     check_names,
@@ -25,7 +25,7 @@ from lpo.generalization import (
     over_objectives,
 )
 from lpo.meta_training import MetaTrainingConfig, TaskTraining, task_agent
-from lpo.objectives import Objective
+from lpo.objectives import Objective, closed_form
 from scb.agents.ppo import PPOHyperparameters
 from scb.agents.spec import AgentSpec, environment_agent
 from scb.artefacts import machine_description, package_versions
@@ -100,10 +100,9 @@ class Regime:
 
 def known_drifts() -> list[Objective]:
     """Clips from 0.05 to 1, no drift, and DPO over alpha and beta: a family that spans the scale."""
-    none = NoDrift()
     return [
         *_clips(0.05, 0.1, 0.2, 0.3, 0.5, 1.0),
-        Objective("none", none, none.init(root_key(0))),
+        closed_form("none", NoDrift()),
         *_dpo((1.0, 0.3), (2.0, 0.6), (4.0, 1.2)),
     ]
 

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lpo.drift import Drift
+from lpo.drifts.contract import Drift
 from scb.agents.ppo import MAX_LOG_RATIO
 
 

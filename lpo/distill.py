@@ -2,13 +2,13 @@
 
 A network that was learned can be written as a formula, as its authors did when they found DPO (Lu et
 al., 2022); here genetic programming does the reading (gplearn, the extra `distill`), least squares
-sets the numbers, and what comes out is a `lpo.formula.ClosedFormDrift`.
+sets the numbers, and what comes out is a `lpo.drifts.ClosedFormDrift`.
 """
 
 import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import jax
@@ -17,8 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lpo.certificate import certify
-from lpo.drift import LearnedDrift, gated
-from lpo.formula import FUNCTIONS, ClosedFormDrift, parse
+from lpo.drifts import ClosedFormDrift
+from lpo.drifts.contract import CorrectedDrift
+from lpo.drifts.formula import FUNCTIONS, parse
+from scb.agents.ppo import clipped_surrogate_drift
 from scb.errors import UserError
 from scb.keys import root_key
 
@@ -133,12 +135,12 @@ def distill(objective: "Objective", config: DistillConfig | None = None) -> Dist
     start = time.perf_counter()
     config = config or DistillConfig()
     drift = objective.drift
-    shape: dict[str, Any] = {"base": "none"}
-    if isinstance(drift, LearnedDrift | ClosedFormDrift):
-        shape = {"base": drift.base, "clip": drift.clip, "xi": drift.xi, "gate": drift.gate}
+    nothing = ClosedFormDrift("0*d")
+    if isinstance(drift, CorrectedDrift):
+        nothing = replace(nothing, base=drift.base, clip=drift.clip, xi=drift.xi, gate=drift.gate)
     rng = np.random.default_rng(config.seed)
-    temporal = bool(getattr(drift, "temporal", False))
-    fit = _Data(objective, sample_updates(rng, config.samples), shape)
+    temporal = drift.temporal
+    fit = _Data(objective, sample_updates(rng, config.samples), nothing)
     if not fit.drift.max() > 0.0:
         raise UserError(
             f"{objective.name} charges nothing where updates go: there is no drift to write as a formula."
@@ -159,7 +161,7 @@ def distill(objective: "Objective", config: DistillConfig | None = None) -> Dist
     for text, score, _ in front:
         if score < best - config.tolerance:
             continue
-        closed = ClosedFormDrift(text, **shape)
+        closed = replace(nothing, expression=text)
         parameters = closed.init(root_key(0))
         if certify(closed, parameters).holds:
             break
@@ -167,7 +169,6 @@ def distill(objective: "Objective", config: DistillConfig | None = None) -> Dist
         raise UserError(
             f"no formula for {objective.name} passes as a drift: search with another seed."
         )
-    nothing = ClosedFormDrift("0*d", **shape)
     return Distillation(
         drift=closed,
         parameters=parameters,
@@ -222,19 +223,18 @@ class _Data:
         self,
         objective: "Objective",
         points: Mapping[str, NDArray[np.floating]],
-        shape: Mapping[str, Any],
+        around: ClosedFormDrift,
     ) -> None:
         x = points["log_ratio"]
         x = np.concatenate([x, x + _STEP, x - _STEP])
         a, p = np.tile(points["advantage"], 3), np.tile(points["progress"], 3)
         # As the closed form will compute it: its own base, and nothing of the network's.
-        self.xi = float(shape.get("xi", ClosedFormDrift.xi))
-        self.base = np.zeros_like(x)
-        if shape["base"] == "ppo":
-            clip, ratio = shape["clip"], np.exp(x)
-            self.base = np.maximum((ratio - np.clip(ratio, 1.0 - clip, 1.0 + clip)) * a, 0.0)
+        self.xi, self.base, self.gate = around.xi, np.zeros_like(x), np.ones_like(x)
+        if around.base == "ppo":
+            self.base = clipped_surrogate_drift(around.clip, x, a, p, np)
+        if around.gate:
+            self.gate = around.gate_factor(x)
         self.variables = {"d": np.expm1(x), "log_r": x, "A": a, "abs(A)": np.abs(a), "progress": p}
-        self.gate = gated(np.ones_like(x), x, shape.get("gate", ClosedFormDrift.gate), np)
         f = objective.drift(objective.parameters, *(jnp.asarray(v, jnp.float32) for v in (x, a, p)))
         self.drift, self.slope = self._split(np.asarray(f, float))
         # Residuals in units of the standard deviation: 1 - R² is the mean of their squares.

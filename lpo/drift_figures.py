@@ -17,7 +17,7 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator, NullLocator
 from numpy.typing import NDArray
 
-from lpo.understanding import CLIP, REGIONS, analyze, is_temporal
+from lpo.understanding import CLIP, REGIONS, analyze
 from scb.errors import UserError
 from scb.plotting import (
     GREEN,
@@ -208,7 +208,7 @@ def drift_and_gradient(
             analyze(o, fraction),
         )
         for o in objectives
-        for fractions in [progress if is_temporal(o) else (0.5,)]
+        for fractions in [progress if o.drift.temporal else (0.5,)]
         for fraction in fractions
     ]
     names = list(REGIONS)

@@ -6,7 +6,7 @@ from typing import Any
 
 from lpo import figures
 from lpo.certificate import Certificate
-from lpo.drift import LearnedDrift
+from lpo.drifts import LearnedDrift
 from lpo.meta_training import VALIDATION_AGENTS, MetaTraining, MetaTrainingConfig, chosen_mean
 from lpo.objectives import Objective, load_objective, save_objective
 from lpo.pipeline import meta_training_artefact

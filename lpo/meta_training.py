@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
 
-from lpo.drift import Drift, LearnedDrift
+from lpo.drifts import Drift, LearnedDrift
 from lpo.fitness import FITNESSES, Fitness
 from lpo.suite import REFERENCES, random_return
 from scb.agents.ppo import PPOConfig, PPOHyperparameters, PPOState
@@ -44,8 +44,7 @@ class MetaTrainingConfig:
       tasks: where the inner loop trains: bandits ("Synthetic-Pendulum-v1"), or any environments.
         Of several, whose returns have different scales, `evolution.combine` says how they count.
       drift: the learned drift's family.
-      initial_scale: factor on the output layer's random start, so that the search begins near the
-        base.
+      initial_scale: of the drift's random start, so that the search begins near what it corrects.
       fitness: one of `lpo.fitness.FITNESSES`, by name. "return": of the trained agent where it was
         trained, without reward noise; "area": the mean of that over the training; "transfer": in
         the bandit's evaluation environment.
@@ -74,7 +73,7 @@ class MetaTrainingConfig:
     """
 
     tasks: tuple[str, ...] = ("Synthetic-Pendulum-v1",)
-    drift: LearnedDrift = field(default_factory=LearnedDrift)
+    drift: Drift = field(default_factory=LearnedDrift)
     initial_scale: float = 0.1
     fitness: str = "return"
     agent: PPOConfig | None = None
@@ -293,9 +292,8 @@ class MetaTraining:
                     for name, judge in self.judges.items()
                 }
 
-    def initial_solution(self, key: jax.Array) -> dict[str, jax.Array]:
-        weights = self.config.drift.init(key)
-        return {**weights, "output": weights["output"] * self.config.initial_scale}
+    def initial_solution(self, key: jax.Array) -> Any:
+        return self.config.drift.init(key, self.config.initial_scale)
 
     def evaluate(
         self, candidate: Any, key: jax.Array, generation: jax.Array

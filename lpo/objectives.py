@@ -9,11 +9,9 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from lpo.certificate import Certificate, certify
-from lpo.drift import TEMPORAL_FEATURES, ClipDrift, DPODrift, Drift, LearnedDrift, NoDrift
-from lpo.formula import ClosedFormDrift
+from lpo.drifts import ClipDrift, DPODrift, Drift, NoDrift, drift_from_config
 from scb import artefacts
 from scb.errors import UserError, unknown_name
 from scb.keys import root_key
@@ -59,13 +57,13 @@ def load_objective(name: str | Path) -> Objective:
     text = str(name)
     clip = _CLIP_NAME.match(text)
     if text == "ppo":
-        return _closed_form(text, ClipDrift())
+        return closed_form(text, ClipDrift())
     if clip:
-        return _closed_form(text, ClipDrift(float(clip.group(1))))
+        return closed_form(text, ClipDrift(float(clip.group(1))))
     if text == "dpo":
-        return _closed_form(text, DPODrift())
+        return closed_form(text, DPODrift())
     if text == "none":
-        return _closed_form(text, NoDrift())
+        return closed_form(text, NoDrift())
     if text in zoo_names():
         with resources.as_file(resources.files("lpo") / "zoo") as folder:
             return _from_file(folder / f"{text}.npz")
@@ -74,26 +72,15 @@ def load_objective(name: str | Path) -> Objective:
     raise unknown_name("objective", text, [*objective_names(), "path/to/objective.npz"])
 
 
-def _closed_form(name: str, drift: Drift) -> Objective:
-    # A closed form's parameters are not random.
+def closed_form(name: str, drift: Drift) -> Objective:
+    """The objective of a drift whose parameters its settings say: none of them is random."""
     return Objective(name, drift, drift.init(root_key(0)))
 
 
 def _from_file(path: Path) -> Objective:
     artefact = artefacts.load(path, KIND)
     try:
-        family = artefact.metadata["config"]["drift"]
-        if "expression" in family:
-            return _formula(path, artefact, family)
-        features = tuple(family["features"])
-        drift = LearnedDrift(
-            base=family["base"],
-            hidden_size=family["hidden_size"],
-            clip=family["clip"],
-            xi=family["xi"],
-            temporal=features == TEMPORAL_FEATURES,
-            gate=family.get("gate", 0.0),  # what was learned before there was one has none
-        )
+        drift = drift_from_config(artefact.metadata["config"]["drift"])
     except KeyError as error:
         raise UserError(
             f"{path} does not describe a drift: its .json lacks config entry {error}."
@@ -102,28 +89,12 @@ def _from_file(path: Path) -> Objective:
         raise UserError(
             f"{path} does not describe a drift: its .json garbles config entry 'drift' ({error})."
         ) from error
-    if features != drift.features:
-        raise UserError(
-            f"{path} was learned on other features ({', '.join(map(str, features))}) than this version computes "
-            f"({', '.join(drift.features)}): use the version that made it."
-        )
-    artefacts.expect_shapes(artefact, drift.weight_shapes())
+    except UserError as error:
+        raise UserError(f"{path}: {error}") from error
+    artefacts.expect_shapes(artefact, drift.shapes())
     parameters = jax.tree.map(jnp.asarray, dict(artefact.arrays))
-    return Objective(artefact.name, drift, parameters, artefact.metadata)
-
-
-def _formula(path: Path, artefact: artefacts.Artefact, family: Mapping[str, Any]) -> Objective:
-    drift = ClosedFormDrift(
-        expression=str(family["expression"]),
-        base=family["base"],
-        clip=family["clip"],
-        xi=family["xi"],
-        gate=family.get("gate", 0.0),
-    )
-    parameters = drift.init(root_key(0))
-    artefacts.expect_shapes(artefact, {"constants": parameters["constants"].shape})
-    # The text is what a reader sees, so it must be what is computed.
-    if not np.array_equal(np.asarray(artefact.arrays["constants"]), parameters["constants"]):
+    # Where settings say the parameters, a reader trusts those.
+    if drift.with_parameters(parameters) != drift:
         raise UserError(
             f"{path} holds other numbers than the expression in its .json: fetch or save both again."
         )
@@ -131,10 +102,7 @@ def _formula(path: Path, artefact: artefacts.Artefact, family: Mapping[str, Any]
 
 
 def save_objective(
-    path: str | Path,
-    drift: LearnedDrift | ClosedFormDrift,
-    parameters: Any,
-    metadata: Mapping[str, Any],
+    path: str | Path, drift: Drift, parameters: Any, metadata: Mapping[str, Any]
 ) -> tuple[Path, Certificate]:
     """Writes a learned objective, or a formula, with its certificate.
 
@@ -143,24 +111,11 @@ def save_objective(
       drift, parameters: the drift.
       metadata: config (of the meta-training), seeds, results, cost, command.
     """
-    if isinstance(drift, ClosedFormDrift) and not np.array_equal(
-        drift.init(root_key(0))["constants"], parameters["constants"]
-    ):
-        # Trained on: its text must say the numbers that it is saved with.
-        drift = drift.with_parameters(parameters)
-        parameters = drift.init(root_key(0))
+    told = drift.with_parameters(parameters)
+    if told != drift:  # trained on: what its text says now is what is saved
+        drift, parameters = told, told.init(root_key(0))
     certificate = certify(drift, parameters)
-    config = dict(metadata.get("config", {}))
-    own: dict[str, Any]
-    if isinstance(drift, ClosedFormDrift):
-        own = {"expression": drift.expression}
-    else:
-        own = {
-            "hidden_size": drift.hidden_size,
-            "features": list(drift.features),
-        }
-    shared = {"base": drift.base, "clip": drift.clip, "xi": drift.xi, "gate": drift.gate}
-    config["drift"] = {**shared, **own}
+    config = {**metadata.get("config", {}), "drift": drift.to_config()}
     full = {
         **metadata,
         "kind": KIND,

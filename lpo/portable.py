@@ -9,6 +9,7 @@ at ±`MAX_LOG_RATIO`, and advantages that the caller has normalised over the min
 """
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -17,8 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
-from lpo.drift import ClipDrift, DPODrift, LearnedDrift, NoDrift, gated
-from lpo.formula import ClosedFormDrift, evaluate, parse
+from lpo.drifts import Drift
 from lpo.objectives import Objective, load_objective
 from scb.agents.ppo import MAX_LOG_RATIO
 from scb.errors import UserError
@@ -29,10 +29,6 @@ if TYPE_CHECKING:
     TorchFunction: TypeAlias = Callable[
         [torch.Tensor, torch.Tensor, float | torch.Tensor], torch.Tensor
     ]
-
-# Any: an array of either library, and the library, `numpy` or `torch`. Both follow the array API
-# standard in what is used here, so that each formula is written once.
-_Formula: TypeAlias = Callable[[Any, Any, Any, Any], Any]
 
 
 def drift_function(
@@ -78,15 +74,16 @@ def numpy_drift(
     integers.
 
     Raises:
-      UserError: as `load_objective`, or the drift is of a family that lpo does not know.
+      UserError: as `load_objective`.
     """
-    formula = _formula(_loaded(objective))
+    objective = _loaded(objective)
+    drift, parameters = objective.drift, _host_parameters(objective)
 
     def penalty(log_ratio: ArrayLike, advantage: ArrayLike, progress: ArrayLike) -> np.ndarray:
         log_ratio, advantage = np.asarray(log_ratio), np.asarray(advantage)
         dtype = np.result_type(log_ratio, advantage, np.float32)
         log_ratio, advantage = log_ratio.astype(dtype), advantage.astype(dtype)
-        return np.asarray(_evaluate(np, formula, log_ratio, advantage, progress))
+        return np.asarray(_evaluate(np, drift, parameters, log_ratio, advantage, progress))
 
     return penalty
 
@@ -105,13 +102,14 @@ def torch_drift(objective: Objective | str | Path) -> "TorchFunction":
         raise UserError(
             "a drift for PyTorch needs the package torch: install the extra `torch`."
         ) from error
-    formula = _formula(_loaded(objective))
+    objective = _loaded(objective)
+    drift, parameters = objective.drift, _host_parameters(objective)
 
     def penalty(
         log_ratio: "torch.Tensor", advantage: "torch.Tensor", progress: "float | torch.Tensor"
     ) -> "torch.Tensor":
         result: torch.Tensor = _evaluate(
-            torch, formula, log_ratio, advantage.to(log_ratio), progress
+            torch, drift, parameters, log_ratio, advantage.to(log_ratio), progress
         )
         return result
 
@@ -149,105 +147,21 @@ def _check_shapes(log_ratio: Any, advantage: Any) -> None:
         )
 
 
-def _evaluate(xp: Any, formula: _Formula, log_ratio: Any, advantage: Any, progress: Any) -> Any:
+def _evaluate(
+    xp: Any,
+    drift: Drift,
+    parameters: Any,
+    log_ratio: Any,
+    advantage: Any,
+    progress: Any,
+) -> Any:
     _check_shapes(log_ratio, advantage)
+    like = partial(xp.asarray, dtype=log_ratio.dtype, device=log_ratio.device)
     log_ratio = xp.clip(log_ratio, -MAX_LOG_RATIO, MAX_LOG_RATIO)
-    progress = xp.broadcast_to(_like(xp, log_ratio, progress), log_ratio.shape)
-    return formula(xp, log_ratio, advantage, progress)
+    progress = xp.broadcast_to(like(progress), log_ratio.shape)
+    return drift(jax.tree.map(like, parameters), log_ratio, advantage, progress, xp)
 
 
-def _like(xp: Any, array: Any, values: Any) -> Any:
-    """Values as an array of another's type and device."""
-    return xp.asarray(values, dtype=array.dtype, device=array.device)
-
-
-def _relu(xp: Any, x: Any) -> Any:
-    # Not clip(x, 0), whose slope at 0 is 1 in torch and 0 in JAX. NumPy has no relu.
-    return xp.relu(x) if hasattr(xp, "relu") else xp.maximum(x, 0)
-
-
-def _formula(objective: Objective) -> _Formula:
-    """(numpy or torch, log_ratio, advantage, progress) -> penalty, as in lpo.drift and for the same parameters."""
-    drift, parameters = objective.drift, jax.device_get(objective.parameters)
-    match drift:
-        case NoDrift():
-            # Not zeros_like, which torch refuses to differentiate.
-            return lambda xp, log_ratio, advantage, progress: log_ratio - log_ratio
-        case ClipDrift():
-            clip = float(parameters)
-            return lambda xp, log_ratio, advantage, progress: _clip(xp, log_ratio, advantage, clip)
-        case DPODrift():
-            alpha, beta = float(parameters["alpha"]), float(parameters["beta"])
-            return lambda xp, log_ratio, advantage, progress: _dpo(
-                xp, log_ratio, advantage, alpha, beta
-            )
-        case LearnedDrift():
-            # Copied: what comes off a device is read-only, which torch warns of.
-            weights = {name: np.array(array) for name, array in parameters.items()}
-            return lambda xp, log_ratio, advantage, progress: _learned(
-                xp, log_ratio, advantage, progress, drift, weights
-            )
-        case ClosedFormDrift():
-            constants = [float(x) for x in parameters["constants"]]
-            return lambda xp, log_ratio, advantage, progress: _closed_form(
-                xp, log_ratio, advantage, progress, drift, constants
-            )
-    raise UserError(
-        f"{type(drift).__name__} has no form in NumPy and PyTorch: those that have are ClipDrift, DPODrift, NoDrift, "
-        "LearnedDrift and ClosedFormDrift; take `drift_function` for JAX, or write the formula out."
-    )
-
-
-def _clip(xp: Any, log_ratio: Any, advantage: Any, clip: float) -> Any:
-    ratio = xp.exp(log_ratio)
-    return _relu(xp, (ratio - xp.clip(ratio, 1.0 - clip, 1.0 + clip)) * advantage)
-
-
-def _dpo(xp: Any, log_ratio: Any, advantage: Any, alpha: float, beta: float) -> Any:
-    gain = xp.expm1(log_ratio) * advantage
-    loss = log_ratio * advantage
-    positive = _relu(xp, gain - alpha * xp.tanh(gain / alpha))
-    negative = _relu(xp, loss - beta * xp.tanh(loss / beta))
-    return xp.where(advantage >= 0, positive, negative)
-
-
-def _learned(
-    xp: Any,
-    log_ratio: Any,
-    advantage: Any,
-    progress: Any,
-    drift: LearnedDrift,
-    weights: dict[str, np.ndarray],
-) -> Any:
-    delta = -xp.expm1(log_ratio)
-    away = xp.stack([delta, delta**2, log_ratio, log_ratio**2], -1)
-    inputs = xp.concatenate([away, advantage[..., None] * away], -1)
-    if drift.temporal:
-        inputs = xp.concatenate([inputs, progress[..., None] * inputs], -1)
-    hidden, output = (_like(xp, log_ratio, weights[name]) for name in ("hidden", "output"))
-    penalty = (xp.tanh(inputs @ hidden) @ output)[..., 0]
-    penalty = gated(penalty, log_ratio, drift.gate, xp)
-    if drift.base == "ppo":
-        penalty = penalty + _clip(xp, log_ratio, advantage, drift.clip)
-    return _relu(xp, penalty - drift.xi)
-
-
-def _closed_form(
-    xp: Any,
-    log_ratio: Any,
-    advantage: Any,
-    progress: Any,
-    drift: ClosedFormDrift,
-    constants: list[float],
-) -> Any:
-    variables = {
-        "d": xp.expm1(log_ratio),
-        "log_r": log_ratio,
-        "A": advantage,
-        "progress": progress,
-    }
-    expression = evaluate(parse(drift.expression).root, constants, variables, xp)
-    penalty = gated(expression, log_ratio, drift.gate, xp)
-    if drift.base == "ppo":
-        penalty = penalty + _clip(xp, log_ratio, advantage, drift.clip)
-    return _relu(xp, penalty - drift.xi)
+def _host_parameters(objective: Objective) -> Any:
+    # Copied: what comes off a device is read-only, which torch warns of.
+    return jax.tree.map(np.array, jax.device_get(objective.parameters))

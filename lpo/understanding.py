@@ -180,11 +180,6 @@ def surface(
     )
 
 
-def is_temporal(objective: "Objective") -> bool:
-    """Whether the drift changes with the fraction of training done."""
-    return bool(getattr(objective.drift, "temporal", False))
-
-
 def midpoints(low: float, high: float, count: int) -> NDArray[np.floating]:
     """[count] middles of equal cells between two bounds: an even number of them misses the centre."""
     return low + (np.arange(count) + 0.5) * (high - low) / count

@@ -34,9 +34,17 @@ DriftFunction: TypeAlias = Callable[[Any, jax.Array, jax.Array, jax.Array], jax.
 MAX_LOG_RATIO = 20.0
 
 
+def relu(x: Any, xp: Any = jnp) -> Any:
+    """max(x, 0) of an array of `xp`, `jax.numpy`, `numpy` or `torch`, with slope 0 at 0 in each."""
+    if xp is jnp:
+        return jax.nn.relu(x)
+    # NumPy has none, nor slopes.
+    return xp.relu(x) if hasattr(xp, "relu") else xp.maximum(x, 0)
+
+
 def clipped_surrogate_drift(
-    clip: ArrayLike, log_ratio: jax.Array, advantage: jax.Array, progress: jax.Array
-) -> jax.Array:
+    clip: Any, log_ratio: Any, advantage: Any, progress: Any, xp: Any = jnp
+) -> Any:
     """PPO's clip written as a drift (Lu et al., 2022, eq. 4).
 
     Args:
@@ -44,13 +52,14 @@ def clipped_surrogate_drift(
       log_ratio: [B] log pi(a|s) - log pi_behaviour(a|s), in nats.
       advantage: [B] normalised advantage.
       progress: [B] fraction of training done; unused here.
+      xp: the arrays' library, `jax.numpy`, `numpy` or `torch`.
 
     Returns:
       [B] non-negative penalty; ratio * advantage - drift equals PPO's minimum.
     """
     chex.assert_equal_shape([log_ratio, advantage, progress])
-    ratio = jnp.exp(log_ratio)
-    return jax.nn.relu((ratio - jnp.clip(ratio, 1.0 - clip, 1.0 + clip)) * advantage)
+    ratio = xp.exp(log_ratio)
+    return relu((ratio - xp.clip(ratio, 1.0 - clip, 1.0 + clip)) * advantage, xp)
 
 
 @dataclass(frozen=True)

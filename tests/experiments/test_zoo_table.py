@@ -225,7 +225,7 @@ def published_pendulum(folder):
     folder.mkdir()
     for name, environment in (("pendulum", "Pendulum-v1"), ("hopper", "hopper")):
         bandit = bandit_for(*make(environment), BanditConfig(), environment)
-        shapes = bandit.weight_shapes()
+        shapes = bandit.shapes()
         np.savez(folder / f"{name}.npz", **{k: np.ones(v, np.float32) for k, v in shapes.items()})
     return folder
 

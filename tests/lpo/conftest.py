@@ -6,7 +6,7 @@ from pathlib import Path
 import jax
 import pytest
 
-from lpo.drift import LearnedDrift
+from lpo.drifts import LearnedDrift
 from lpo.objectives import save_objective
 from scb.agents.ppo import PPOConfig
 

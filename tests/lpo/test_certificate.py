@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import pytest
 
 from lpo.certificate import Certificate, certify
-from lpo.drift import ClipDrift, DPODrift, Drift, LearnedDrift, NoDrift
+from lpo.drifts import ClipDrift, DPODrift, Drift, LearnedDrift, NoDrift
 from lpo.objectives import load_objective
 
 GRID = {"num_ratios": 61, "num_advantages": 11}

@@ -16,7 +16,7 @@ from gymnax.environments import spaces
 
 import lpo
 from lpo import cli, commands, learning
-from lpo.drift import NoDrift
+from lpo.drifts import NoDrift
 from lpo.fitness import LABELS
 from lpo.generalization import LearningCurves
 from lpo.meta_training import MetaTrainingConfig

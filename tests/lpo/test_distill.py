@@ -12,8 +12,8 @@ import pytest
 from lpo import cli, commands
 from lpo.certificate import certify
 from lpo.distill import DistillConfig, _as_sum, as_text, distill
-from lpo.drift import ClipDrift, DPODrift, LearnedDrift
-from lpo.formula import ClosedFormDrift, parse
+from lpo.drifts import ClipDrift, ClosedFormDrift, DPODrift, LearnedDrift
+from lpo.drifts.formula import parse
 from lpo.objectives import Objective, load_objective, save_objective
 from scb.agents.ppo import PPO, PPOHyperparameters
 from scb.environments.registry import make

@@ -1,5 +1,6 @@
 """What PPO's clip, DPO and any learned network charge, and what a drift must never charge."""
 
+import json
 from dataclasses import replace
 
 import jax
@@ -10,24 +11,15 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from lpo.certificate import certify
-from lpo.drift import (
-    BASES,
-    FEATURES,
-    ClipDrift,
-    DPODrift,
-    Drift,
-    LearnedDrift,
-    NoDrift,
-    drift_features,
-)
+from lpo.drifts import DRIFTS, ClipDrift, DPODrift, Drift, LearnedDrift, drift_from_config
+from lpo.drifts.contract import BASES
+from lpo.drifts.network import FEATURES, drift_features
 from scb.agents.ppo import MAX_LOG_RATIO
 from scb.errors import UserError
 
+EXPRESSION = "0.5*A*d - tanh(2*log_r)"
 MEMBERS = {
-    "clip": ClipDrift(),
-    "dpo": DPODrift(),
-    "none": NoDrift(),
-    "learned": LearnedDrift(hidden_size=4),
+    name: drift(EXPRESSION) if name == "formula" else drift() for name, drift in DRIFTS.items()
 }
 HIDDEN = 4
 LEARNED = {base: LearnedDrift(base=base, hidden_size=HIDDEN) for base in BASES}
@@ -150,7 +142,7 @@ def test_a_network_by_hand_charges_beyond_xi_and_nothing_within():
 
 def random_weights(seed: int, scale: float) -> dict[str, jax.Array]:
     rng = np.random.default_rng(seed)
-    shapes = LearnedDrift(hidden_size=HIDDEN).weight_shapes()
+    shapes = LearnedDrift(hidden_size=HIDDEN).shapes()
     return {
         name: jnp.asarray(scale * rng.normal(size=shape), jnp.float32)
         for name, shape in shapes.items()
@@ -247,7 +239,7 @@ def test_antithetic_candidates_tie_around_zero_weights_but_not_around_init():
 def test_init_is_random_and_nowhere_zero(base):
     drift = LEARNED[base]
     first, second = drift.init(jax.random.key(0)), drift.init(jax.random.key(1))
-    assert {name: w.shape for name, w in first.items()} == drift.weight_shapes()
+    assert {name: w.shape for name, w in first.items()} == drift.shapes()
     for name in first:
         assert np.all(np.asarray(first[name]) != 0.0)
         assert np.any(np.asarray(first[name]) != np.asarray(second[name]))
@@ -263,17 +255,45 @@ def drift_grid() -> tuple[jax.Array, jax.Array, jax.Array]:
 
 
 @pytest.mark.parametrize("name", MEMBERS)
-def test_every_member_keeps_the_contract(name):
+def test_every_registered_drift_keeps_the_contract(name):
     drift = MEMBERS[name]
-    assert isinstance(drift, Drift)
+    assert drift.name == name
     assert hash(drift) == hash(type(drift)(**vars(drift)))  # static: equal drifts share a program
     values = drift(drift.init(KEY), *drift_grid())
     assert values.shape == (63,)
     assert values.dtype == jnp.float32
 
 
-def test_a_plain_function_is_no_member():
-    assert not isinstance(lambda parameters, r, a, p: r, Drift)
+@pytest.mark.parametrize("name", MEMBERS)
+def test_every_registered_drift_comes_back_from_its_description(name):
+    described = json.loads(json.dumps(MEMBERS[name].to_config()))
+    assert drift_from_config(described) == MEMBERS[name]
+    with pytest.raises(UserError, match=f"unknown drift '{name}s': did you mean {name}"):
+        drift_from_config({**described, "family": f"{name}s"})
+
+
+@pytest.mark.parametrize("name", [name for name, drift in MEMBERS.items() if drift.learned])
+def test_the_scale_of_a_learned_drifts_start_brings_it_towards_what_it_starts_from(name):
+    drift = MEMBERS[name]
+    points = drift_grid()
+    known = drift(drift.init(KEY, 0.0), *points)
+    away = [float(jnp.abs(drift(drift.init(KEY, s), *points) - known).max()) for s in (0.1, 1.0)]
+    assert 0.0 < away[0] < away[1]
+
+
+@pytest.mark.parametrize("name", MEMBERS)
+def test_every_registered_drift_is_one_formula_in_numpy_and_pytorch_too(name):
+    torch = pytest.importorskip("torch")
+    drift = MEMBERS[name]
+    parameters, points = drift.init(KEY), [np.asarray(x) for x in drift_grid()]
+    expected = drift(parameters, *drift_grid())
+    parameters = jax.tree.map(np.array, parameters)
+    in_numpy = drift(parameters, *points, np)
+    in_torch = drift(
+        jax.tree.map(torch.asarray, parameters), *(torch.tensor(x) for x in points), torch
+    )
+    for found in (in_numpy, in_torch.numpy()):
+        np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.parametrize("name", MEMBERS)

@@ -9,7 +9,7 @@ import pytest
 from gymnax.environments import spaces
 
 from lpo import meta_training
-from lpo.drift import LearnedDrift
+from lpo.drifts import LearnedDrift
 from lpo.fitness import FITNESSES, Fitness
 from lpo.meta_training import (
     MetaTraining,

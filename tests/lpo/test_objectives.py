@@ -12,7 +12,8 @@ import pytest
 from gymnax.environments import spaces
 
 from lpo.certificate import certify
-from lpo.drift import FEATURES, ClipDrift, DPODrift, LearnedDrift, NoDrift
+from lpo.drifts import ClipDrift, DPODrift, LearnedDrift, NoDrift
+from lpo.drifts.network import FEATURES
 from lpo.objectives import load_objective, objective_names, save_objective, zoo_names
 from scb.environments.synthetic import BanditConfig, SyntheticBandit
 from scb.environments.zoo import save_bandit

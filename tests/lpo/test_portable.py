@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lpo.drift import BASES, LearnedDrift
-from lpo.formula import ClosedFormDrift
+from lpo.drifts import ClosedFormDrift, LearnedDrift
+from lpo.drifts.contract import BASES
 from lpo.objectives import Objective, load_objective, objective_names
 from lpo.portable import drift_function, numpy_drift, torch_drift, torch_loss
 from scb.agents.ppo import MAX_LOG_RATIO
@@ -139,22 +139,6 @@ def test_shapes_that_would_broadcast_are_refused(make, one_sentence):
 def test_an_unknown_name_is_refused_as_everywhere(make):
     with pytest.raises(UserError, match="unknown objective 'dppo'"):
         make("dppo")
-
-
-def test_a_drift_of_another_family_has_a_form_in_jax_alone(one_sentence):
-    class Squared:
-        def init(self, key):
-            return jnp.float32(2.0)
-
-        def __call__(self, parameters, log_ratio, advantage, progress):
-            return parameters * log_ratio**2
-
-    objective = Objective("squared", Squared(), jnp.float32(2.0))
-    # 2 * 0.5^2 = 0.5
-    assert float(drift_function(objective)(0.5, 1.0, 0.0)) == 0.5
-    with pytest.raises(UserError) as error:
-        numpy_drift(objective)
-    assert "Squared" in one_sentence(str(error.value))
 
 
 def test_without_torch_one_sentence_says_what_to_install(monkeypatch, one_sentence):

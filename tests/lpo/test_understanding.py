@@ -12,9 +12,9 @@ from matplotlib.collections import QuadMesh
 
 from experiments.understanding import words
 from lpo import drift_figures
-from lpo.drift import LearnedDrift
+from lpo.drifts import LearnedDrift
 from lpo.objectives import Objective, load_objective
-from lpo.understanding import REGIONS, Analysis, analyze, classify, is_temporal, midpoints, surface
+from lpo.understanding import REGIONS, Analysis, analyze, classify, midpoints, surface
 from scb.errors import UserError
 
 # Ratios on either side of both ends of PPO's clip, and an advantage of either sign.
@@ -164,7 +164,7 @@ def test_a_grid_that_cannot_be_judged_is_refused(arguments, message, one_sentenc
 def test_the_figure_has_a_row_for_every_fraction_of_a_temporal_drift():
     drift = LearnedDrift(hidden_size=2, temporal=True)
     temporal = Objective("late", drift, drift.init(jax.random.key(0)))
-    assert is_temporal(temporal) and not is_temporal(load_objective("dpo"))
+    assert temporal.drift.temporal and not load_objective("dpo").drift.temporal
     figure = drift_figures.drift_and_gradient(
         [load_objective("ppo"), temporal], progress=(0.0, 1.0)
     )

@@ -39,7 +39,7 @@ def imported(source):
     [
         "import lpo",
         "import os, lpo.cli as cli",
-        "from lpo.drift import Drift",
+        "from lpo.drifts import Drift",
         "def f():\n    from lpo import cli",
         "import importlib\nimportlib.import_module('lpo.cli')",
         "from importlib import import_module\nimport_module('lpo')",

@@ -17,8 +17,8 @@ from scb.warm_start import (
     ExpertDataset,
     WarmStartConfig,
     energy_distance,
-    expert_dataset,
     expert_agent,
+    expert_dataset,
     find_expert,
     fit_bandit,
     reward_targets,
@@ -312,7 +312,7 @@ def test_the_fitted_weights_are_a_bandits(fitted):
         for layer, arrays in layers.items()
         for name, array in arrays.items()
     }
-    assert shapes == bandit.weight_shapes()
+    assert shapes == bandit.shapes()
 
 
 def test_a_discrete_bandit_is_fitted_too(corridor_dataset):

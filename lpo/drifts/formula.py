@@ -12,18 +12,17 @@ finds such expressions for learned drifts.
 import math
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from typing import Any, TypeAlias
+from typing import Any, ClassVar, Self
 
-import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lpo.drift import BASES, Base, check_gate, gated
-from scb.agents.ppo import MAX_LOG_RATIO, clipped_surrogate_drift
-from scb.errors import UserError, unknown_name
+from lpo.drifts.contract import Array, Base, CorrectedDrift
+from scb.agents.ppo import MAX_LOG_RATIO
+from scb.errors import UserError
 
 # What an expression is made of, beside numbers, +, -, * and parentheses: with its largest magnitude
 # in training, and for `d` and `log_r`, which are 0 at ratio 1. A minibatch of 10 000 has no
@@ -43,14 +42,11 @@ DEEPEST = 50
 _NUMBER = r"(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?"
 _TOKEN = re.compile(rf"\s*(?:({_NUMBER})|(\w+)|(.))", re.S)
 
-# Any: an array of NumPy, JAX or another library with abs and tanh.
-_Array: TypeAlias = Any
-
 # All three are 0 at 0 and continuous, so that what vanishes inside vanishes outside.
-FUNCTIONS: dict[str, Callable[[_Array, Any], _Array]] = {
-    "tanh": lambda x, library: library.tanh(x),
-    "relu": lambda x, library: 0.5 * (x + library.abs(x)),
-    "abs": lambda x, library: library.abs(x),
+FUNCTIONS: dict[str, Callable[[Array, Any], Array]] = {
+    "tanh": lambda x, xp: xp.tanh(x),
+    "relu": lambda x, xp: 0.5 * (x + xp.abs(x)),
+    "abs": lambda x, xp: xp.abs(x),
 }
 
 
@@ -231,17 +227,17 @@ def _bound(node: Node, constants: Sequence[float]) -> float:
 
 def evaluate(
     node: Node,
-    constants: Sequence[float] | _Array,
-    variables: Mapping[str, _Array],
-    library: Any,
-) -> _Array:
+    constants: Sequence[float] | Array,
+    variables: Mapping[str, Array],
+    xp: Any,
+) -> Array:
     """The value of an expression.
 
     Args:
       node: its root.
       constants: [K] numbers in their order.
       variables: [B] arrays under the names of `VARIABLES`.
-      library: `jax.numpy`, `numpy`, or another with `abs` and `tanh`.
+      xp: `jax.numpy`, `numpy`, or another with `abs` and `tanh`.
 
     Returns:
       [B].
@@ -250,7 +246,7 @@ def evaluate(
         return constants[node.position]
     if node.operator == "variable":
         return variables[node.name]
-    values = [evaluate(argument, constants, variables, library) for argument in node.arguments]
+    values = [evaluate(argument, constants, variables, xp) for argument in node.arguments]
     match node.operator:
         case "+":
             return sum(values[1:], start=values[0])
@@ -259,81 +255,74 @@ def evaluate(
         case "negative":
             return -values[0]
         case function:
-            return FUNCTIONS[function](values[0], library)
+            return FUNCTIONS[function](values[0], xp)
 
 
-@dataclass(frozen=True)
-class ClosedFormDrift:
+@dataclass(frozen=True, kw_only=True)
+class ClosedFormDrift(CorrectedDrift):
     """A formula as a drift: relu(base + gate * expression - xi).
 
     Its parameters are the formula's numbers, so they can be traced and evolved like a network's
-    weights. The conditions of mirror learning hold whatever they are: expression and base vanish at
-    ratio 1, both are continuous, and relu(. - xi) is flat around 0.
+    weights. The conditions of mirror learning hold whatever they are: every term vanishes at ratio 1.
 
     Attributes:
       expression: in the language of `parse`: numbers, d (r - 1), log_r, A, progress; +, -, *, tanh,
         relu, abs.
-      base, clip, xi, gate: as `LearnedDrift`'s.
+      base, clip, xi, gate: as `CorrectedDrift`'s, the correction being the expression.
 
     Raises:
       UserError: as `parse`.
     """
 
-    expression: str
+    name: ClassVar[str] = "formula"
+
+    expression: str = field(kw_only=False)
     base: Base = "none"
-    clip: float = 0.2
-    xi: float = 1e-6
     gate: float = 0.0
 
     def __post_init__(self) -> None:
-        check_gate(self.gate)
+        super().__post_init__()
         parse(self.expression)
-        if self.base not in BASES:
-            raise unknown_name("drift base", self.base, BASES)
-        if not (self.clip > 0 and self.xi > 0):
-            raise UserError(f"clip and xi are {self.clip} and {self.xi}: both must be positive.")
 
     @property
     def temporal(self) -> bool:
-        """Whether it changes with the fraction of training done."""
         return any(node.name == "progress" for node in _nodes(parse(self.expression).root))
 
-    def init(self, key: jax.Array) -> dict[str, jax.Array]:
+    def init(self, key: jax.Array, scale: float = 1.0) -> dict[str, jax.Array]:
         """The numbers that the text has; nothing about them is random."""
         return {"constants": jnp.asarray(parse(self.expression).constants, jnp.float32)}
 
-    def with_parameters(self, parameters: Any) -> "ClosedFormDrift":
+    @classmethod
+    def from_config(cls, config: Mapping[str, Any]) -> Self:
+        return super().from_config({**config, "expression": str(config["expression"])})
+
+    def with_parameters(self, parameters: Any) -> Self:
         """The same formula with these numbers in its text, which reads back to charge exactly the same.
 
         A negative number becomes a minus sign and its magnitude, since numbers are read without one.
         """
-        values = iter(np.asarray(parameters["constants"], np.float32))
+        numbers = np.asarray(parameters["constants"], np.float32)
+        if np.array_equal(numbers, np.asarray(parse(self.expression).constants, np.float32)):
+            return self
+        values = iter(numbers)
 
         def replaced(match: re.Match[str]) -> str:
             if match.group(1) is None:
                 return match.group()
             return match.group().removesuffix(match.group(1)) + str(next(values))
 
-        text = _TOKEN.sub(replaced, self.expression)
-        return replace(self, expression=text)
+        return replace(self, expression=_TOKEN.sub(replaced, self.expression))
 
-    def __call__(
-        self, parameters: Any, log_ratio: jax.Array, advantage: jax.Array, progress: jax.Array
-    ) -> jax.Array:
-        chex.assert_equal_shape([log_ratio, advantage, progress])
+    def correction(
+        self, parameters: Any, log_ratio: Array, advantage: Array, progress: Array, xp: Any
+    ) -> Array:
         variables = {
-            "d": jnp.expm1(log_ratio),
+            "d": xp.expm1(log_ratio),
             "log_r": log_ratio,
             "A": advantage,
             "progress": progress,
         }
-        root = parse(self.expression).root
-        penalty = gated(
-            evaluate(root, parameters["constants"], variables, jnp), log_ratio, self.gate
-        )
-        if self.base == "ppo":
-            penalty = penalty + clipped_surrogate_drift(self.clip, log_ratio, advantage, progress)
-        return jax.nn.relu(penalty - self.xi)
+        return evaluate(parse(self.expression).root, parameters["constants"], variables, xp)
 
 
 def _nodes(node: Node) -> Iterator[Node]:

@@ -1,0 +1,159 @@
+"""What every drift is, and the shape that learned ones and formulas share: a correction of a base."""
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
+from typing import Any, ClassVar, Literal, Self, TypeAlias
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from scb.agents.ppo import clipped_surrogate_drift, relu
+from scb.errors import UserError, unknown_name
+from scb.keys import root_key
+
+# Any: an array of JAX, NumPy or PyTorch; `xp` below is its library.
+Array: TypeAlias = Any
+Base: TypeAlias = Literal["ppo", "none"]
+BASES: tuple[Base, ...] = ("ppo", "none")
+
+
+class Drift(ABC):
+    """A family of drifts: a frozen dataclass, which is static, and parameters, traced, so that a population vmaps.
+
+    Attributes:
+      name: of the family, in files and after `--drift`. The dataclass's fields are its settings.
+      learned: whether `lpo meta-train` evolves it.
+      always_holds: whether the conditions of mirror learning hold by construction, whatever the
+        parameters are, as long as they are finite.
+    """
+
+    name: ClassVar[str]
+    learned: ClassVar[bool] = False
+    always_holds: ClassVar[bool] = False
+
+    @property
+    def temporal(self) -> bool:
+        """Whether it changes with the fraction of training done."""
+        return False
+
+    @abstractmethod
+    def init(self, key: jax.Array, scale: float = 1.0) -> Any:
+        """Parameters: a pytree of float arrays, and a dict of them where they are to be saved.
+
+        Args:
+          key: decides what is random.
+          scale: of what a search starts with, beside the drift that it starts from.
+        """
+
+    @abstractmethod
+    def __call__(
+        self,
+        parameters: Any,
+        log_ratio: Array,
+        advantage: Array,
+        progress: Array,
+        xp: Any = jnp,
+    ) -> Array:
+        """The penalty.
+
+        Args:
+          parameters: as from `init`, as arrays of `xp`.
+          log_ratio: [B] log pi(a|s) - log pi_behaviour(a|s), in nats.
+          advantage: [B] advantage, normalised over the minibatch.
+          progress: [B] fraction of training done, in [0, 1].
+          xp: `jax.numpy`, `numpy` or `torch`. What the three have alike is enough to write a formula
+            once: functions of the array API standard, and `relu` of `scb.agents.ppo`.
+
+        Returns:
+          [B] penalty.
+        """
+
+    def to_config(self) -> dict[str, Any]:
+        """What a file says of it: the family and its settings."""
+        return {"family": self.name, **asdict(self)}  # type: ignore[call-overload]
+
+    @classmethod
+    def from_config(cls, config: Mapping[str, Any]) -> Self:
+        """The inverse of `to_config`; a KeyError names an entry that is missing."""
+        names = [field.name for field in fields(cls)]  # type: ignore[arg-type]
+        return cls(**{name: config[name] for name in names})
+
+    def shapes(self) -> dict[str, tuple[int, ...]]:
+        """Of the parameters, by name."""
+        return {name: x.shape for name, x in jax.eval_shape(self.init, root_key(0)).items()}
+
+    def with_parameters(self, parameters: Any) -> Self:
+        """The same drift with settings that say these parameters, where settings say any."""
+        return self
+
+
+@dataclass(frozen=True, kw_only=True)
+class CorrectedDrift(Drift):
+    """relu(base + gate * correction - xi), for a correction that vanishes at ratio 1.
+
+    The conditions of mirror learning hold then: base and correction are continuous and vanish at
+    ratio 1, and relu(. - xi) is flat around 0. What they do not bound is the slope just outside that
+    flat zone. There a correction acts like a penalty on |log r|, and updates whose advantages correlate with
+    no direction more than that slope never leave ratio 1: found with an objective learned on
+    minibatches of 20, which held a policy still on minibatches of 1000. The gate fades the correction
+    out there.
+
+    Attributes:
+      base: ppo (the correction is added to PPO's clip drift, so that none is PPO) or none.
+      clip: epsilon of the PPO base.
+      xi: half-width of the dead zone, in units of the penalty; the original code has 1e-4.
+      gate: width, in nats of log-ratio, of the region around ratio 1 where the correction is faded out,
+        by 1 - exp(-(log r / gate)^2). 0 leaves it as it is, as in the original.
+    """
+
+    always_holds: ClassVar[bool] = True
+
+    base: Base = "ppo"
+    clip: float = 0.2
+    xi: float = 1e-6
+    gate: float = 0.1
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.gate < math.inf:
+            raise UserError(f"gate is {self.gate}: it must be 0 or larger, and finite.")
+        if self.base not in BASES:
+            raise unknown_name("drift base", self.base, BASES)
+        if not (self.clip > 0 and self.xi > 0):
+            raise UserError(f"clip and xi are {self.clip} and {self.xi}: both must be positive.")
+
+    @classmethod
+    def from_config(cls, config: Mapping[str, Any]) -> Self:
+        # What was learned before there was a gate has none.
+        return super().from_config({"gate": 0.0, **config})
+
+    @abstractmethod
+    def correction(
+        self, parameters: Any, log_ratio: Array, advantage: Array, progress: Array, xp: Any
+    ) -> Array:
+        """[B] what is added to the base; arguments as for `__call__`."""
+
+    def __call__(
+        self,
+        parameters: Any,
+        log_ratio: Array,
+        advantage: Array,
+        progress: Array,
+        xp: Any = jnp,
+    ) -> Array:
+        chex.assert_equal_shape([log_ratio, advantage, progress])
+        penalty = self.correction(parameters, log_ratio, advantage, progress, xp)
+        if self.gate:
+            penalty = penalty * self.gate_factor(log_ratio, xp)
+        if self.base == "ppo":
+            penalty = penalty + clipped_surrogate_drift(
+                self.clip, log_ratio, advantage, progress, xp
+            )
+        return relu(penalty - self.xi, xp)
+
+    def gate_factor(self, log_ratio: Array, xp: Any = np) -> Array:
+        """[B] 1 - exp(-(log r / gate)^2), where there is a gate."""
+        return -xp.expm1(-((log_ratio / self.gate) ** 2))

@@ -1,0 +1,95 @@
+"""Drifts that are known in closed form: PPO's clip, DPO, and none."""
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import chex
+import jax
+import jax.numpy as jnp
+
+from lpo.drifts.contract import Array, Drift
+from scb.agents.ppo import clipped_surrogate_drift, relu
+from scb.errors import UserError
+
+
+@dataclass(frozen=True)
+class ClipDrift(Drift):
+    """PPO's clipped surrogate as a drift; its parameter is the clip epsilon."""
+
+    name: ClassVar[str] = "clip"
+
+    clip: float = 0.2
+
+    def __post_init__(self) -> None:
+        if not self.clip > 0:
+            raise UserError(f"the clip epsilon is {self.clip}: it must be positive.")
+
+    def init(self, key: jax.Array, scale: float = 1.0) -> jax.Array:
+        return jnp.float32(self.clip)
+
+    def __call__(
+        self,
+        parameters: Any,
+        log_ratio: Array,
+        advantage: Array,
+        progress: Array,
+        xp: Any = jnp,
+    ) -> Array:
+        return clipped_surrogate_drift(parameters, log_ratio, advantage, progress, xp)
+
+
+@dataclass(frozen=True)
+class DPODrift(Drift):
+    """Discovered policy optimisation (Lu et al., 2022, eq. 6): the closed form read off a learned drift."""
+
+    name: ClassVar[str] = "dpo"
+
+    alpha: float = 2.0
+    beta: float = 0.6
+
+    def __post_init__(self) -> None:
+        if not (self.alpha > 0 and self.beta > 0):
+            raise UserError(
+                f"DPO's alpha and beta are {self.alpha} and {self.beta}: both must be positive."
+            )
+
+    def init(self, key: jax.Array, scale: float = 1.0) -> dict[str, jax.Array]:
+        return {"alpha": jnp.float32(self.alpha), "beta": jnp.float32(self.beta)}
+
+    def __call__(
+        self,
+        parameters: Any,
+        log_ratio: Array,
+        advantage: Array,
+        progress: Array,
+        xp: Any = jnp,
+    ) -> Array:
+        chex.assert_equal_shape([log_ratio, advantage, progress])
+        alpha, beta = parameters["alpha"], parameters["beta"]
+        gain = xp.expm1(log_ratio) * advantage
+        loss = log_ratio * advantage
+        positive = relu(gain - alpha * xp.tanh(gain / alpha), xp)
+        negative = relu(loss - beta * xp.tanh(loss / beta), xp)
+        return xp.where(advantage >= 0, positive, negative)
+
+
+@dataclass(frozen=True)
+class NoDrift(Drift):
+    """No penalty at all: the plain policy-gradient surrogate."""
+
+    name: ClassVar[str] = "none"
+
+    def init(self, key: jax.Array, scale: float = 1.0) -> jax.Array:
+        return jnp.zeros(())
+
+    def __call__(
+        self,
+        parameters: Any,
+        log_ratio: Array,
+        advantage: Array,
+        progress: Array,
+        xp: Any = jnp,
+    ) -> Array:
+        chex.assert_equal_shape([log_ratio, advantage, progress])
+        # Not zeros_like, which PyTorch refuses to differentiate.
+        return log_ratio - log_ratio
