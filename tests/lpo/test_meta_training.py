@@ -461,7 +461,7 @@ def test_physics_go_to_the_environment_and_not_to_its_bandit(
         ({"tasks": ()}, "the list of tasks is empty: give at least one bandit or environment."),
         ({"tasks": ("a", "b", "a")}, "the task a is there twice: give each once."),
         (
-            {"tasks": ("a", "b"), "agent": PPOConfig()},
+            {"tasks": ("CartPole-v1", "Pendulum-v1"), "agent": PPOConfig()},
             "one agent configuration does not fit several tasks",
         ),
         (
