@@ -34,10 +34,10 @@ from lpo.alignment import (
     other_drifts,
     regime_label,
 )
-from lpo.cli import configure_jax
 from lpo.fitness import LABELS
 from lpo.objectives import Objective, load_objective
 from scb import plotting
+from scb.cli import configure_jax
 from scb.errors import UserError
 from scb.runs import write_json
 

@@ -37,9 +37,9 @@ import numpy as np
 
 import scb
 from experiments.page import exit_status
-from lpo.cli import configure_jax
 from scb.agents.spec import bandit_agent
 from scb.artefacts import flatten, machine_description, package_versions
+from scb.cli import configure_jax
 from scb.environments.zoo import PREFIX, open_bandit, space_description
 from scb.evolution import map_population
 from scb.keys import key_at, root_key, split_key

@@ -21,8 +21,8 @@ from matplotlib.ticker import EngFormatter, MaxNLocator
 
 from experiments.page import exit_status, read
 from experiments.zoo_table_page import ENVIRONMENTS, TARGETS, label
-from lpo.cli import configure_jax
 from scb import plotting
+from scb.cli import configure_jax
 from scb.discovery import DiscoveryConfig
 from scb.errors import UserError
 from scb.runs import read_config

@@ -73,7 +73,7 @@ def config_of(environment: str, source: str, plan: Mapping[str, Any]) -> Discove
         plan,
         size,
         plan["seed"],
-        sampled_hyperparameters=source == DRAWN,
+        fixed_hyperparameters=source != DRAWN,
         curriculum=curriculum,
         init=plan["init"],
     )

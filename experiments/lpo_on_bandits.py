@@ -25,13 +25,13 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, LogLocator, NullFormatter, StrMethodFormatter
 
 from experiments.page import exit_status, read, text
-from lpo.cli import configure_jax
 from lpo.generalization import compare
 from lpo.learning import objective_of_run
 from lpo.objectives import Objective, load_objective
 from scb import plotting
 from scb.agents.spec import AgentSpec, environment_agent
 from scb.artefacts import machine_description, package_versions
+from scb.cli import configure_jax
 from scb.errors import UserError
 from scb.runs import write_json
 from scb.statistics import estimate, iqm, pooled_estimate

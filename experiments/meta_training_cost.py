@@ -16,10 +16,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments.page import exit_status
-from lpo.cli import configure_jax
 from lpo.meta_training import MetaTraining, MetaTrainingConfig
 from lpo.pipeline import environment_problem
 from scb.artefacts import machine_description, package_versions
+from scb.cli import configure_jax
 from scb.evolution import map_population
 from scb.keys import root_key
 from scb.runs import Stopwatch

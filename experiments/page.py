@@ -19,9 +19,9 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from lpo.cli import configure_jax
 from scb import plotting
 from scb.artefacts import machine_description, package_versions
+from scb.cli import configure_jax
 from scb.errors import UserError
 from scb.runs import make_folder, write_json
 from scb.statistics import Estimate

@@ -10,8 +10,8 @@ from experiments.page import text
 from scb.curriculum import CurriculumConfig, paper_curriculum
 from scb.discovery import BanditDiscovery, DiscoveryConfig, discover
 from scb.errors import UserError
-from scb.evolution import EvolutionConfig, Outcome, config_dict
-from scb.runs import Run
+from scb.evolution import EvolutionConfig, Outcome
+from scb.runs import Run, config_dict
 from scb.statistics import Estimate, estimate
 
 NONE = "none"  # the curriculum that is none

@@ -22,16 +22,16 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from experiments.page import exit_status, read, text
-from lpo.cli import configure_jax
 from lpo.generalization import compare
-from lpo.learning import objective_of_run
+from lpo.learning import command_of, objective_of_run
 from lpo.objectives import load_objective
 from scb import plotting
 from scb.agents.spec import environment_agent
 from scb.artefacts import machine_description, package_versions
+from scb.cli import configure_jax
 from scb.errors import UserError
 from scb.plotting import BLUE, GREY, VERMILLION, estimate_row, figure_style
-from scb.runs import command_of, write_json
+from scb.runs import write_json
 from scb.statistics import estimate, paired_difference
 
 # Flags of `lpo meta-train`. The first is what the others differ from in one thing each.

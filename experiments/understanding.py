@@ -24,12 +24,12 @@ import numpy as np
 
 from experiments.page import exit_status
 from lpo import drift_figures
-from lpo.cli import configure_jax
 from lpo.drifts import ClosedFormDrift
 from lpo.objectives import load_objective, zoo_names
 from lpo.understanding import REGIONS, analyze
 from scb import plotting
 from scb.artefacts import package_versions
+from scb.cli import configure_jax
 from scb.errors import UserError
 from scb.runs import write_json
 from scb.statistics import paired_difference

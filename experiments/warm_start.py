@@ -20,10 +20,10 @@ from typing import Any
 import numpy as np
 
 from experiments.page import exit_status
-from lpo.cli import configure_jax
 from scb import make
 from scb.agents.spec import algorithms_for, bandit_agent
 from scb.artefacts import machine_description, package_versions
+from scb.cli import configure_jax
 from scb.discovery import SyntheticTraining, judge
 from scb.environments.synthetic import BanditConfig, bandit_for
 from scb.keys import root_key, split_key

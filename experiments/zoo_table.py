@@ -35,9 +35,9 @@ from experiments.zoo_table_page import (
     place,
     render,
 )
-from lpo.cli import configure_jax
 from scb.agents.spec import algorithms_for, bandit_agent
 from scb.artefacts import machine_description, package_versions
+from scb.cli import configure_jax
 from scb.commands import FIRST_REPORTING_SEED
 from scb.discovery import SyntheticTraining, check_fits, judge
 from scb.environments.brax import BRAX_NAMES

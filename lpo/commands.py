@@ -36,7 +36,7 @@ from scb.artefacts import machine_description, package_versions
 from scb.console import console
 from scb.environments.zoo import home_of
 from scb.errors import UserError
-from scb.runs import Run, make_folder, settle, write_json
+from scb.runs import Run, make_folder, write_json
 from scb.statistics import estimate
 
 
@@ -69,7 +69,7 @@ def run(
       resume: a folder that an earlier, interrupted `lpo run` wrote: do what is missing there.
       objective: take this objective (a zoo name or file.npz) instead of learning one.
     """
-    settings = settle(
+    settings = learning.settle(
         {"command": "run", "seed": seed, "objective": objective}, RUN_PRESETS, preset, resume
     )
     settings["seed"] = settings.get("seed") or 0
@@ -154,7 +154,7 @@ def meta_train_command(
       backend: Brax physics, for Brax environments.
       wandb: project to log to, with the extra `wandb`.
     """
-    settings = settle(
+    settings = learning.settle(
         {
             "command": "meta-train",
             "environment": environment,

@@ -1,5 +1,6 @@
 """Learning an objective from flat settings: what `lpo meta-train` does, and experiments that do the same."""
 
+import shlex
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -11,9 +12,9 @@ from lpo.meta_training import VALIDATION_AGENTS, MetaTraining, MetaTrainingConfi
 from lpo.objectives import Objective, load_objective, save_objective
 from lpo.pipeline import meta_training_artefact
 from scb import plotting
-from scb.errors import UserError
+from scb.errors import UserError, unknown_name
 from scb.evolution import EvolutionConfig, evolve
-from scb.runs import Run, command_of
+from scb.runs import Run, read_config
 
 PRESETS: dict[str, dict[str, Any]] = {
     "quick": {"population_size": 32, "generations": 30},
@@ -157,3 +158,36 @@ def _lists(text: str | None) -> dict[str, tuple[float, ...]]:
             )
         lists[name] = _numbers(values, name)
     return lists
+
+
+def command_of(program: str, settings: Mapping[str, Any]) -> str:
+    """The command that starts a run with these settings afresh, however it was typed or resumed."""
+    flags = [
+        f"--{name.replace('_', '-')}" if value is True else f"--{name.replace('_', '-')}={value}"
+        for name, value in settings.items()
+        if name != "command" and value is not None and value is not False
+    ]
+    return shlex.join([program, str(settings["command"]), *flags])
+
+
+def settle(
+    flags: Mapping[str, Any],
+    presets: Mapping[str, Mapping[str, Any]],
+    preset: str | None,
+    resume: Path | None,
+) -> dict[str, Any]:
+    """The settings of a run: the flags that were given, over the preset, over nothing.
+
+    With `resume`, the stored run's settings; a flag that says otherwise is an error, found by
+    `Run.open`.
+    """
+    given = {name: value for name, value in flags.items() if value is not None}
+    if resume is not None:
+        stored = read_config(resume)
+        if preset is not None:
+            given["preset"] = preset
+        return {**stored, **given}
+    chosen = preset or "quick"
+    if chosen not in presets:
+        raise unknown_name("preset", chosen, presets)
+    return {**flags, "preset": chosen, **presets[chosen], **given}

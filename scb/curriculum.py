@@ -72,6 +72,9 @@ class CurriculumConfig:
                 "one length for both, or another shape."
             )
 
+    def __str__(self) -> str:
+        return f"{self.shape}:{self.initial}:{self.final}:{self.begin}:{self.transition}"
+
     @property
     def longest(self) -> int:
         """Steps of its longest episodes, which the environment's limit must not cut."""
@@ -94,6 +97,21 @@ class CurriculumConfig:
             begin=self.begin * to_generations // from_generations,
             transition=max(1, self.transition * to_generations // from_generations),
         )
+
+
+def read_curriculum(words: str) -> CurriculumConfig | str | None:
+    """A curriculum from the command line: paper, none, or SHAPE:INITIAL:FINAL:BEGIN:TRANSITION."""
+    if words in ("none", "paper"):
+        return None if words == "none" else words
+    shape, *lengths = words.split(":")
+    try:
+        initial, final, begin, transition = (int(length) for length in lengths)
+    except ValueError as error:
+        raise UserError(
+            f"the curriculum {words!r} is not understood: give paper, none, or "
+            "SHAPE:INITIAL:FINAL:BEGIN:TRANSITION such as linear:100:1000:20:160."
+        ) from error
+    return CurriculumConfig(shape, initial, final, begin, transition)
 
 
 # Table "Hyperparameters for evaluation length curricula".

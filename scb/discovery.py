@@ -9,15 +9,17 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import tyro
 from gymnax.environments import environment
 from jax.typing import ArrayLike
 
 from scb.agents.spec import (
+    ALGORITHMS,
     AgentSpec,
     algorithms_for,
     bandit_agent,
@@ -25,7 +27,15 @@ from scb.agents.spec import (
     kind_of_actions,
 )
 from scb.agents.tables import Lists
-from scb.curriculum import CurriculumConfig, check_curriculum, horizon, with_limit
+from scb.command_line import listed, text
+from scb.curriculum import (
+    CurriculumConfig,
+    check_curriculum,
+    horizon,
+    paper_curriculum,
+    read_curriculum,
+    with_limit,
+)
 from scb.environments.registry import make
 from scb.environments.synthetic import (
     BanditConfig,
@@ -38,6 +48,7 @@ from scb.environments.zoo import open_bandit
 from scb.errors import UserError, unknown_name
 from scb.evolution import EnvironmentSteps, EvolutionConfig, Outcome, evolve, map_population
 from scb.keys import key_at, root_key, split_key
+from scb.lists import read_lists, write_lists
 from scb.runs import Run, Stopwatch
 from scb.warm_start import (
     WarmStartConfig,
@@ -49,6 +60,17 @@ from scb.warm_start import (
 
 INITS = ("random", "expert")
 MODES = ("all", "sequential")
+SELECTIONS = ("final", "best")
+
+
+def _read_algorithms(words: str) -> tuple[str, ...]:
+    if words.strip().lower() == "all":
+        return ()
+    return listed(words.lower(), f"algorithms, of {', '.join(ALGORITHMS)} or all,")
+
+
+_Algorithms = text(_read_algorithms, lambda names: ",".join(names) or "all", "NAME,NAME")
+_Curriculum = text(read_curriculum, lambda curriculum: str(curriculum or "none"), "CURRICULUM")
 
 
 @dataclass(frozen=True)
@@ -56,29 +78,36 @@ class DiscoveryConfig:
     """What to discover, and how.
 
     Attributes:
-      environment: the evaluation environment's name.
-      backend: Brax's physics; None for its default, and for other environments.
-      parameterization: "I", the bandit; "TI" or "T", the paper's fully synthetic MDPs.
-      max_steps: a synthetic MDP's maximum episode length; None for the environment's own.
-      bandit: the networks and the latent.
-      algorithms: of the inner loop; empty for the paper's for the action space. In the mode
-        "sequential" a name may stand several times, and its algorithm then has that many turns.
-      mode: "all" trains every algorithm in every candidate; "sequential" one a generation, in turn.
-      sampled_hyperparameters: draw them from the paper's lists for each agent, or keep the
-        underlined ones.
-      lists: {algorithm: {hyperparameter: values}} to draw from instead of the paper's.
+      environment: the evaluation environment (Pendulum-v1, CartPole-v1, hopper, ...).
+      backend: Brax's physics: generalized, positional or spring.
+      parameterization: I (the bandit), TI or T (fully synthetic MDPs: learned transition, reward and
+        termination, with or without a learned initial state).
+      max_steps: a synthetic MDP's maximum episode length; the environment's own where None.
+      algorithms: of the inner loop, separated by commas (ppo,sac,dqn,ddqn,ddpg,td3); in the mode
+        sequential a name may stand several times, and its algorithm then has that many turns. "all",
+        which is the empty tuple, for the paper's for the action space.
+      mode: all (every algorithm trains in every candidate) or sequential (one a generation, in turn).
+      fixed_hyperparameters: train with the paper's underlined values instead of drawing each agent's
+        from the paper's lists.
+      lists: {"ppo": {"learning_rate": [0.001, 0.005], ...}, ...}, a JSON file or the text itself, to
+        draw from instead of the paper's.
       configs: {algorithm: static configuration} instead of the paper's.
-      agents_per_candidate: agents of each algorithm that is trained.
-      evaluation_episodes: episodes of each agent in the evaluation environment.
-      mode_actions: evaluate the most likely actions rather than sampled ones.
-      curriculum: of the evaluation episodes' length; None for the environment's own throughout.
-      init: "random", or "expert" for the warm start.
-      start: a bandit (name or file) whose weights to start from instead.
-      reward_std: standard deviation, over contexts and uniform actions, that the reward of the
-        weights that the search starts from is scaled to, and shifted to mean zero; None leaves it
-        as it is. PPO, which normalises advantages, is nearly indifferent; SAC is not: its
-        temperature starts at 1 and its critics near 0.
-      warm_start: its configuration.
+      agents_per_candidate: agents of each trained algorithm whose returns are a candidate's fitness.
+      evaluation_episodes: of each agent in the evaluation environment.
+      mode_actions: evaluate the most likely actions during the search, rather than sampled ones.
+      curriculum: of the evaluation episodes' length: paper, none, or
+        SHAPE:INITIAL:FINAL:BEGIN:TRANSITION such as linear:100:1000:20:160 (lengths in steps, then
+        generations).
+      init: expert (fit the bandit to an expert first, in a minute) or random (as the paper).
+      start: start from this bandit (a zoo name or file.npz) instead.
+      reward_std: scale the reward that the search starts from to this standard deviation, over
+        contexts and uniform actions, and shift it to mean zero. PPO, which normalises advantages, is
+        nearly indifferent; SAC, whose temperature starts at 1 and whose critics start near 0, is not.
+      select: what a search ends with: final (the mean of the last search distribution) or best (the
+        mean whose judgement during the search was best; where the search starts near its end, noise
+        can lead it away again).
+      bandit: the networks and the latent.
+      warm_start: how the expert is found and the bandit fitted to it.
       evolution: the outer loop's.
     """
 
@@ -86,27 +115,38 @@ class DiscoveryConfig:
     backend: str | None = None
     parameterization: str = "I"
     max_steps: int | None = None
-    bandit: BanditConfig = field(default_factory=BanditConfig)
-    algorithms: tuple[str, ...] = ("ppo",)
+    algorithms: Annotated[tuple[str, ...], _Algorithms] = ("ppo",)
     mode: str = "all"
-    sampled_hyperparameters: bool = True
-    lists: Mapping[str, Lists] = field(default_factory=dict)
-    configs: Mapping[str, Any] = field(default_factory=dict)
+    fixed_hyperparameters: bool = False
+    lists: Annotated[
+        Mapping[str, Lists],
+        tyro.conf.arg(name="hyperparameters"),
+        text(read_lists, write_lists, "FILE|JSON"),
+    ] = field(default_factory=dict)
+    configs: tyro.conf.Suppress[Mapping[str, Any]] = field(default_factory=dict)
     agents_per_candidate: int = 4
     evaluation_episodes: int = 16
     mode_actions: bool = False
-    curriculum: CurriculumConfig | None = None
+    curriculum: Annotated[CurriculumConfig | str | None, _Curriculum] = None
     init: str = "expert"
-    start: str | None = None
+    start: Annotated[str | None, tyro.conf.arg(name="from-bandit")] = None
     reward_std: float | None = None
-    warm_start: WarmStartConfig = field(default_factory=WarmStartConfig)
-    evolution: EvolutionConfig = field(default_factory=lambda: EvolutionConfig(combine="ranks"))
+    select: str = "final"
+    bandit: BanditConfig = field(default_factory=BanditConfig)
+    warm_start: Annotated[WarmStartConfig, tyro.conf.arg(name="warm start")] = field(
+        default_factory=WarmStartConfig
+    )
+    evolution: Annotated[EvolutionConfig, tyro.conf.arg(name="outer loop")] = field(
+        default_factory=lambda: EvolutionConfig(combine="ranks")
+    )
 
     def __post_init__(self) -> None:
         if self.init not in INITS:
             raise unknown_name("initialisation", self.init, INITS)
         if self.mode not in MODES:
             raise unknown_name("mode", self.mode, MODES)
+        if self.select not in SELECTIONS:
+            raise unknown_name("selection", self.select, SELECTIONS)
         if self.parameterization not in PARAMETERIZATIONS:
             raise unknown_name("parameterization", self.parameterization, PARAMETERIZATIONS)
         if self.parameterization != "I" and self.init == "expert" and self.start is None:
@@ -115,7 +155,7 @@ class DiscoveryConfig:
             )
         if self.parameterization != "I" and self.start is not None:
             raise UserError("a synthetic MDP cannot start from a bandit: leave the start out.")
-        if self.lists and not self.sampled_hyperparameters:
+        if self.lists and self.fixed_hyperparameters:
             raise UserError(
                 "fixed hyperparameters are not drawn from lists: leave out the lists, or draw."
             )
@@ -219,6 +259,9 @@ class BanditDiscovery:
         space = self.env.action_space(self.env_params)
         if not config.algorithms:
             config = replace(config, algorithms=algorithms_for(space))
+        if isinstance(config.curriculum, str):
+            generations = config.evolution.num_generations
+            config = replace(config, curriculum=paper_curriculum(config.environment, generations))
         check_algorithms(config.algorithms, kind_of_actions(space))
         if config.mode == "all" and len(set(config.algorithms)) < len(config.algorithms):
             raise UserError(
@@ -247,7 +290,7 @@ class BanditDiscovery:
             for name in dict.fromkeys(config.algorithms)
         }
         self._horizon, self._longest = None, None
-        if config.curriculum is not None:
+        if isinstance(config.curriculum, CurriculumConfig):
             limit = int(self.env_params.max_steps_in_episode)
             check_curriculum(config.curriculum, limit, config.environment)
             self._horizon, self._longest = horizon(config.curriculum), config.curriculum.longest
@@ -257,7 +300,7 @@ class BanditDiscovery:
 
     def _spec(self, name: str) -> AgentSpec:
         config = self.config
-        spec = bandit_agent(name, config.environment, config.sampled_hyperparameters)
+        spec = bandit_agent(name, config.environment, not config.fixed_hyperparameters)
         return replace(
             spec,
             lists=config.lists.get(name, spec.lists),

@@ -4,8 +4,11 @@ from collections.abc import Iterable
 from difflib import get_close_matches
 
 
-class UserError(ValueError):
-    """Bad input, told in one sentence: what it was, what is allowed, what to do."""
+class UserError(Exception):
+    """Bad input, told in one sentence: what it was, what is allowed, what to do.
+
+    Not a ValueError: tyro takes those for its own.
+    """
 
 
 def unknown_name(kind: str, name: str, known: Iterable[str]) -> UserError:

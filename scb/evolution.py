@@ -8,8 +8,8 @@ distribution's mean, checkpoints, resume, and logs.
 
 import sys
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
-from typing import Any, Protocol
+from dataclasses import dataclass
+from typing import Annotated, Any, Protocol
 
 import evosax.algorithms
 import jax
@@ -17,6 +17,7 @@ import jax.flatten_util
 import jax.numpy as jnp
 import numpy as np
 import optax
+import tyro
 from jax.experimental import multihost_utils
 from jax.sharding import NamedSharding, PartitionSpec
 from rich.console import Console
@@ -54,18 +55,20 @@ COMBINATIONS = ("mean", "ranks")
 
 @dataclass(frozen=True)
 class EvolutionConfig:
-    """The outer loop's configuration.
+    """Evolution of the candidates.
 
     Attributes:
-      strategy: name of an evosax strategy; "SNES" and "Open_ES" are the usual ones.
+      strategy: any of evosax's, by name (SNES, Open_ES, CMA_ES, ...).
       population_size: candidates a generation.
       num_generations: how many of them.
-      sigma, sigma_decay, sigma_limit: initial standard deviation of the search distribution; for
-        strategies with a schedule (Open_ES) it decays by that factor a generation down to the
-        limit.
-      learning_rate, learning_rate_decay, learning_rate_limit: of Adam, for Open_ES and its
-        relatives; SNES steps by its own rule.
-      combine: "mean" or "ranks", over the tasks of a candidate; see `combine_tasks`.
+      sigma: initial standard deviation of the search distribution.
+      sigma_decay: factor on it a generation, for strategies with a schedule (Open_ES).
+      sigma_limit: what it decays down to.
+      learning_rate: of Adam, for Open_ES and its relatives; SNES steps by its own rule.
+      learning_rate_decay: factor on it a generation.
+      learning_rate_limit: what it decays down to.
+      combine: how a candidate's agents and tasks count: mean, or ranks (the mean over them of its rank
+        among the candidates).
       mean_evaluations: agents that judge the mean of the search distribution.
       evaluate_mean_every: generations between those judgements (and one after the last generation).
       checkpoint_every: generations between checkpoints.
@@ -74,7 +77,7 @@ class EvolutionConfig:
 
     strategy: str = "SNES"
     population_size: int = 64
-    num_generations: int = 100
+    num_generations: Annotated[int, tyro.conf.arg(name="generations")] = 100
     sigma: float = 0.05
     sigma_decay: float = 1.0
     sigma_limit: float = 0.0
@@ -485,18 +488,12 @@ class _progress:
         self._bar.stop()
 
 
-def config_dict(config: Any) -> dict[str, Any]:
-    """A dataclass configuration as plain JSON types."""
-    return dict(asdict(config))
-
-
 __all__ = [
     "STRATEGIES",
     "EnvironmentSteps",
     "EvolutionConfig",
     "Outcome",
     "Problem",
-    "config_dict",
     "evolve",
     "map_population",
     "rank_failed_last",

@@ -11,10 +11,10 @@ runs/NAME/checkpoints/      orbax
 import hashlib
 import json
 import os
-import shlex
 import shutil
 import time
 from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,7 @@ import numpy as np
 import orbax.checkpoint as ocp
 from tensorboardX import SummaryWriter
 
-from scb.errors import UserError, unknown_name
+from scb.errors import UserError
 
 
 def make_folder(folder: Path, flag: str = "--out") -> None:
@@ -68,7 +68,8 @@ class Run:
 
         Args:
           folder: where; must not exist or be empty, unless `resume`.
-          config: JSON-serialisable; decides the run together with the code's version.
+          config: JSON-serialisable; decides the run together with the code's version. An entry
+            "command", by which people and resumptions start it, is stored and not compared.
           resume: continue the run that is there. Its config must equal `config`.
           wandb_project: also log to this Weights & Biases project (extra `wandb`).
 
@@ -81,7 +82,8 @@ class Run:
         stored_config = folder / "config.json"
         if resume:
             stored = read_config(folder)
-            difference = _first_difference(stored, config)
+            stored, asked = ({**c, "command": None} for c in (stored, config))
+            difference = _first_difference(stored, asked)
             if difference:
                 raise UserError(
                     f"cannot resume {folder}: its config differs at {difference}; resume with the config it was "
@@ -163,14 +165,9 @@ def read_config(folder: str | Path) -> dict[str, Any]:
         ) from error
 
 
-def command_of(program: str, settings: Mapping[str, Any]) -> str:
-    """The command that starts a run with these settings afresh, however it was typed or resumed."""
-    flags = [
-        f"--{name.replace('_', '-')}" if value is True else f"--{name.replace('_', '-')}={value}"
-        for name, value in settings.items()
-        if name != "command" and value is not None and value is not False
-    ]
-    return shlex.join([program, str(settings["command"]), *flags])
+def config_dict(config: Any) -> dict[str, Any]:
+    """A configuration's dataclass as plain JSON types."""
+    return dict(json.loads(json.dumps(asdict(config))))
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
@@ -178,29 +175,6 @@ def write_json(path: Path, content: Mapping[str, Any]) -> None:
     temporary = path.with_name(path.name + ".tmp")
     temporary.write_text(json.dumps(content, indent=2) + "\n")
     os.replace(temporary, path)
-
-
-def settle(
-    flags: Mapping[str, Any],
-    presets: Mapping[str, Mapping[str, Any]],
-    preset: str | None,
-    resume: Path | None,
-) -> dict[str, Any]:
-    """The settings of a run: the flags that were given, over the preset, over nothing.
-
-    With `resume`, the stored run's settings; a flag that says otherwise is an error, found by
-    `Run.open`.
-    """
-    given = {name: value for name, value in flags.items() if value is not None}
-    if resume is not None:
-        stored = read_config(resume)
-        if preset is not None:
-            given["preset"] = preset
-        return {**stored, **given}
-    chosen = preset or "quick"
-    if chosen not in presets:
-        raise unknown_name("preset", chosen, presets)
-    return {**flags, "preset": chosen, **presets[chosen], **given}
 
 
 class Checkpoints:

@@ -52,7 +52,8 @@ class WarmStartConfig:
         they are. Agents learn little from an entry as small as a car's velocity. For
         "action_distance" only: Q-values cannot be simulated from states that don't exist.
       discount: of the Q-function.
-      num_states, num_actions: states that the dataset holds, and actions tried in each.
+      num_states: states that the dataset holds.
+      num_actions: actions that are tried in each of them.
       horizon: steps after which a Monte-Carlo return is cut off.
       fit_steps: Adam steps of each regression.
     """

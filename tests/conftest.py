@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 # Two devices, so that sharding is tested on every machine. Set as environment variables, which the
-# processes that tests start inherit and which `lpo.cli.configure_jax` leaves alone.
+# processes that tests start inherit and which `scb.cli.configure_jax` leaves alone.
 os.environ.setdefault("JAX_NUM_CPU_DEVICES", "2")
 # Tests compile more than they compute. Without the compiler's optimisations, without MLIR between XLA
 # and LLVM, and with one module a program, compiling takes a quarter of the time. XLA ends a process

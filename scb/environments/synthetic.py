@@ -78,12 +78,19 @@ class TwoLayers(nn.Module):
 
 @dataclass(frozen=True)
 class BanditConfig:
-    """What decides a bandit's shapes and program; defaults are the paper's."""
+    """What decides a bandit's shapes and program; defaults are the paper's.
+
+    Attributes:
+      hidden_size: units of each network's hidden layer.
+      activation: tanh or relu.
+      latent: normal, uniform, categorical or softmax_categorical.
+      latent_size: numbers that a context is made of; None for the observation's size, as in the paper.
+    """
 
     hidden_size: int = 32
     activation: str = "tanh"
     latent: str = "normal"
-    latent_size: int | None = None  # None: the observation's size, as in the paper
+    latent_size: int | None = None
 
     def __post_init__(self) -> None:
         if self.activation not in ACTIVATIONS:

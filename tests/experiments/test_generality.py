@@ -84,8 +84,8 @@ def test_columns_pool_the_algorithms():
 def test_the_two_searches_differ_in_drawn_hyperparameters_alone():
     plan = generality.EXPERIMENT.presets["quick"]
     drawn, fixed = (generality.config_of("Pendulum-v1", x, plan) for x in (DRAWN, FIXED))
-    assert drawn.sampled_hyperparameters and not fixed.sampled_hyperparameters
-    assert replace(fixed, sampled_hyperparameters=True) == drawn
+    assert fixed.fixed_hyperparameters and not drawn.fixed_hyperparameters
+    assert replace(fixed, fixed_hyperparameters=False) == drawn
 
 
 def test_neuroevolution_takes_as_many_steps_of_an_environment_as_of_a_bandit():

@@ -4,7 +4,7 @@ from matplotlib.figure import Figure
 
 from experiments import searches
 from scb import plotting
-from scb.commands import _paper_settings
+from scb.commands import Discover
 from scb.discovery import DiscoveryConfig
 from scb.evolution import EvolutionConfig
 
@@ -36,8 +36,12 @@ def test_a_search_that_has_ended_is_read_and_not_run_again(tmp_path):
 
 def test_the_papers_sizes_are_those_of_its_preset():
     for name, size in searches.PAPER_SIZES.items():
-        paper = _paper_settings(name)
-        assert size == {key: paper[key] for key in size}
+        paper = Discover.presets["paper"](name)
+        assert size == {
+            "generations": paper.evolution.num_generations,
+            "population_size": paper.evolution.population_size,
+            "agents_per_candidate": paper.agents_per_candidate,
+        }
 
 
 def test_the_last_judgement_is_over_searches_that_have_one():

@@ -7,12 +7,12 @@ import pytest
 from gymnax.environments import spaces
 
 import scb
-from lpo.cli import scb_main
 from scb.analysis import figures
 from scb.analysis.importance import reward_variance
 from scb.analysis.optimal_actions import optimal_actions, optimal_policy
 from scb.analysis.planes import observation_names, plane_for
 from scb.analysis.states import bandit_states, follow
+from scb.cli import main
 from scb.environments.synthetic import BanditConfig, SyntheticBandit
 from scb.environments.zoo import open_bandit
 from scb.errors import UserError
@@ -170,7 +170,7 @@ def test_a_jump_of_the_angle_is_not_drawn_as_a_line():
 
 def test_explain_writes_what_it_found(tmp_path, capsys):
     arguments = ["explain", "Synthetic-MountainCar-v0", "--episodes", "8"]
-    assert scb_main([*arguments, "--out", str(tmp_path / "a")]) == 0
+    assert main([*arguments, "--out", str(tmp_path / "a")]) == 0
     numbers = json.loads((tmp_path / "a" / "explain.json").read_text())
     # Random actions never reach the goal and earn -200.
     assert numbers["return_of_optimal_policy"]["value"] > -150
@@ -197,6 +197,6 @@ PENDULUM = "Synthetic-Pendulum-v1"
     ],
 )
 def test_explain_refuses_what_makes_no_sense(arguments, said, capsys, tmp_path):
-    assert scb_main(["explain", "--out", str(tmp_path / "a"), *arguments]) == 2
+    assert main(["explain", "--out", str(tmp_path / "a"), *arguments]) == 2
     assert said in capsys.readouterr().err
     assert not (tmp_path / "a").exists()

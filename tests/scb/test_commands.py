@@ -8,7 +8,7 @@ import shlex
 import shutil
 import subprocess
 import sys
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -17,17 +17,20 @@ import numpy as np
 import pytest
 
 import scb
-from lpo.cli import scb_main
 from scb import artefacts
 from scb.agents.ppo import PPOConfig
 from scb.agents.spec import bandit_agent
-from scb.commands import discovery_config
-from scb.curriculum import CurriculumConfig
+from scb.cli import main
+from scb.command_line import Output
+from scb.commands import Discover
+from scb.curriculum import CurriculumConfig, paper_curriculum
 from scb.discovery import BanditDiscovery, DiscoveryConfig
 from scb.environments.registry import make
 from scb.environments.synthetic import BanditConfig, bandit_for
 from scb.environments.zoo import bandit_metadata, load_bandit, save_bandit, zoo_names
-from scb.evolution import config_dict
+from scb.evolution import EvolutionConfig
+from scb.runs import config_dict
+from scb.warm_start import WarmStartConfig
 
 METADATA = {"seeds": {}, "results": {}, "cost": {}, "command": "scb discover", "config": {}}
 TINY = PPOConfig(
@@ -35,7 +38,16 @@ TINY = PPOConfig(
 )
 DISCOVER = ["discover", "--environment", "CartPole-v1", "--init", "random", "--generations", "2"]
 DISCOVER += ["--population-size", "4", "--agents-per-candidate", "2", "--evaluation-episodes", "1"]
-DISCOVER += ["--seed", "7", "--activation", "relu", "--latent", "uniform"]
+DISCOVER += [
+    "--seed",
+    "7",
+    "--activation",
+    "relu",
+    "--latent",
+    "uniform",
+    "--mean-evaluations",
+    "2",
+]
 
 
 def call(*arguments):
@@ -43,7 +55,7 @@ def call(*arguments):
     out, err = io.StringIO(), io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         try:
-            code = scb_main([str(argument) for argument in arguments])
+            code = main([str(argument) for argument in arguments])
         except SystemExit as stop:  # tyro's own refusals and its help
             code = stop.code
     return SimpleNamespace(code=code, out=out.getvalue(), err=err.getvalue())
@@ -63,7 +75,6 @@ def small_inner_loop():
     with pytest.MonkeyPatch.context() as patch:
         for module in ("scb.discovery", "scb.commands"):
             patch.setattr(f"{module}.bandit_agent", small)
-        patch.setattr("scb.discovery.EvolutionConfig.mean_evaluations", 2)
         yield
 
 
@@ -137,10 +148,9 @@ def test_a_flag_that_contradicts_the_resumed_run_is_refused(discovered):
     folder, _ = discovered
     result = call("discover", "--resume", folder, "--seed", 8)
     assert result.code == 2
-    assert "its config differs at seed (7 there, 8 now)" in result.err
-    # The same flags again contradict nothing, and are judged before anything is computed.
+    assert "its config differs at config.evolution.seed (7 there, 8 now)" in result.err
     result = call("discover", "--resume", folder, "--preset", "paper")
-    assert "its config differs at preset ('quick' there, 'paper' now)" in result.err
+    assert "its config differs at config.algorithms (['ppo'] there, [] now)" in result.err
 
 
 def test_a_discovery_from_a_bandit_tells_where_it_started(discovered, tmp_path):
@@ -154,38 +164,53 @@ def test_a_discovery_from_a_bandit_tells_where_it_started(discovered, tmp_path):
     assert origin["config"]["started_from"]["sha256"] == first["sha256"]
 
 
-def test_settings_become_a_configuration_and_what_is_left_out_keeps_its_default():
-    assert discovery_config({}) == DiscoveryConfig()
-    settings = {
-        "sigma": 0.1,
-        "generations": 5,
-        "latent": "uniform",
-        "construction": "q",
-        "seed": None,
-    }
-    config = discovery_config(settings)
+def asked_for(*arguments):
+    """The configuration that a command asks for."""
+    return Discover.parse([str(argument) for argument in arguments]).config
+
+
+def test_flags_become_a_configuration_and_what_is_left_out_keeps_its_default():
+    config = asked_for(
+        *["--sigma", "0.1", "--generations", "5", "--latent", "uniform", "--construction", "q"]
+    )
     assert (config.evolution.sigma, config.evolution.num_generations) == (0.1, 5)
     assert (config.bandit.latent, config.warm_start.construction) == ("uniform", "q")
     assert config.evolution.seed == DiscoveryConfig().evolution.seed
-    assert not discovery_config({"fixed_hyperparameters": True}).sampled_hyperparameters
+    assert asked_for("--fixed-hyperparameters").fixed_hyperparameters
 
 
-@pytest.fixture
-def asked_for(monkeypatch):
-    """Runs a command as far as the problem, and returns the configuration that it asks for."""
-    seen = []
+EVERY_FLAG = """--preset=paper --environment=MountainCar-v0 --backend=spring --max-steps=5 --algorithms=ppo,dqn,ppo
+--mode=sequential '--hyperparameters={"ppo": {"learning_rate": [0.25]}}' --agents-per-candidate=3
+--evaluation-episodes=2 --mode-actions --curriculum=linear:2:4:0:2 --from-bandit=b.npz --reward-std=4.0
+--select=best --hidden-size=3 --activation=relu --latent=uniform --latent-size=2 --construction=q --expert=sac
+--num-experts=3 --expert-steps=9 --expert-generations=8 --discount=0.5 --num-states=7 --num-actions=6 --horizon=4
+--fit-steps=3 --strategy=Open_ES --population-size=6 --generations=9 --sigma=0.2 --sigma-decay=0.9 --sigma-limit=0.1
+--learning-rate=0.3 --learning-rate-decay=0.8 --learning-rate-limit=0.2 --combine=ranks --mean-evaluations=5
+--evaluate-mean-every=4 --checkpoint-every=3 --seed=8"""
 
-    def record(config):
-        seen.append(config)
-        raise KeyboardInterrupt
 
-    monkeypatch.setattr("scb.commands.BanditDiscovery", record)
-
-    def run(*arguments):
-        assert call(*arguments).code == 130
-        return seen.pop()
-
-    return run
+def test_the_command_that_a_configuration_is_written_as_asks_for_it_again():
+    words = shlex.split(EVERY_FLAG)
+    command = Discover.parse(words)
+    assert sorted(shlex.split(command.command)) == sorted(["scb", "discover", *words])
+    assert Discover.parse(shlex.split(command.command)[2:]).config == command.config
+    # That is every field but those that only a program sets, and those that contradict others.
+    paper = config_dict(Discover.parse(["--preset=paper", "--environment=CartPole-v1"]).config)
+    same = {
+        name
+        for group in ("bandit", "warm_start", "evolution")
+        for name, value in paper[group].items()
+        if value == getattr(getattr(command.config, group), name)
+    } | {name for name, value in paper.items() if value == config_dict(command.config)[name]}
+    assert same == {"configs", "fixed_hyperparameters", "init", "min_spread", "parameterization"}
+    for text in (
+        "--fixed-hyperparameters",
+        "--min-spread=0.5",
+        "--parameterization=TI --init=random",
+    ):
+        words = text.split()
+        assert shlex.split(Discover.parse(words).command) == ["scb", "discover", *words]
+    assert Discover.parse(["--preset=quick", "--generations=150"]).command == "scb discover"
 
 
 # Tables "Hyperparameters for meta-training", "Number of generations for each environment" and
@@ -212,66 +237,63 @@ PAPER = {
 
 
 @pytest.mark.parametrize("environment", PAPER)
-def test_the_preset_paper_is_the_papers_tables(asked_for, environment):
-    config = asked_for("discover", "--preset", "paper", "--environment", environment)
+def test_the_preset_paper_is_the_papers_tables(environment):
+    config = asked_for("--preset", "paper", "--environment", environment)
     generations, population, rollouts, episodes, mode, curriculum = PAPER[environment]
     evolution = config.evolution
     assert (evolution.num_generations, evolution.population_size) == (generations, population)
     assert (config.agents_per_candidate, config.evaluation_episodes) == (rollouts, episodes)
     assert config.mode == mode
-    assert config.curriculum == (None if curriculum is None else CurriculumConfig(*curriculum))
+    assert config.curriculum == "paper"
+    expected = None if curriculum is None else CurriculumConfig(*curriculum)
+    assert paper_curriculum(environment, generations) == expected
     # The rows and tables that are the same for all: SNES from 0.05, 64 agents for the mean, the mean
     # of the returns, 32 tanh units, a normal latent as large as the observation.
     assert (evolution.strategy, evolution.sigma, evolution.combine) == ("SNES", 0.05, "mean")
     assert config.bandit == BanditConfig(32, "tanh", "normal", None)
     assert (config.init, config.start, config.parameterization) == ("random", None, "I")
-    assert config.sampled_hyperparameters and not config.mode_actions
+    assert not config.fixed_hyperparameters and not config.mode_actions
     # All that fit the action space; Brax's and Pendulum's is continuous.
     assert config.algorithms == ()
 
 
-def test_single_flags_override_the_preset_paper(asked_for):
-    paper = ["discover", "--preset", "paper", "--environment", "MountainCar-v0"]
-    config = asked_for(
-        *paper, "--generations", "10", "--algorithms", "ppo,DQN", "--mode", "sequential"
-    )
+def test_single_flags_override_the_preset_paper():
+    paper = ["--preset", "paper", "--environment", "MountainCar-v0"]
+    config = asked_for(*paper, "--generations", 10, "--algorithms", "ppo,DQN", "--mode=sequential")
     assert (config.algorithms, config.mode) == (("ppo", "dqn"), "sequential")
     assert config.evolution.population_size == 128
     # A hundredth of the generations: the transition begins at 2 and takes 6.
-    assert config.curriculum == CurriculumConfig("linear", 1000, 200, 2, 6)
+    curriculum = BanditDiscovery(config).config.curriculum
+    assert curriculum == CurriculumConfig("linear", 1000, 200, 2, 6)
     assert asked_for(*paper, "--curriculum", "none").curriculum is None
     config = asked_for(*paper, "--curriculum", "cosine:50:100:3:4")
     assert config.curriculum == CurriculumConfig("cosine", 50, 100, 3, 4)
 
 
-def test_the_preset_quick_trains_ppo_alone_unless_all_are_asked_for(asked_for):
-    assert asked_for("discover").algorithms == ("ppo",)
-    assert asked_for("discover", "--algorithms", "ppo, sac ,ppo").algorithms == (
-        "ppo",
-        "sac",
-        "ppo",
-    )
-    for text in ("all", " All "):
-        assert asked_for("discover", "--algorithms", text).algorithms == ()
+def test_the_preset_quick_trains_ppo_alone_unless_all_are_asked_for():
+    assert asked_for().algorithms == ("ppo",)
+    assert asked_for("--algorithms", "ppo, sac ,ppo").algorithms == ("ppo", "sac", "ppo")
+    for words in ("all", " All "):
+        assert asked_for("--algorithms", words).algorithms == ()
 
 
-def test_a_file_gives_the_lists_to_draw_from(asked_for, tmp_path):
+def test_a_file_gives_the_lists_to_draw_from(tmp_path):
     path = tmp_path / "lists.json"
     path.write_text('{"ppo": {"learning_rate": [0.25, 1]}, "sac": {"polyak": [0.5]}}')
-    config = asked_for("discover", "--hyperparameters", path)
+    config = asked_for("--hyperparameters", path)
     assert config.lists == {"ppo": {"learning_rate": (0.25, 1)}, "sac": {"polyak": (0.5,)}}
     drawn = BanditDiscovery(config).trainings["ppo"].spec.sample(jax.random.key(0), 2)
     assert sorted(drawn.learning_rate.tolist()) == [0.25, 1.0]
+    # The content itself does too, so that a run's command is whole without the file.
+    assert asked_for("--hyperparameters", path.read_text()) == config
 
 
 @pytest.mark.slow
-def test_a_synthetic_mdp_is_discovered_and_its_command_asks_for_the_same_again(tmp_path, asked_for):
+def test_a_synthetic_mdp_is_discovered_and_its_command_asks_for_the_same_again(tmp_path):
     flags = ["--parameterization", "T", "--max-steps", "3", "--mode", "sequential"]
     flags += ["--algorithms", "ppo,dqn,ppo", "--curriculum", "linear:2:4:0:2", "--mode-actions"]
     flags += ["--fixed-hyperparameters", "--out", tmp_path / "run"]
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("scb.commands.BanditDiscovery", BanditDiscovery)
-        result = call(*DISCOVER, *flags, "--judge-agents", "0")
+    result = call(*DISCOVER, *flags, "--judge-agents", "0")
     assert result.code == 0, result.err
     path = tmp_path / "run" / "Synthetic-CartPole-v1.npz"
     mdp, params = make(str(path))
@@ -281,11 +303,9 @@ def test_a_synthetic_mdp_is_discovered_and_its_command_asks_for_the_same_again(t
     # 2 generations of 4 candidates: 2 agents, turns of 16 steps, episodes of at most 4.
     assert metadata["cost"]["environment_steps_training"] == 2 * 4 * 2 * 16
     assert metadata["cost"]["environment_steps_evaluation"] == 2 * 4 * 2 * 4
-    program, *command = shlex.split(metadata["command"])
-    assert program == "scb"
-    config = asked_for(*command, "--out", tmp_path / "again")
-    assert json.loads(json.dumps(config_dict(config))) == metadata["config"]["discovery"]
-    assert config.mode_actions and not config.sampled_hyperparameters
+    config = asked_for(*shlex.split(metadata["command"])[2:])
+    assert config_dict(config) == metadata["config"]["discovery"]
+    assert config.mode_actions and config.fixed_hyperparameters
 
 
 def test_a_refused_discovery_leaves_no_folder_behind(tmp_path):
@@ -350,7 +370,7 @@ def test_a_reader_that_stops_early_is_no_error(monkeypatch):
         monkeypatch.setattr(
             "scb.commands.list_command", lambda: (_ for _ in ()).throw(BrokenPipeError)
         )
-        assert scb_main(["list"]) == 1
+        assert main(["list"]) == 1
 
 
 # -- errors
@@ -400,8 +420,8 @@ def test_a_reader_that_stops_early_is_no_error(monkeypatch):
             "td3 does not fit the environment's discrete actions: use ppo, sac, dqn, ddqn",
         ),
         ("discover --algorithms pop", "unknown algorithm 'pop': did you mean ppo"),
-        ("discover --algorithms ,", "the list of algorithms is empty: give one or more of ppo"),
-        ("discover --algorithms ''", "the list of algorithms is empty: give one or more of ppo"),
+        ("discover --algorithms ,", "the list of algorithms, of ppo, sac,"),
+        ("discover --algorithms ''", "td3 or all, is empty: give one or more"),
         (
             "discover --environment CartPole-v1 --curriculum linear:100:501:0:5",
             "ends with episodes of 501 steps, but one of CartPole-v1 takes at most 500",
@@ -519,10 +539,34 @@ def test_an_import_of_pickles_is_refused_and_writes_nothing(tmp_path, monkeypatc
     assert [path.name for path in tmp_path.iterdir()] == ["published"]
 
 
-@pytest.mark.parametrize("config", ["{}", '{"command": "meta-train", "preset": "paper"}'])
-def test_a_run_of_something_else_is_not_resumed(tmp_path, config):
-    (tmp_path / "config.json").write_text(config)
-    refused(["discover", "--resume", tmp_path], f"cannot resume {tmp_path}: its config differs at")
+# As `scb discover` wrote it until random keys were mended.
+OLD = {
+    "command": "discover",
+    "environment": "CartPole-v1",
+    "seed": 7,
+    "population_size": 4,
+    "preset": "quick",
+}
+
+
+@pytest.mark.parametrize(
+    ("config", "message"),
+    [
+        (OLD, "an earlier version started it, whose random numbers this one does not draw"),
+        ({}, "an earlier version started it"),
+        (
+            {"command": "lpo meta-train --seed=3", "config": {}},
+            "with scb discover: it was started with lpo meta-train --seed=3.",
+        ),
+        (
+            {"command": "scb discover --seed=7", "config": {"environment": "CartPole-v1"}},
+            "its config differs at config.agents_per_candidate (None there, 4 now)",
+        ),
+    ],
+)
+def test_a_run_of_something_else_is_not_resumed(tmp_path, config, message):
+    (tmp_path / "config.json").write_text(json.dumps(config))
+    refused(["discover", "--resume", tmp_path], message)
 
 
 @pytest.mark.parametrize(
@@ -539,6 +583,18 @@ def test_help_is_shown_for_every_command(arguments):
     result = call(*arguments)
     assert result.code == 0
     assert "scb" in result.out
+
+
+def test_every_flag_of_a_discovery_is_explained_in_a_group_of_its_own():
+    for config in (DiscoveryConfig, BanditConfig, WarmStartConfig, EvolutionConfig, Output):
+        for field in fields(config):
+            assert f"\n      {field.name}: " in config.__doc__
+    shown = call("discover", "--help").out
+    for group in ("bandit", "warm start", "outer loop", "output", "judgement"):
+        assert f"{group} options" in shown
+    # The preset's own values are shown as the defaults.
+    paper = call("discover", "--preset", "paper", "--environment", "reacher", "--help").out
+    assert "(default: 30)" in paper and "(default: 256)" in paper
 
 
 def test_an_interruption_is_exit_code_130(monkeypatch, bandit_file):
@@ -559,7 +615,7 @@ def test_a_process_of_its_own_starts_and_refuses_in_one_sentence(tmp_path):
         [
             sys.executable,
             "-c",
-            "import sys; from lpo.cli import scb_main; sys.exit(scb_main())",
+            "import sys; from scb.cli import main; sys.exit(main())",
             *("discover", "--environment", "Pendulum-v2", "--out", str(tmp_path / "run")),
         ],
         env={**environment, "PYTHONPATH": str(root), "XDG_CACHE_HOME": str(tmp_path / "cache")},

@@ -29,8 +29,8 @@ from scb.environments.zoo import (
     zoo_names,
 )
 from scb.errors import UserError
-from scb.evolution import EvolutionConfig, config_dict, map_population
-from scb.runs import Run
+from scb.evolution import EvolutionConfig, map_population
+from scb.runs import Run, config_dict
 from scb.statistics import iqm
 from scb.warm_start import WarmStartConfig
 from tests.scb.probes import Corridor, CorridorParams
@@ -570,10 +570,10 @@ def test_a_bandit_fits_the_environments_of_its_shapes_only():
 
 def test_hyperparameters_are_drawn_from_the_papers_lists_or_fixed():
     sampled, fixed = (
-        BanditDiscovery(replace(CONFIG, sampled_hyperparameters=yes))
+        BanditDiscovery(replace(CONFIG, fixed_hyperparameters=fixed))
         .trainings["ppo"]
         .spec.sample(jax.random.key(0), 5)
-        for yes in (True, False)
+        for fixed in (False, True)
     )
     np.testing.assert_array_equal(fixed.learning_rate, np.full(5, 5e-3, np.float32))
     # Five agents share the five learning rates out, 0.01 among them where actions are discrete.
@@ -642,7 +642,7 @@ def test_the_inner_loop_is_the_papers_where_no_agent_is_given():
             "there are hyperparameter lists for sac, but the inner loop trains ppo",
         ),
         (
-            {"lists": {"ppo": {"discount": (0.9,)}}, "sampled_hyperparameters": False},
+            {"lists": {"ppo": {"discount": (0.9,)}}, "fixed_hyperparameters": True},
             "fixed hyperparameters are not drawn from lists",
         ),
     ],

@@ -24,12 +24,11 @@ from scb.evolution import (
     EnvironmentSteps,
     EvolutionConfig,
     combine_tasks,
-    config_dict,
     evolve,
     map_population,
     rank_failed_last,
 )
-from scb.runs import Run
+from scb.runs import Run, config_dict
 from tests.scb.probes import Parabola
 
 CONFIG = EvolutionConfig(

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from scb.errors import UserError
-from scb.runs import Checkpoints, Run, Stopwatch, read_config, settle, write_json
+from scb.runs import Checkpoints, Run, Stopwatch, read_config, write_json
 
 CONFIG = {"seed": 0, "evolution": {"sigma": 0.05, "strategy": "SNES"}, "hidden_sizes": (8, 8)}
 
@@ -148,35 +148,6 @@ def test_rewinding_drops_the_half_line_that_a_kill_left(run):
 def test_rewinding_a_run_without_logs_is_nothing(run):
     run.rewind(0)
     assert not (run.folder / "metrics.jsonl").exists()
-
-
-# -- settings
-# -----------------------------------------------------------------------------------------
-
-PRESETS = {"quick": {"generations": 3, "population": 8}, "paper": {"generations": 1000}}
-
-
-def test_a_flag_wins_over_the_preset_and_the_preset_over_nothing():
-    flags = {"generations": None, "population": 4, "seed": None}
-    settings = settle(flags, PRESETS, None, None)
-    assert settings == {"generations": 3, "population": 4, "seed": None, "preset": "quick"}
-    assert settle(flags, PRESETS, "paper", None)["generations"] == 1000
-
-
-def test_an_unknown_preset_is_refused():
-    with pytest.raises(UserError, match=r"unknown preset .quik.: did you mean quick\?"):
-        settle({}, PRESETS, "quik", None)
-
-
-def test_a_resumed_run_keeps_its_settings_and_a_contradicting_flag_is_found(tmp_path):
-    stored = {"generations": 3, "population": 4, "seed": 1, "preset": "quick"}
-    run = Run.open(tmp_path / "run", stored)
-    flags = {"generations": None, "population": None, "seed": None}
-    assert settle(flags, PRESETS, None, run.folder) == stored
-    for flags, preset, field in [({"seed": 2}, None, "seed"), ({}, "paper", "preset")]:
-        settings = settle(flags, PRESETS, preset, run.folder)
-        with pytest.raises(UserError, match=f"its config differs at {field}"):
-            Run.open(run.folder, settings, resume=True)
 
 
 # -- checkpoints

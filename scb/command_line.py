@@ -1,0 +1,189 @@
+"""A configuration's dataclass is its command line: tyro reads it, and the command of a run is written from it.
+
+A setting is one field with its docstring. Where its flag has another name, or its value is one word of
+text (`ppo,sac`), the field's annotation says so, with `tyro.conf.arg` and `text`.
+"""
+
+import argparse
+import shlex
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields, is_dataclass
+from pathlib import Path
+from typing import Any, ClassVar, Self, TypeVar, get_type_hints
+
+import tyro
+from tyro.constructors import PrimitiveConstructorSpec
+
+from scb.errors import UserError, unknown_name
+from scb.runs import Run, config_dict, read_config
+
+T = TypeVar("T")
+# Flags are the fields' names without those of the dataclasses that they are in; comments are for readers of code.
+_STYLE = (tyro.conf.OmitArgPrefixes, tyro.conf.HelptextFromCommentsOff)
+
+
+def text(read: Callable[[str], T], write: Callable[[T], str], metavar: str) -> Any:
+    """Annotates a field whose value is one word of the command line; `read` raises a UserError for a wrong one."""
+    return PrimitiveConstructorSpec(
+        nargs=1,
+        metavar=metavar,
+        instance_from_str=lambda words: read(words[0]),
+        is_instance=lambda value: True,
+        str_from_instance=lambda value: [write(value)],
+    )
+
+
+def listed(words: str, what: str) -> tuple[str, ...]:
+    """The names in "a,b"."""
+    names = tuple(name.strip() for name in words.split(",") if name.strip())
+    if not names:
+        raise UserError(f"the list of {what} is empty: give one or more, separated by commas.")
+    return names
+
+
+def numbers(words: str, what: str) -> tuple[float, ...]:
+    """The numbers in "0.25,1"."""
+    try:
+        return tuple(float(x) for x in listed(words, what))
+    except ValueError as error:
+        raise UserError(
+            f"{what} {words!r} are no numbers: give them separated by commas, such as 0.25,0.5,1."
+        ) from error
+
+
+def flags(config: Any, default: Any) -> Iterator[str]:
+    """The flags that make of `default` this configuration, a dataclass of the same type."""
+    hints = get_type_hints(type(config), include_extras=True)
+    for entry in fields(config):
+        value, other = getattr(config, entry.name), getattr(default, entry.name)
+        annotations = getattr(hints[entry.name], "__metadata__", ())
+        if value == other or tyro.conf.Suppress in annotations:
+            continue
+        written = [x for x in annotations if isinstance(x, PrimitiveConstructorSpec)]
+        if is_dataclass(value) and not written:
+            yield from flags(value, other)
+            continue
+        named = [x.name for x in annotations if getattr(x, "name", None)]
+        name = (named[0] if named else entry.name).replace("_", "-")
+        if isinstance(value, bool):
+            yield f"--{name}" if value else f"--no-{name}"
+        else:
+            yield f"--{name}={written[0].str_from_instance(value)[0] if written else value}"
+
+
+@dataclass(frozen=True)
+class Output:
+    """What the run writes, and where.
+
+    Attributes:
+      out: folder to write; must be new or empty.
+      resume: a run folder to continue; its configuration applies, and a flag that contradicts it is
+        an error.
+      wandb: project to log to, with the extra `wandb`.
+    """
+
+    out: Path
+    resume: Path | None = None
+    wandb: str | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class LongRun:
+    """A command that leaves a run folder: a configuration, which the folder stores, from a preset and flags.
+
+    A subclass has the fields `config` and `output`, `program`, the names of program and command, and
+    `presets`, which make a configuration, for the environment where one was named.
+    """
+
+    config: Any
+    output: Output
+    preset: str = "quick"
+
+    program: ClassVar[str]
+    presets: ClassVar[Mapping[str, Callable[[str | None], Any]]]
+
+    def run(self) -> None:
+        raise NotImplementedError
+
+    @classmethod
+    def parse(cls, arguments: Sequence[str]) -> Self:
+        """The command with these flags: those that a resumed run was started with, over its preset, come first."""
+        folder = _given(arguments).get("resume")
+        if folder is not None:
+            arguments = [*cls._stored(folder), *arguments]
+        given = _given(arguments)
+        preset = given.get("preset", "quick")
+        if preset not in cls.presets:
+            raise unknown_name("preset", preset, cls.presets)
+        config = cls.presets[preset](given.get("environment"))
+        default = cls(config=config, preset=preset)  # type: ignore[call-arg]
+        return tyro.cli(cls, default=default, prog=cls.program, args=arguments, config=_STYLE)
+
+    @classmethod
+    def _stored(cls, folder: str) -> list[str]:
+        stored = read_config(folder)
+        command = stored.get("command")
+        if "config" not in stored or not isinstance(command, str):
+            raise UserError(
+                f"cannot resume {folder}: an earlier version started it, whose random numbers this one does not "
+                "draw; start a new folder with --out."
+            )
+        if not command.startswith(cls.program):
+            raise UserError(
+                f"cannot resume {folder} with {cls.program}: it was started with {command}."
+            )
+        return shlex.split(command)[len(cls.program.split()) :]
+
+    @property
+    def command(self) -> str:
+        """What starts the same run afresh, however it was typed or resumed."""
+        return command_of(self.program, self.config, self.presets[self.preset], self.preset)
+
+    def open(self) -> Run:
+        """The run folder, new or resumed."""
+        output = self.output
+        stored = {"command": self.command, "config": config_dict(self.config)}
+        return Run.open(
+            output.resume or output.out, stored, output.resume is not None, output.wandb
+        )
+
+
+def command_of(
+    program: str, config: Any, preset: Callable[[str | None], Any], name: str = "quick"
+) -> str:
+    """The command that asks for a configuration: what differs from the preset of that name."""
+    words = [] if name == "quick" else [f"--preset={name}"]
+    default = preset(None)
+    environment = getattr(config, "environment", None)
+    if environment is not None and environment != default.environment:
+        words.append(f"--environment={environment}")
+        default = preset(environment)
+    return shlex.join([*program.split(), *words, *flags(config, default)])
+
+
+def call(
+    program: str, description: str, commands: Mapping[str, Any], arguments: Sequence[str]
+) -> None:
+    """Runs the command that the arguments name, of functions and LongRuns by name."""
+    name = arguments[0] if arguments else ""
+    command = commands.get(name)
+    if command is None:
+        tyro.extras.subcommand_cli_from_dict(
+            dict(commands),
+            prog=program,
+            description=description,
+            args=list(arguments),
+            sort_subcommands=False,
+        )
+    elif isinstance(command, type) and issubclass(command, LongRun):
+        command.parse(arguments[1:]).run()
+    else:
+        tyro.cli(command, prog=f"{program} {name}", args=arguments[1:], config=_STYLE)
+
+
+def _given(arguments: Sequence[str]) -> dict[str, str]:
+    """What the default values depend on, and is therefore read first."""
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    for name in ("preset", "resume", "environment"):
+        parser.add_argument(f"--{name}", nargs="?")
+    return {k: v for k, v in vars(parser.parse_known_args(arguments)[0]).items() if v is not None}

@@ -1,0 +1,66 @@
+"""Lists of hyperparameters to draw from, as the command line writes them."""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from scb.agents.spec import tables_of
+from scb.agents.tables import Lists
+from scb.errors import UserError
+
+# Of 32 bits, which is what an agent calculates with.
+_LARGEST = float(np.finfo(np.float32).max)
+_WANTED = 'give {"ppo": {"learning_rate": [0.001, 0.005]}, ...}'
+
+
+def read_lists(words: str) -> dict[str, Lists]:
+    """{algorithm: {hyperparameter: values}} from a JSON file or its content; what is wrong with it is a UserError."""
+    source, content = "the text", words
+    if not words.lstrip().startswith("{"):
+        source = words
+        try:
+            content = Path(words).read_bytes().decode()
+        except OSError as error:
+            raise UserError(f"cannot read {source} ({error.strerror}): {_WANTED}.") from error
+        except ValueError as error:
+            raise UserError(f"{source} is no JSON ({error}): {_WANTED}.") from error
+    try:
+        lists = json.loads(content, parse_constant=_no_json)
+    except ValueError as error:
+        raise UserError(f"{source} is no JSON ({error}): {_WANTED}.") from error
+    if words == "{}":
+        return {}
+    if not isinstance(lists, dict) or not lists or not all(map(_is_filled, lists.values())):
+        raise UserError(f"{source} holds no hyperparameter lists: {_WANTED}.")
+    for algorithm, values_of in lists.items():
+        tables_of(algorithm)
+        for name, values in values_of.items():
+            if not isinstance(values, list) or not values:
+                raise UserError(
+                    f"{source}: {algorithm}'s {name} is {values!r}, no list of numbers: {_WANTED}."
+                )
+            for value in values:
+                number = isinstance(value, int | float) and not isinstance(value, bool)
+                if not number or abs(value) > _LARGEST:
+                    raise UserError(
+                        f"{source}: {algorithm}'s {name} has the value {value!r}, which is no number that an "
+                        "agent can take: give finite numbers only."
+                    )
+    return {a: {n: tuple(v) for n, v in values.items()} for a, values in lists.items()}
+
+
+def write_lists(lists: Mapping[str, Lists]) -> str:
+    """What `read_lists` reads."""
+    return json.dumps(lists)
+
+
+def _is_filled(lists: Any) -> bool:
+    return isinstance(lists, dict) and bool(lists)
+
+
+def _no_json(constant: str) -> Any:
+    """Raises a ValueError for NaN and infinities, which Python would read."""
+    raise ValueError(f"{constant} is no JSON number")
