@@ -92,6 +92,7 @@ def meta_train_command(
     resume: Path | None = None,
     fitness: str | None = None,
     reward_noise: float | None = None,
+    drift: str | None = None,
     base: str | None = None,
     xi: float | None = None,
     gate: float | None = None,
@@ -128,6 +129,8 @@ def meta_train_command(
         transfer (return of the bandit-trained agent in the bandit's evaluation environment).
       reward_noise: noise on the bandit's reward, in its standard deviations. Without it the drift
         overfits the bandit.
+      drift: the family that is learned: network (Lu et al., 2022; the default) or another of
+        `lpo.drifts`. The next four are settings of a network.
       base: ppo (the network corrects PPO's clip) or none.
       xi: half-width of the drift's dead zone.
       gate: width of the region around ratio 1 where the network is faded out, in nats; 0 for none.
@@ -162,6 +165,7 @@ def meta_train_command(
             "seed": seed,
             "fitness": fitness,
             "reward_noise": reward_noise,
+            "drift": drift,
             "base": base,
             "xi": xi,
             "gate": gate,

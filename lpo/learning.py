@@ -7,7 +7,7 @@ from typing import Any
 
 from lpo import figures
 from lpo.certificate import Certificate
-from lpo.drifts import LearnedDrift
+from lpo.drifts import LearnedDrift, learned_drift
 from lpo.meta_training import VALIDATION_AGENTS, MetaTraining, MetaTrainingConfig, chosen_mean
 from lpo.objectives import Objective, load_objective, save_objective
 from lpo.pipeline import meta_training_artefact
@@ -109,7 +109,10 @@ def meta_training_config(settings: Mapping[str, Any]) -> MetaTrainingConfig:
             ),
         }
     )
-    drift = LearnedDrift(**given(base="base", temporal="temporal", xi="xi", gate="gate"))
+    drift = learned_drift(
+        settings.get("drift") or LearnedDrift.name,
+        **given(base="base", temporal="temporal", xi="xi", gate="gate"),
+    )
     return MetaTrainingConfig(
         tasks=tasks,
         drift=drift,

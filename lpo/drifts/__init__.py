@@ -16,7 +16,7 @@ from lpo.drifts.contract import Drift
 from lpo.drifts.formula import ClosedFormDrift
 from lpo.drifts.known import ClipDrift, DPODrift, NoDrift
 from lpo.drifts.network import LearnedDrift
-from scb.errors import unknown_name
+from scb.errors import UserError, unknown_name
 
 DRIFTS: dict[str, type[Drift]] = {
     drift.name: drift
@@ -28,6 +28,28 @@ DRIFTS: dict[str, type[Drift]] = {
         ClosedFormDrift,
     )
 }
+
+
+def learned_drift(name: str, **settings: Any) -> Drift:
+    """A drift that meta-training can evolve, by its family's name.
+
+    Args:
+      name: of a family in `DRIFTS` that is `learned`.
+      settings: of its fields, which are its flags on the command line; the rest keep their defaults.
+
+    Raises:
+      UserError: the family is unknown, does not learn, or has no such setting.
+    """
+    learned = {family: drift for family, drift in DRIFTS.items() if drift.learned}
+    if name not in learned:
+        raise unknown_name("learned drift", name, learned)
+    for setting in settings:
+        if setting not in learned[name].settings():
+            having = [family for family, drift in learned.items() if setting in drift.settings()]
+            raise UserError(
+                f"the drift {name} has no {setting}, which is a setting of {', '.join(having)}: leave it out."
+            )
+    return learned[name](**settings)
 
 
 def drift_from_config(config: Mapping[str, Any]) -> Drift:

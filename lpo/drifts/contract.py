@@ -79,8 +79,12 @@ class Drift(ABC):
     @classmethod
     def from_config(cls, config: Mapping[str, Any]) -> Self:
         """The inverse of `to_config`; a KeyError names an entry that is missing."""
-        names = [field.name for field in fields(cls)]  # type: ignore[arg-type]
-        return cls(**{name: config[name] for name in names})
+        return cls(**{name: config[name] for name in cls.settings()})
+
+    @classmethod
+    def settings(cls) -> list[str]:
+        """Names of its fields."""
+        return [field.name for field in fields(cls)]  # type: ignore[arg-type]
 
     def shapes(self) -> dict[str, tuple[int, ...]]:
         """Of the parameters, by name."""

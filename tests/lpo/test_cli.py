@@ -68,6 +68,8 @@ def refused(capsys, working_folder, one_sentence):
         ("meta-train --environment Synthetic-Pendulm-v1", "did you mean Synthetic-Pendulum-v1"),
         ("train --objective dop", "unknown objective 'dop': did you mean dpo?"),
         ("evaluate --objectives ppo dop", "unknown objective 'dop': did you mean dpo?"),
+        ("meta-train --drift netwrok", "unknown learned drift 'netwrok': did you mean network?"),
+        ("meta-train --drift dpo", "unknown learned drift 'dpo': "),
         ("certify --objective dop", "unknown objective 'dop': did you mean dpo?"),
         ("run --objective dop", "unknown objective 'dop': did you mean dpo?"),
         ("meta-train --strategy Open_SE", "unknown evolution strategy 'Open_SE': did you mean Op"),
