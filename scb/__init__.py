@@ -6,6 +6,9 @@ Importing the package registers the bandits that ship with it:
     env, params = gymnax.make("Synthetic-Pendulum-v1")
 """
 
+from scb import start as start  # before what imports gymnax
+
+# isort: split
 from scb.agents.dqn import DQN, DQNConfig, DQNHyperparameters
 from scb.agents.ppo import PPO, PPOConfig, PPOHyperparameters
 from scb.agents.sac import SAC, SACConfig, SACHyperparameters
