@@ -42,7 +42,7 @@ from scb.artefacts import flatten, machine_description, package_versions
 from scb.cli import configure_jax
 from scb.environments.zoo import PREFIX, open_bandit, space_description
 from scb.evolution import map_population
-from scb.keys import key_at, root_key, split_key
+from scb.keys import named_key, root_key, split_key
 from scb.statistics import Estimate, estimate
 
 EPISODES = 20
@@ -112,7 +112,7 @@ def measure_this_project(task: Task, steps: int) -> dict[str, list[float]]:
         if repeat == 0:
             continue
         seconds.append((time.perf_counter() - start) / task.population)
-        keys = split_key(key_at(root_key(repeat), 1), task.population)
+        keys = split_key(named_key(root_key(repeat), "evaluation"), task.population)
         returns += evaluate_all(states, keys).tolist()
     return {"seconds": seconds, "returns": returns}
 

@@ -29,10 +29,10 @@ from scb.environments.zoo import bandit_metadata, open_bandit
 from scb.evolution import map_population
 from scb.importer import PUBLISHED_BANDITS, published_bandit
 from scb.keys import root_key, split_key
+from scb.seeds import REPORTING
 from scb.statistics import estimate
 
 OURS, PUBLISHED = "ours", "published"
-REPORTING_SEED = 10_000
 # Final returns of agents trained in the environment, Liesen et al. (2024), table of Brax results, columns EE;
 # those of agents trained in bandits are `zoo_table_page.PAPER`.
 PAPER: dict[str, dict[str, float]] = {
@@ -157,7 +157,7 @@ def _curves(
         return agent.train_with_evaluations(key, hyperparameters, trained_in, evaluation, every)[1]
 
     start = time.monotonic()
-    keys = split_key(root_key(REPORTING_SEED), number)
+    keys = split_key(root_key(REPORTING.start), number)
     returns = np.asarray(map_population(train, number, (0,))(keys))
     seconds = time.monotonic() - start
     # What is no number counts as the agent before its training.

@@ -25,6 +25,7 @@ from scb.analysis.states import follow
 from scb.discovery import SyntheticTraining, judge
 from scb.environments.zoo import bandit_metadata, open_bandit
 from scb.keys import key_at, root_key, split_key
+from scb.seeds import ILLUSTRATING, REPORTING
 from scb.statistics import iqm, normalized_score, pooled_estimate
 
 ENVIRONMENT = "Pendulum-v1"
@@ -42,7 +43,6 @@ WITH = {
     CLONING: "cloning",
     ACTION: "closeness to the expert's action",
 }
-EXPERT_SEED, REPORTING_SEED = 40_000, 10_000
 
 
 def cell(reward: str, states: str) -> str:
@@ -65,7 +65,7 @@ def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None
     space = env.action_space(env_params)
     bandit = open_bandit(f"Synthetic-{ENVIRONMENT}")
     spec = bandit_agent("ppo", ENVIRONMENT)
-    key_random, key_experts = split_key(root_key(EXPERT_SEED))
+    key_random, key_experts = split_key(root_key(ILLUSTRATING.start))
 
     def counted(returns: Any) -> list[float]:
         """Two digits of each; what is no number counts as a random policy's."""
@@ -79,14 +79,14 @@ def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None
         training = SyntheticTraining(replaced, env, env_params, spec)
         weights = bandit.default_params.weights
         (returns,) = judge(
-            training, weights, REPORTING_SEED, plan["agents"], plan["episodes"], mode=True
+            training, weights, REPORTING.start, plan["agents"], plan["episodes"], mode=True
         ).values()
         return counted(returns)
 
     def imitate(expert: Any, states: Any) -> list[float]:
         """Returns of policies cloned from the expert in these states."""
         source = components.ReplacedBandit(bandit, states=states)
-        key_draw, key_agents = split_key(root_key(REPORTING_SEED))
+        key_draw, key_agents = split_key(root_key(REPORTING.start))
         returns = components.judge_cloning(
             expert,
             lambda key: source.reset_env(key, source.default_params)[0],

@@ -25,11 +25,11 @@ from scb.curriculum import paper_curriculum
 from scb.discovery import DiscoveryConfig, SyntheticTraining
 from scb.evolution import map_population
 from scb.keys import root_key, split_key
+from scb.seeds import REPORTING
 from scb.statistics import Estimate, estimate, normalized_score, paired_difference
 
 OWN = "max"  # the evaluation environment's own limit
 BINS = {"1": 1, "2": 2, "3 to 5": 5, "6 to 10": 10, "11 to 50": 50, "more": np.inf}
-JUDGE_SEED = 10_000
 GOOD = 0.5  # normalised score from which a search counts as one that has found something
 
 
@@ -77,7 +77,7 @@ def _measure_limit(
             bandit_agent(algorithm, environment),
         )
         judged, lengths = returns_and_lengths(
-            training, outcome.mean, root_key(JUDGE_SEED), plan["agents"], plan["episodes"]
+            training, outcome.mean, root_key(REPORTING.start), plan["agents"], plan["episodes"]
         )
         returns[algorithm], number = finite(judged, entry["random"])
         failed += number

@@ -20,6 +20,7 @@ from scb.agents.spec import environment_agent
 from scb.analysis.components import SACExpert, train_sac_expert
 from scb.evaluation import evaluate
 from scb.keys import root_key
+from scb.seeds import ILLUSTRATING, REPORTING
 from scb.statistics import Estimate, estimate
 
 # Liesen et al. (2024), table of SAC experts: interquartile mean and 95 % interval of 200 evaluations.
@@ -30,14 +31,13 @@ PAPER = {
     "MountainCarContinuous-v0": (94.9, 94.8, 95.0),
     "Pendulum-v1": (-137.4, -151.5, -127.5),
 }
-EXPERT_SEED, JUDGE_SEED = 40_000, 10_000
 
 
 def train(environment: str, number: int, episodes: int) -> tuple[SACExpert, Any, Any]:
     """(the best of `number` agents on `episodes` episodes, the environment, its parameters)."""
 
     env, env_params = scb.make(environment)
-    key = root_key(EXPERT_SEED)
+    key = root_key(ILLUSTRATING.start)
     return train_sac_expert(environment, env, env_params, key, number, episodes), env, env_params
 
 
@@ -55,7 +55,7 @@ def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None
             lambda key, expert=expert, env=env, env_params=env_params: (
                 evaluate(env, env_params, expert.policy(), key, plan["evaluations"]).returns
             )
-        )(root_key(JUDGE_SEED))
+        )(root_key(REPORTING.start))
         spec = environment_agent("sac", environment)
         found[environment] = {
             "returns": np.round(np.asarray(returns), 2).tolist(),

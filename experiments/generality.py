@@ -33,6 +33,7 @@ from scb.evaluation import evaluate
 from scb.evolution import map_population
 from scb.keys import root_key, split_key
 from scb.neuroevolution import NeuroevolutionConfig, evolve_policy
+from scb.seeds import REPORTING
 from scb.statistics import (
     Estimate,
     estimate,
@@ -59,7 +60,6 @@ TICKS = {
     EVOLVED: "neuro-\nevolution",
     OPTIMAL: "optimal\npolicy",
 }
-REPORTING_SEED = 10_000
 
 
 def config_of(environment: str, source: str, plan: Mapping[str, Any]) -> DiscoveryConfig:
@@ -148,7 +148,7 @@ class _Trainer:
     def returns(self, agent: str) -> np.ndarray:
         """[N] mean returns of agents of one kind, most likely actions."""
 
-        key = root_key(REPORTING_SEED)
+        key = root_key(REPORTING.start)
         if agent == OPTIMAL:
             return self._optimal(key)
         if agent == EVOLVED:

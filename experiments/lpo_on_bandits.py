@@ -34,13 +34,12 @@ from scb.artefacts import machine_description, package_versions
 from scb.cli import configure_jax
 from scb.errors import UserError
 from scb.runs import write_json
+from scb.seeds import REPORTING, reporting, validation
 from scb.statistics import estimate, iqm, pooled_estimate
 
 SOURCES = ("bandit", "environment")
 BANDIT = "LPO (bandit)"
 CLIPS = ("ppo-0.1", "ppo", "ppo-0.3", "ppo-0.5", "ppo-1")
-TUNING_SEED = 22_000  # the clip is chosen on these agents, and reported on others
-REPORTING_SEED = 10_000
 SCALES = {"Flax's initialisation": 1.0, "small last layer": 0.01}
 
 _JUDGED = {"validate": True, "mean_evaluations": 16}
@@ -189,7 +188,7 @@ def markdown(report: Mapping[str, Any]) -> str:
         "",
         "Interquartile means over agents, and for learned objectives over searches and agents, with 95 % bootstrap "
         "intervals that resample both; differences are paired by seed. Most likely actions, seeds from "
-        f"{REPORTING_SEED}. Measured on {machine['cores']} cores, {machine['processor']}.",
+        f"{REPORTING.start}. Measured on {machine['cores']} cores, {machine['processor']}.",
         "",
     ]
     return "\n".join(lines)
@@ -388,7 +387,7 @@ def _tuned_clip(spec: AgentSpec, agents: int) -> dict[str, Any]:
     curves = compare(
         "Pendulum-v1",
         [load_objective(clip) for clip in CLIPS],
-        list(range(TUNING_SEED, TUNING_SEED + agents)),
+        validation(agents),
         spec=spec,
         points=1,
     ).curves
@@ -415,7 +414,7 @@ def _judge(
     }
     if not any(lacking.values()):
         return
-    seeds = list(range(REPORTING_SEED, REPORTING_SEED + agents))
+    seeds = reporting(agents)
     curves = compare(
         environment,
         [objective for group in lacking.values() for objective in group],

@@ -140,7 +140,7 @@ def main() -> None:
         start = time.perf_counter()
         states, _ = jax.block_until_ready(train(keys))
         seconds.append((time.perf_counter() - start) / job["population"])
-        key = jax.random.fold_in(jax.random.PRNGKey(repeat), 1)
+        key = jax.random.fold_in(jax.random.PRNGKey(repeat), job["population"])
         keys = jax.random.split(key, job["population"])
         returns += evaluate_all(states, keys).tolist()
     print(json.dumps({"seconds": seconds, "returns": returns}))

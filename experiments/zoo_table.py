@@ -38,7 +38,6 @@ from experiments.zoo_table_page import (
 from scb.agents.spec import algorithms_for, bandit_agent
 from scb.artefacts import machine_description, package_versions
 from scb.cli import configure_jax
-from scb.commands import FIRST_REPORTING_SEED
 from scb.discovery import SyntheticTraining, check_fits, judge
 from scb.environments.brax import BRAX_NAMES
 from scb.environments.registry import make
@@ -47,6 +46,7 @@ from scb.environments.zoo import bandit_metadata, home_of, open_bandit, zoo_name
 from scb.errors import UserError
 from scb.importer import PUBLISHED_BANDITS, published_bandit
 from scb.runs import write_json
+from scb.seeds import REPORTING
 from scb.statistics import estimate, paired_difference
 
 DEFAULT_PUBLISHED = Path("../shared/published_scbs")
@@ -171,7 +171,7 @@ def measure(
                 "sha256": candidate.sha256,
                 "agents": protocol.agents,
                 "episodes": protocol.brax_episodes if brax else protocol.episodes,
-                "seed": FIRST_REPORTING_SEED,
+                "seed": REPORTING.start,
                 "backend": protocol.backend if brax else None,
                 "training_steps": spec.steps,
                 "inner_loop": repr(spec),
@@ -185,7 +185,7 @@ def measure(
             returns = judge(
                 trainings[key],
                 candidate.bandit.default_params.weights,
-                FIRST_REPORTING_SEED,
+                REPORTING.start,
                 row["agents"],
                 row["episodes"],
             )

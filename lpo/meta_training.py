@@ -29,7 +29,7 @@ from scb.environments.synthetic import SyntheticBandit
 from scb.environments.zoo import home_of
 from scb.errors import UserError, unknown_name
 from scb.evolution import EnvironmentSteps, EvolutionConfig, Outcome, evolve
-from scb.keys import key_at, root_key, split_key
+from scb.keys import key_at, named_key, root_key, split_key
 from scb.runs import Run
 
 # Agents that judge a mean on the environment, where each costs a training there.
@@ -194,7 +194,7 @@ class TaskTraining:
         self.evaluation_episodes = config.evaluation_episodes or (50 if one_step else 20)
         self.training_params = self.env_params
         if isinstance(self.env, SyntheticBandit) and config.reward_noise:
-            scale = self.env.reward_scale(self.env_params, root_key(0))
+            scale = self.env.reward_scale(self.env_params, named_key(root_key(0), "reward scale"))
             self.training_params = self.env_params.replace(reward_noise=config.reward_noise * scale)
 
     def fitness(

@@ -17,7 +17,6 @@ from lpo.generalization import (
     Comparison,
     LearningCurves,
     check_names,
-    check_seeds,
     learning_curves,
 )
 from lpo.meta_training import VALIDATION_AGENTS, MetaTraining, MetaTrainingConfig, chosen_mean
@@ -30,9 +29,7 @@ from scb.environments.synthetic import SyntheticBandit
 from scb.environments.zoo import bandit_metadata, home_of
 from scb.evolution import EvolutionConfig, Outcome, evolve
 from scb.runs import Run, Stopwatch, write_json
-
-# The seeds that judge are never those that learn or choose.
-FIRST_REPORTING_SEED = 10_000
+from scb.seeds import reporting
 
 PRESETS: dict[str, dict[str, Any]] = {
     "tiny": {
@@ -141,8 +138,6 @@ def check_settings(settings: Mapping[str, Any]) -> None:
       settings: as for `run_pipeline`.
     """
     config = pipeline_config(settings)
-    for evaluation in settings["evaluations"]:
-        check_seeds(reporting_seeds(settings["seed"], evaluation["seeds"]))
     if settings["objective"] is None:
         for name in config.tasks:
             make(name)
@@ -152,8 +147,7 @@ def check_settings(settings: Mapping[str, Any]) -> None:
 
 def reporting_seeds(seed: int, count: int) -> list[int]:
     """The seeds that judge a run of this seed."""
-    first = FIRST_REPORTING_SEED + 1000 * seed
-    return list(range(first, first + count))
+    return reporting(count, offset=1000 * (seed % 20))
 
 
 def _with_references(objective: Objective) -> list[Objective]:

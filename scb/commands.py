@@ -37,10 +37,8 @@ from scb.environments.zoo import (
 from scb.errors import UserError
 from scb.evolution import EvolutionConfig, evolve
 from scb.runs import config_dict
+from scb.seeds import VALIDATING
 from scb.statistics import estimate
-
-# Reported on these seeds, which neither evolution nor selection sees.
-FIRST_REPORTING_SEED = 10_000
 
 
 def _quick(environment: str | None) -> DiscoveryConfig:
@@ -157,7 +155,7 @@ class Discover(LongRun):
                 "discovery": config_dict(config),
                 "started_from": None if config.start is None else _origin(config.start),
             },
-            "seeds": {"discovery": config.evolution.seed, "reporting": FIRST_REPORTING_SEED},
+            "seeds": {"discovery": config.evolution.seed, "validation": VALIDATING.start},
             "results": results,
             "cost": {
                 "environment_steps_training": evaluations * steps.training,
@@ -186,7 +184,7 @@ def judge_all(
     sampled: bool = True,
     num_agents: int = 20,
     num_episodes: int = 50,
-    seed: int = FIRST_REPORTING_SEED,
+    seed: int = VALIDATING.start,
 ) -> dict[str, Any]:
     """What agents of every fitting algorithm earn, by name of the algorithm in capitals, printed as it comes."""
     space = env.action_space(env_params)

@@ -47,7 +47,7 @@ from scb.environments.synthetic_mdp import PARAMETERIZATIONS, SyntheticMDP, synt
 from scb.environments.zoo import open_bandit
 from scb.errors import UserError, unknown_name
 from scb.evolution import EnvironmentSteps, EvolutionConfig, Outcome, evolve, map_population
-from scb.keys import key_at, root_key, split_key
+from scb.keys import named_key, root_key, split_key
 from scb.lists import read_lists, write_lists
 from scb.runs import Run, Stopwatch
 from scb.warm_start import (
@@ -334,7 +334,7 @@ class BanditDiscovery:
         assert isinstance(self.bandit, SyntheticBandit)
         # Of the seed alone, so that a resumed run starts from the same fit.
         key_expert, key_data, key_fit = split_key(
-            key_at(root_key(self.config.evolution.seed), 1), 3
+            named_key(root_key(self.config.evolution.seed), "expert"), 3
         )
         warm, watch = self.config.warm_start, Stopwatch()
         expert = find_expert(self.config.environment, self.env, self.env_params, key_expert, warm)
@@ -373,7 +373,8 @@ class BanditDiscovery:
         names = list(self.trainings)
         if config.mode == "all":
             returns = {
-                name: returns_of(name, key if i == 0 else key_at(key, i))
+                # The first has the generation's own key, as where it is alone.
+                name: returns_of(name, named_key(key, name) if i else key)
                 for i, name in enumerate(names)
             }
             means = {f"fitness/{name}": r.mean() for name, r in returns.items()}
@@ -393,7 +394,7 @@ class BanditDiscovery:
     def evaluate_mean(self, candidate: Weights, key: jax.Array) -> dict[str, jax.Array]:
         results = {}
         for i, (name, training) in enumerate(self.trainings.items()):
-            key_draw, key_agent = split_key(key if i == 0 else key_at(key, i))
+            key_draw, key_agent = split_key(named_key(key, name) if i else key)
             hyperparameters = jax.tree.map(lambda x: x[0], training.spec.sample(key_draw, 1))
             results[f"fitness/{name}"] = training.returns(
                 candidate,
@@ -428,7 +429,9 @@ def standardize_reward(
 
     Both are over its contexts and uniform actions. What agents should do in it stays the same.
     """
-    rewards = bandit.sample_rewards(bandit.params(weights), root_key(0), num_samples)
+    rewards = bandit.sample_rewards(
+        bandit.params(weights), named_key(root_key(0), "reward scale"), num_samples
+    )
     factor = std / rewards.std()
     # Through the network's last layer, which is linear.
     reward = dict(weights["reward"])

@@ -27,6 +27,7 @@ from scipy.stats import rankdata
 from scb.errors import UserError, unknown_name
 from scb.keys import key_at, root_key, split_key
 from scb.runs import Checkpoints, Run, Stopwatch
+from scb.seeds import searching
 from scb.statistics import iqm
 
 # These take constructor arguments of their own that no common configuration can supply.
@@ -72,7 +73,7 @@ class EvolutionConfig:
       mean_evaluations: agents that judge the mean of the search distribution.
       evaluate_mean_every: generations between those judgements (and one after the last generation).
       checkpoint_every: generations between checkpoints.
-      seed: decides everything else.
+      seed: decides everything else; one of `scb.seeds.SEARCHING`.
     """
 
     strategy: str = "SNES"
@@ -111,8 +112,7 @@ class EvolutionConfig:
         ):
             if getattr(self, field) < 1:
                 raise UserError(f"{field} is {getattr(self, field)}: it must be at least 1.")
-        if self.seed < 0:
-            raise UserError(f"seed is {self.seed}: it must be 0 or larger.")
+        searching(self.seed)
         for field in ("sigma", "learning_rate", "sigma_decay", "learning_rate_decay"):
             if not getattr(self, field) > 0:
                 raise UserError(f"{field} is {getattr(self, field)}: it must be positive.")
@@ -315,7 +315,11 @@ class _Strategy:
 
 
 def evolve(
-    problem: Problem, config: EvolutionConfig, run: Run | None = None, quiet: bool = False
+    problem: Problem,
+    config: EvolutionConfig,
+    run: Run | None = None,
+    quiet: bool = False,
+    key: jax.Array | None = None,
 ) -> Outcome:
     """Runs, or resumes, an evolution.
 
@@ -329,12 +333,13 @@ def evolve(
       run: where to log and checkpoint; None keeps everything in memory. A resumed run continues
         after its newest intact checkpoint.
       quiet: no progress on the terminal.
+      key: of an evolution inside of another one, in place of the configuration's seed.
 
     Returns:
       The Outcome.
     """
-    root = root_key(config.seed)
-    key_solution, key_strategy, key_generations, key_mean = split_key(root, 4)
+    key = root_key(config.seed) if key is None else key
+    key_solution, key_strategy, key_generations, key_mean = split_key(key, 4)
     solution = problem.initial_solution(key_solution)
     strategy = _Strategy(config, solution)
     state = {

@@ -7,7 +7,7 @@ MountainCar, where policy gradients see nothing to follow.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import jax
@@ -22,7 +22,7 @@ from scb.curriculum import CurriculumConfig, horizon, with_limit
 from scb.errors import UserError
 from scb.evaluation import evaluate
 from scb.evolution import EnvironmentSteps, EvolutionConfig, evolve
-from scb.keys import root_key, split_key
+from scb.keys import named_key, root_key, split_key
 from scb.neuroevolution import network_action, policy_network
 
 EPISODES = 20  # by which an expert is judged
@@ -198,11 +198,10 @@ def evolve_expert(
     Args:
       key: decides everything; `config.evolution.seed` is not used.
     """
-    key_seed, key_judge = split_key(key)
-    seed = int(jax.random.randint(key_seed, (), 0, 2**31 - 1))
-    evolution = replace(config.evolution, seed=seed)
+    key_search, key_judge = split_key(key)
+    evolution = config.evolution
     problem = _PolicySearch(env, env_params, config)
-    outcome = evolve(problem, evolution, quiet=True)
+    outcome = evolve(problem, evolution, quiet=True, key=key_search)
     steps = problem.steps().total * evolution.population_size * evolution.num_generations
     return judged(problem.policy(outcome.mean), env, env_params, key_judge, steps)
 
@@ -229,6 +228,6 @@ def _random_statistics(
         return jax.lax.scan(step, (env_state, space.sample(key_action)), inputs)[1]
 
     with jax.ensure_compile_time_eval():
-        visited = jax.jit(jax.vmap(roll))(split_key(root_key(0), num_envs))
+        visited = jax.jit(jax.vmap(roll))(split_key(named_key(root_key(0), "statistics"), num_envs))
         visited = jnp.reshape(visited, (-1, visited.shape[-1]))
         return update_statistics(RunningStatistics.start(visited.shape[-1]), visited)

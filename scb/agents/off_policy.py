@@ -191,20 +191,18 @@ class OffPolicyAgent(Agent):
         else:
             steps = config.prefill // config.num_envs
             held = jnp.arange(steps) // config.prefill_hold
-            # A number that no step's key has.
-            key_held = key_at(key_prefill, steps)
+            keys = split_key(key_prefill, steps + 1)
 
             def step(standing: Any, inputs: tuple[jax.Array, jax.Array]) -> tuple[Any, Transition]:
                 key, choice = inputs
 
                 def hold(observation: jax.Array, _: jax.Array) -> jax.Array:
-                    return random_actions(observation, key_at(key_held, choice))
+                    return random_actions(observation, key_at(keys[-1], choice))
 
                 actions = random_actions if config.prefill_hold == 1 else hold
                 return self._step(standing, config.num_envs, actions, key, env_params)
 
-            keys = split_key(key_prefill, steps)
-            standing, transitions = jax.lax.scan(step, standing, (keys, held))
+            standing, transitions = jax.lax.scan(step, standing, (keys[:-1], held))
             transitions = jax.tree.map(
                 lambda x: jnp.reshape(x, (config.prefill, *x.shape[2:])), transitions
             )

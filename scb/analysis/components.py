@@ -187,7 +187,7 @@ def clone(
         )
 
     key_init, key_batches = split_key(key)
-    weights = network.init(key_init, contexts(key_init))
+    weights = network.init(key_init, jnp.zeros(jax.eval_shape(contexts, key).shape))
     (weights, _), _ = jax.lax.scan(
         batch, (weights, optimizer.init(weights)), split_key(key_batches, num_batches)
     )

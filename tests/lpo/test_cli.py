@@ -102,7 +102,7 @@ def test_an_unknown_name_is_answered_by_near_ones(refused, arguments, message):
         ("meta-train --seed -1", "seed is -1: it must be 0 or larger"),
         ("run --seed -1", "seed is -1: it must be 0 or larger"),
         # 10 000 + 1000 x 5 000 000 has more than 32 bits.
-        ("run --seed 5000000", "a seed is 5000010000: each must be 0 or larger, and below 2^32"),
+        ("run --seed 5000000", "seed is 5000000: it must be 0 or larger, and below 10000"),
         ("train --steps 0", "steps is 0: it must be at least 1"),
         ("train --steps -100", "steps is -100: it must be at least 1"),
         ("evaluate --steps -100", "steps is -100: it must be at least 1"),

@@ -119,7 +119,7 @@ def test_a_discovery_leaves_a_bandit_with_its_story(discovered):
     metadata = artefacts.load(folder / "Synthetic-CartPole-v1.npz", "bandit").metadata
     assert metadata["config"]["evaluation_environment"] == "CartPole-v1"
     assert metadata["config"]["started_from"] is None
-    assert metadata["seeds"] == {"discovery": 7, "reporting": 10_000}
+    assert metadata["seeds"] == {"discovery": 7, "validation": 30_000}
     assert metadata["results"].keys() == {"PPO", "SAC", "DQN"}
     for result in metadata["results"].values():
         for actions in ("sampled_actions", "mode_actions"):
