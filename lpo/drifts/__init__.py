@@ -15,6 +15,7 @@ from typing import Any
 from lpo.drifts.contract import Drift
 from lpo.drifts.formula import ClosedFormDrift
 from lpo.drifts.known import ClipDrift, DPODrift, NoDrift
+from lpo.drifts.mirror import MirrorDrift
 from lpo.drifts.network import LearnedDrift
 from scb.errors import UserError, unknown_name
 
@@ -26,6 +27,7 @@ DRIFTS: dict[str, type[Drift]] = {
         NoDrift,
         LearnedDrift,
         ClosedFormDrift,
+        MirrorDrift,
     )
 }
 
