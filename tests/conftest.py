@@ -87,3 +87,12 @@ class Compilations:
             worst = sorted(table.items(), key=lambda item: -item[1][0])[:number]
             for name, (programs, seconds) in worst:
                 terminalreporter.write_line(f"{programs:6d} programs {seconds:7.2f} s  {name}")
+
+
+@pytest.fixture
+def small_agents() -> Generator[None]:
+    """For the test, agents that the paper's tables specify take 16 steps, with networks of four units."""
+    from tests.scb import probes
+
+    with probes.small_agents():
+        yield

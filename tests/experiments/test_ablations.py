@@ -61,7 +61,9 @@ def test_a_search_is_the_papers_recipe_with_one_thing_changed():
     )
 
 
-def test_transitions_alone_do_not_reach_the_goal_of_mountain_car(tmp_path, monkeypatch):
+def test_transitions_alone_do_not_reach_the_goal_of_mountain_car(
+    tmp_path, monkeypatch, small_agents
+):
     monkeypatch.setattr(ablations, "ENVIRONMENTS", ("MountainCar-v0",))
     wanted = [name_of("T", "normal", NONE)]
     monkeypatch.setattr(ablations, "searches_of", lambda environment: wanted)

@@ -80,7 +80,9 @@ def test_the_page_and_the_figure_show_every_curriculum():
     np.testing.assert_array_equal(lengths[NONE], 1000)
 
 
-def test_a_search_with_a_curriculum_is_judged_over_whole_episodes(tmp_path, monkeypatch):
+def test_a_search_with_a_curriculum_is_judged_over_whole_episodes(
+    tmp_path, monkeypatch, small_agents
+):
     # MountainCar has a curriculum too, and is far cheaper than Hopper.
     monkeypatch.setattr(experiment, "ENVIRONMENT", "MountainCar-v0")
     plan = {

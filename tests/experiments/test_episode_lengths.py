@@ -60,21 +60,21 @@ def test_the_page_and_the_figure_show_every_limit():
     assert [t.get_text() for t in right.get_xticklabels()] == TINY["limits"]
 
 
-def test_a_limit_of_one_step_is_kept_and_many_are_counted(tmp_path, monkeypatch):
+def test_a_limits_search_is_judged_and_its_episodes_are_counted(
+    tmp_path, monkeypatch, small_agents
+):
     monkeypatch.setattr(experiment, "CLASSIC_CONTROL", ("MountainCar-v0",))
     found, saved = {}, []
-    plan = {**TINY, "runs": str(tmp_path)}
+    plan = {**TINY, "limits": [OWN], "runs": str(tmp_path)}
     experiment.measure(plan, found, lambda: saved.append(1))
-    # Each limit's MDP is searched before it is judged.
-    assert {x.name for x in tmp_path.iterdir()} == {"MountainCar-v0-max", "MountainCar-v0-1"}
+    assert {x.name for x in tmp_path.iterdir()} == {"MountainCar-v0-max"}
     entry = found["environments"]["MountainCar-v0"]
-    assert len(saved) == 2 and entry["limit"] == 200 and entry["random"] == -200.0
+    assert len(saved) == 1 and entry["limit"] == 200 and entry["random"] == -200.0
     assert sum(entry["lengths"]["ppo"].values()) == 2 * 3
-    for limit in TINY["limits"]:
-        returns = entry["returns"][limit]["ppo"]
-        assert len(returns) == 2 and all(-200.0 <= x <= -80.0 for x in returns)
+    returns = entry["returns"][OWN]["ppo"]
+    assert len(returns) == 2 and all(-200.0 <= x <= -80.0 for x in returns)
     experiment.measure(plan, found, lambda: saved.append(1))
-    assert len(saved) == 2
+    assert len(saved) == 1
 
 
 @pytest.mark.parametrize("preset", ["quick", "paper"])

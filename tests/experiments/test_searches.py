@@ -19,7 +19,7 @@ CONFIG = DiscoveryConfig(
 )
 
 
-def test_a_search_that_has_ended_is_read_and_not_run_again(tmp_path):
+def test_a_search_that_has_ended_is_read_and_not_run_again(tmp_path, small_agents):
     _, first = searches.search(CONFIG, tmp_path / "run")
     _, again = searches.search(CONFIG, tmp_path / "run")
     assert again.metrics == first.metrics and again.seconds == first.seconds

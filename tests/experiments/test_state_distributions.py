@@ -3,8 +3,6 @@ import pytest
 
 from experiments import state_distributions as experiment
 from experiments.page import packed, unpacked
-from scb.analysis import components
-from tests.experiments.test_experts import short
 
 LIMITS = [[0.0, 1.0], [0.0, 1.0]]
 
@@ -74,8 +72,7 @@ def test_the_page_and_the_figure_show_both_distributions(report):
     assert {"MountainCar-v0\nexpert", "Pendulum-v1\nbandit"} <= set(titles)
 
 
-def test_states_and_best_actions_of_one_environment(monkeypatch):
-    monkeypatch.setattr(components, "environment_agent", short)
+def test_states_and_best_actions_of_one_environment(small_agents):
     plan = {
         "environments": ["MountainCar-v0"],
         "agents": 2,
@@ -90,7 +87,7 @@ def test_states_and_best_actions_of_one_environment(monkeypatch):
         experiment.points_of(examined[name], examined["limits"]) for name in ("contexts", "visited")
     )
     assert contexts.shape == visited.shape == (2000, 2)
-    # An agent of a few hundred steps stays in the valley; the bandit shows far more.
+    # An untrained agent stays in the valley; the bandit shows far more.
     assert np.ptp(contexts[:, 0]) > 2 * np.ptp(visited[:, 0])
     actions = unpacked(examined["bandit_actions"])
     assert actions.shape == (50, 50) and set(np.unique(actions)) <= {0.0, 1.0, 2.0}

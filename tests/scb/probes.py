@@ -1,12 +1,18 @@
 """Environments whose values and optima are known, for the tests of everything that trains or evaluates."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import fields, replace
+from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import pytest
 from flax import struct
 from gymnax.environments import environment, spaces
 
+from scb.agents.spec import ALGORITHMS
 from scb.environments.synthetic import BanditConfig, SyntheticBandit
 from scb.evolution import EnvironmentSteps
 
@@ -149,3 +155,30 @@ class Parabola:
 
     def steps(self) -> EnvironmentSteps:
         return EnvironmentSteps(training=10, evaluation=3)
+
+
+@contextmanager
+def small_agents() -> Iterator[None]:
+    """The paper's tables with 16 steps and networks of four units; numbers, lists and limits as they are."""
+    off_policy = {"buffer_size": 16, "prefill": 8, "batch_size": 4, "gradient_steps": 1}
+    sizes = {"num_envs": 2, "total_steps": 16, "hidden_sizes": (4,)}
+    with pytest.MonkeyPatch.context() as patch:
+        for name, tables in ALGORITHMS.items():
+            traced = {f.name for f in fields(tables.algorithm.hyperparameters())}
+
+            def numbers(row: Any, traced: set[str] = traced) -> Any:
+                return replace(row, values={k: x for k, x in row.values.items() if k in traced})
+
+            on_policy = {"num_steps": 8, "num_epochs": 1, "num_minibatches": 1}
+            config = partial(
+                tables.algorithm.config, **sizes, **(on_policy if name == "ppo" else off_policy)
+            )
+            small = replace(
+                tables,
+                algorithm=replace(tables.algorithm, config=config),
+                general=numbers(tables.general),
+                families={x: {} for x in tables.families},
+                environments={x: numbers(row) for x, row in tables.environments.items()},
+            )
+            patch.setitem(ALGORITHMS, name, small)
+        yield
