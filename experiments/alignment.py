@@ -38,6 +38,7 @@ from lpo.fitness import LABELS
 from lpo.objectives import Objective, load_objective
 from scb import plotting
 from scb.cli import configure_jax
+from scb.environments.registry import environment_spec
 from scb.errors import UserError
 from scb.runs import write_json
 
@@ -97,7 +98,7 @@ def recommendation(report: dict[str, Any]) -> str:
             (row["bandit"], row["reward_noise"]): row["alignment"][FITNESS]["spearman"] or 0.0
             for row in stage["regimes"]
         }
-        own, noise = f"Synthetic-{stage['environment']}", Regime().reward_noise
+        own, noise = environment_spec(stage["environment"]).bandit, Regime().reward_noise
         confirmed.append(
             f"{name} {of_regime[own, noise]:.2f} (without noise {of_regime[own, 0.0]:.2f})"
         )
@@ -264,7 +265,9 @@ def main() -> int:
         role = "the confirmation, objectives that are not in the family"
         stage(HELD_OUT, "Pendulum-v1", role, regimes, CONFIRMATION_SEED, held_out)
         for environment, steps in CONFIRMATIONS.items():
-            regimes = [Regime(f"Synthetic-{environment}", **variation) for variation in CONFIRMED]
+            regimes = [
+                Regime(environment_spec(environment).bandit, **variation) for variation in CONFIRMED
+            ]
             regimes.append(Regime(PENDULUM))
             forget_programs()
             role = "the confirmation"

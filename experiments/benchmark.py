@@ -40,7 +40,8 @@ from experiments.page import exit_status
 from scb.agents.spec import bandit_agent
 from scb.artefacts import flatten, machine_description, package_versions
 from scb.cli import configure_jax
-from scb.environments.zoo import PREFIX, open_bandit, space_description
+from scb.environments.registry import environment_spec
+from scb.environments.zoo import open_bandit, space_description
 from scb.evolution import map_population
 from scb.keys import named_key, root_key, split_key
 from scb.statistics import Estimate, estimate
@@ -71,7 +72,7 @@ TASKS = {
 
 def bandit_of(task: Task) -> Any:
     """The bandit that ships for the task's environment."""
-    return open_bandit(PREFIX + task.environment)
+    return open_bandit(environment_spec(task.environment).bandit)
 
 
 def spec_of(task: Task, steps: int) -> Any:

@@ -25,6 +25,7 @@ from experiments.page import Experiment, Save, table, text
 from experiments.page import main as run
 from scb import plotting
 from scb.agents.spec import bandit_agent, environment_agent
+from scb.environments.registry import environment_spec
 from scb.environments.zoo import bandit_metadata, open_bandit
 from scb.evolution import map_population
 from scb.importer import PUBLISHED_BANDITS, published_bandit
@@ -33,15 +34,8 @@ from scb.seeds import REPORTING
 from scb.statistics import estimate
 
 OURS, PUBLISHED = "ours", "published"
-# Final returns of agents trained in the environment, Liesen et al. (2024), table of Brax results, columns EE;
-# those of agents trained in bandits are `zoo_table_page.PAPER`.
-PAPER: dict[str, dict[str, float]] = {
-    "hopper": {"ppo": 2521.9, "sac": 3119.4, "ddpg": 1536.0, "td3": 3325.8},
-    "walker2d": {"ppo": 2039.6, "sac": 4140.1, "ddpg": 698.3, "td3": 4605.8},
-    "swimmer": {"ppo": 83.6, "sac": 124.8, "ddpg": 348.5, "td3": 232.2},
-    "halfcheetah": {"ppo": 3487.1, "sac": 7735.5, "ddpg": 3263.3, "td3": 13213.5},
-    "humanoidstandup": {"ppo": 17243.5, "sac": 23808.1, "ddpg": 24944.8, "td3": 28376.2},
-}
+# Whose experts and published bandits the paper has; `zoo_table_page.PAPER` says what these bandits are worth.
+PAPER = ("hopper", "walker2d", "swimmer", "halfcheetah", "humanoidstandup")
 ROUGHLY = 50  # times as many steps are roughly two orders of magnitude
 
 
@@ -95,7 +89,7 @@ def _in_bandit(
 
     env, env_params = scb.make(environment, backend)
     if kind == OURS:
-        bandit = open_bandit(f"Synthetic-{environment}")
+        bandit = open_bandit(environment_spec(environment).bandit)
         digest = bandit_metadata(bandit.name)["sha256"]
     else:
         (name,) = (n for n, home in PUBLISHED_BANDITS.items() if home == environment)
@@ -280,7 +274,7 @@ def body(report: Mapping[str, Any]) -> list[str]:
         environment = name.split(" ")[0]
         own = report["environments"][_environment_of(name)]
         for algorithm, curves in algorithms.items():
-            paper = PAPER.get(environment, {}).get(algorithm)
+            paper = environment_spec(environment).reference(None, algorithm)
             rows.append(
                 [
                     name,
@@ -288,7 +282,7 @@ def body(report: Mapping[str, Any]) -> list[str]:
                     text(estimate(finals(curves))),
                     text(estimate(finals(own[algorithm]))) if algorithm in own else "",
                     "" if paper is None else f"{zoo_table_page.PAPER[environment][algorithm]:.0f}",
-                    "" if paper is None else f"{paper:.0f}",
+                    "" if paper is None else f"{paper.value:.0f}",
                     f"{curves['seconds'] / len(curves['returns']):.1f}",
                     f"{own[algorithm]['seconds'] / len(own[algorithm]['returns']):.0f}"
                     if algorithm in own
@@ -386,10 +380,10 @@ def draw(report: Mapping[str, Any]) -> Figure:
                     steps = np.asarray(found["steps"])[shown]
                     estimates = [estimate(x) for x in np.transpose(found["returns"])[shown]]
                     plotting.estimate_curve(axes, steps, estimates, color, style)
-                paper = PAPER.get(name.split(" ")[0], {}).get(algorithm)
+                paper = environment_spec(name.split(" ")[0]).reference(None, algorithm)
                 # The paper's physics.
                 if algorithm not in own and paper is not None and "(generalized)" in name:
-                    axes.axhline(paper, color=plotting.GREY, linestyle=":")
+                    axes.axhline(paper.value, color=plotting.GREY, linestyle=":")
                 axes.set_xscale("log")
                 axes.set_title(f"{name}\n{algorithm.upper()}", fontsize=9)
                 axes.set_xlabel("training steps")

@@ -23,6 +23,7 @@ from scb.agents.spec import bandit_agent
 from scb.analysis import components
 from scb.analysis.states import follow
 from scb.discovery import SyntheticTraining, judge
+from scb.environments.registry import environment_spec
 from scb.environments.zoo import bandit_metadata, open_bandit
 from scb.keys import key_at, root_key, split_key
 from scb.seeds import ILLUSTRATING, REPORTING
@@ -63,7 +64,7 @@ def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None
 
     env, env_params = scb.make(ENVIRONMENT)
     space = env.action_space(env_params)
-    bandit = open_bandit(f"Synthetic-{ENVIRONMENT}")
+    bandit = open_bandit(environment_spec(ENVIRONMENT).bandit)
     spec = bandit_agent("ppo", ENVIRONMENT)
     key_random, key_experts = split_key(root_key(ILLUSTRATING.start))
 

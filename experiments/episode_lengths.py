@@ -18,11 +18,11 @@ from experiments import searches
 from experiments.page import CLASSIC_CONTROL, Experiment, Save, finite, span, table, text
 from experiments.page import main as run
 from experiments.searches import PAPER_SIZES
-from lpo.suite import REFERENCES, random_return
 from scb import plotting
 from scb.agents.spec import algorithms_for, bandit_agent
 from scb.curriculum import paper_curriculum
 from scb.discovery import DiscoveryConfig, SyntheticTraining
+from scb.environments.registry import environment_spec
 from scb.evolution import map_population
 from scb.keys import root_key, split_key
 from scb.seeds import REPORTING
@@ -64,7 +64,7 @@ def _measure_limit(
 
     folder = f"{plan['runs']}/{environment}-{limit}"
     problem, outcome = searches.search(config_of(environment, limit, plan), folder)
-    entry["random"] = round(random_return(problem.env, problem.env_params), 2)
+    entry["random"] = round(environment_spec(environment).random_return(), 2)
     entry["limit"] = int(problem.env_params.max_steps_in_episode)
     space = problem.env.action_space(problem.env_params)
     returns: dict[str, list[float]] = {}
@@ -131,7 +131,9 @@ def normalized(report: Mapping[str, Any], environment: str, limit: str) -> np.nd
     """[N] scores of the agents of all algorithms: 0 a random policy, 1 the paper's SAC expert."""
     entry = report["environments"][environment]
     returns = np.concatenate([np.asarray(x) for x in entry["returns"][limit].values()])
-    return normalized_score(returns, entry["random"], REFERENCES[environment])
+    return normalized_score(
+        returns, entry["random"], environment_spec(environment).reference_return()
+    )
 
 
 def scores(report: Mapping[str, Any], environment: str, limit: str) -> Estimate:

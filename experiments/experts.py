@@ -18,19 +18,11 @@ from experiments.page import main as run
 from scb import plotting
 from scb.agents.spec import environment_agent
 from scb.analysis.components import SACExpert, train_sac_expert
+from scb.environments.registry import environment_spec
 from scb.evaluation import evaluate
 from scb.keys import root_key
 from scb.seeds import ILLUSTRATING, REPORTING
 from scb.statistics import Estimate, estimate
-
-# Liesen et al. (2024), table of SAC experts: interquartile mean and 95 % interval of 200 evaluations.
-PAPER = {
-    "Acrobot-v1": (-76.7, -78.9, -74.7),
-    "CartPole-v1": (500.0, 500.0, 500.0),
-    "MountainCar-v0": (-117.7, -119.2, -115.3),
-    "MountainCarContinuous-v0": (94.9, 94.8, 95.0),
-    "Pendulum-v1": (-137.4, -151.5, -127.5),
-}
 
 
 def train(environment: str, number: int, episodes: int) -> tuple[SACExpert, Any, Any]:
@@ -73,10 +65,22 @@ def _earned(report: Mapping[str, Any]) -> dict[str, Estimate]:
     return {name: estimate(x["returns"]) for name, x in report["environments"].items()}
 
 
+def _paper(environment: str) -> Estimate:
+    """The paper's expert, of 200 evaluations."""
+    expert = environment_spec(environment).reference()
+    assert expert is not None, environment
+    return Estimate(expert.value, expert.low, expert.high, 200)
+
+
 def parts(report: Mapping[str, Any]) -> list[bool]:
     """Environment by environment: whether the interval reaches the paper's."""
     found = _earned(report).items()
-    return [(x.value if x.high is None else x.high) >= PAPER[name][1] for name, x in found]
+
+    def low_end(name: str) -> float:
+        paper = _paper(name)
+        return paper.value if paper.low is None else paper.low
+
+    return [(x.value if x.high is None else x.high) >= low_end(name) for name, x in found]
 
 
 def verdict(report: Mapping[str, Any]) -> str:
@@ -96,12 +100,12 @@ def body(report: Mapping[str, Any]) -> list[str]:
     plan = report["plan"]
     rows = []
     for name, entry in report["environments"].items():
-        value, low, high = PAPER[name]
+        paper = _paper(name)
         rows.append(
             [
                 name,
                 text(estimate(entry["returns"]), 1),
-                text({"value": value, "low": low, "high": high}, 1),
+                text(paper, 1),
                 str(entry["steps"]),
                 "" if entry["episode_limit"] is None else str(entry["episode_limit"]),
                 f"{entry['seconds']:.0f}",
@@ -139,8 +143,7 @@ def draw(report: Mapping[str, Any]) -> Figure:
         for axes, (name, entry) in zip(panels, report["environments"].items(), strict=True):
             returns = np.asarray(entry["returns"])
             plotting.estimate_row(axes, 0.0, returns, estimate(returns), plotting.BLUE)
-            value, low, high = PAPER[name]
-            paper = Estimate(value, low, high, 200)
+            paper = _paper(name)
             plotting.estimate_row(axes, 1.0, np.empty(0), paper, plotting.VERMILLION)
             axes.set_yticks([0.0, 1.0], ["here", "the paper"])
             axes.set_ylim(1.6, -0.6)

@@ -22,12 +22,12 @@ from experiments import searches
 from experiments.page import CLASSIC_CONTROL, Experiment, Save, finite, span, table, text
 from experiments.page import main as run
 from experiments.searches import PAPER_SIZES
-from lpo.suite import REFERENCES, random_return
 from scb import plotting
 from scb.agents.spec import AgentSpec, algorithms_for, bandit_agent
 from scb.analysis.optimal_actions import optimal_policy
 from scb.curriculum import paper_curriculum
 from scb.discovery import DiscoveryConfig
+from scb.environments.registry import environment_spec
 from scb.environments.zoo import bandit_metadata, open_bandit
 from scb.evaluation import evaluate
 from scb.evolution import map_population
@@ -86,8 +86,8 @@ def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None
     generations = report.setdefault("generation", {})
     for environment in plan["environments"]:
         if environment not in random:
-            random[environment] = round(random_return(*scb.make(environment)), 2)
-            digests[environment] = bandit_metadata(f"Synthetic-{environment}")["sha256"]
+            random[environment] = round(environment_spec(environment).random_return(), 2)
+            digests[environment] = bandit_metadata(environment_spec(environment).bandit)["sha256"]
         entry = found.setdefault(environment, {source: {} for source in SOURCES})
         chosen = generations.setdefault(environment, {})
         for source in SOURCES:
@@ -134,7 +134,7 @@ class _Trainer:
         self.trained_in: Any = self.env
         self.trained_in_params: Any = self.env_params
         if source == ZOO:
-            self.trained_in = open_bandit(f"Synthetic-{environment}")
+            self.trained_in = open_bandit(environment_spec(environment).bandit)
             self.trained_in_params = self.trained_in.default_params
         elif source != ENVIRONMENT:
             kind = "drawn" if source == DRAWN else "fixed"
@@ -231,7 +231,11 @@ def columns(entry: Mapping[str, list[float]]) -> dict[str, np.ndarray]:
 def normalized(report: Mapping[str, Any], source: str, column: str) -> list[np.ndarray]:
     """Per environment the scores of one kind of agent: 0 a random policy, 1 the paper's expert."""
     return [
-        normalized_score(columns(entry[source])[column], report["random"][name], REFERENCES[name])
+        normalized_score(
+            columns(entry[source])[column],
+            report["random"][name],
+            environment_spec(name).reference_return(),
+        )
         for name, entry in report["environments"].items()
     ]
 

@@ -31,6 +31,7 @@ from scb.analysis.explain import explain
 from scb.analysis.importance import reward_variance
 from scb.analysis.planes import Plane
 from scb.analysis.states import bandit_states
+from scb.environments.registry import environment_spec
 from scb.environments.zoo import bandit_metadata, open_bandit
 from scb.keys import root_key, split_key
 from scb.statistics import estimate
@@ -50,7 +51,7 @@ def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None
 
 def _examine(name: str, plan: Mapping[str, Any]) -> dict[str, Any]:
 
-    bandit = open_bandit(f"Synthetic-{name}")
+    bandit = open_bandit(environment_spec(name).bandit)
     env, env_params = scb.make(name)
     numbers, drawn = explain(bandit, env, env_params, name, plan["episodes"], plan["seed"])
     keys = split_key(root_key(plan["seed"] + 1), plan["repetitions"])

@@ -24,6 +24,7 @@ from scb.analysis.components import ReplacedBandit, q_reward
 from scb.analysis.optimal_actions import first_action, optimal_actions
 from scb.analysis.planes import Plane, plane_for
 from scb.analysis.states import bandit_states, follow
+from scb.environments.registry import environment_spec
 from scb.environments.synthetic import SyntheticBandit
 from scb.environments.zoo import bandit_metadata, open_bandit
 from scb.keys import root_key, split_key
@@ -51,7 +52,7 @@ def _examine(environment: str, plan: Mapping[str, Any]) -> dict[str, Any]:
 
     key_states, key_episodes, key_pick = split_key(root_key(SEED), 3)
     expert, env, env_params = experts.train(environment, plan["agents"], plan["selection_episodes"])
-    bandit = open_bandit(f"Synthetic-{environment}")
+    bandit = open_bandit(environment_spec(environment).bandit)
     space = env.action_space(env_params)
     contexts = bandit_states(bandit, key_states, STATES)
     episodes = follow(env, env_params, expert.policy(), key_episodes, plan["episodes"])

@@ -16,16 +16,15 @@ import jax
 import numpy as np
 from matplotlib.figure import Figure
 
-import scb
 from experiments.brax_curriculum import STANDING
 from experiments.page import CLASSIC_CONTROL, Experiment, Save, packed, table, text, unpacked
 from experiments.page import main as run
-from lpo.suite import REFERENCES
 from scb import plotting
 from scb.agents.spec import bandit_agent
 from scb.analysis import animation
 from scb.analysis.animation import picture, save_gif
 from scb.analysis.states import follow
+from scb.environments.registry import environment_spec
 from scb.environments.zoo import open_bandit
 from scb.errors import UserError
 from scb.keys import root_key, split_key
@@ -50,14 +49,14 @@ def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None
 
 def _show(name: str, plan: Mapping[str, Any]) -> dict[str, Any]:
 
-    brax = name == HOPPER
-    environment = "hopper" if brax else name
-    env, env_params = scb.make(environment, **({"backend": "spring"} if brax else {}))
-    bandit = open_bandit(f"Synthetic-{environment}")
+    environment, backend = ("hopper", "spring") if name == HOPPER else (name, None)
+    place = environment_spec(environment)
+    env, env_params = place.make(backend)
+    bandit = open_bandit(place.bandit)
     spec = bandit_agent("ppo", environment, sampled=False)
     agent = spec.agent(bandit)
     key_train, key_choose, key_show = split_key(root_key(plan["seed"]), 3)
-    episodes = plan["brax_episodes"] if brax else plan["episodes"]
+    episodes = plan["brax_episodes" if place.backends else "episodes"]
 
     @jax.jit
     @jax.vmap
@@ -76,7 +75,7 @@ def _show(name: str, plan: Mapping[str, Any]) -> dict[str, Any]:
         return agent.act(state, observation, key, bandit.default_params, mode=True)
 
     entry: dict[str, Any] = {"agents": estimate(np.asarray(returns, float)).as_dict()}
-    if brax:
+    if name == HOPPER:
         _, shown = animation.save_brax_html(VIEWER, env, policy, key_show, plan["brax_steps"])
         return {**entry, "shown": round(shown, 1), "steps": plan["brax_steps"]}
     trajectories = follow(env, env_params, policy, key_show, 1)
@@ -112,9 +111,15 @@ def _number(value: float, places: int) -> str:
 
 def _good(report: Mapping[str, Any]) -> list[str]:
     """Where agents earn at most a tenth less than the paper's SAC expert; on Hopper what standing still does."""
-    levels = {name: x - 0.1 * abs(x) for name, x in REFERENCES.items()} | {HOPPER: STANDING}
+
+    def level(name: str) -> float:
+        if name == HOPPER:
+            return STANDING
+        expert = environment_spec(name).reference_return()
+        return expert - 0.1 * abs(expert)
+
     found = report["environments"].items()
-    return [name for name, entry in found if entry["agents"]["value"] >= levels[name]]
+    return [name for name, entry in found if entry["agents"]["value"] >= level(name)]
 
 
 def parts(report: Mapping[str, Any]) -> list[bool]:

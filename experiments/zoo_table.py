@@ -39,10 +39,9 @@ from scb.agents.spec import algorithms_for, bandit_agent
 from scb.artefacts import machine_description, package_versions
 from scb.cli import configure_jax
 from scb.discovery import SyntheticTraining, check_fits, judge
-from scb.environments.brax import BRAX_NAMES
-from scb.environments.registry import make
+from scb.environments.registry import environment_spec
 from scb.environments.synthetic import BanditConfig, SyntheticBandit
-from scb.environments.zoo import bandit_metadata, home_of, open_bandit, zoo_names
+from scb.environments.zoo import bandit_metadata, open_bandit, zoo_names
 from scb.errors import UserError
 from scb.importer import PUBLISHED_BANDITS, published_bandit
 from scb.runs import write_json
@@ -109,16 +108,15 @@ def candidates(
             raise UserError(f"{published} holds no published bandit such as pendulum.npz.")
     found = []
     wanted = set()
+    published_alone = {environment_spec(environment).bandit: environment for environment in paths}
+    for name in zoo_names():
+        published_alone.pop(name, None)
     for name in zoo_names() if names is None else names:
-        home = home_of(name)
-        if home is not None:
-            wanted.add(home)
-        if home in paths and not name.endswith(".npz") and name not in zoo_names():
-            continue  # only the published bandit of that environment can be meant
+        if name in published_alone:
+            wanted.add(published_alone[name])
+            continue
         bandit = open_bandit(name)
-        environment = bandit_metadata(name)["config"].get("evaluation_environment") or home
-        if environment is None:
-            raise UserError(f"{name} does not say its evaluation environment: name another bandit.")
+        environment = environment_spec(name).evaluation_environment
         wanted.add(environment)
         found.append(Candidate(environment, "ours", bandit, bandit_metadata(name)["sha256"]))
     found += [
@@ -126,7 +124,7 @@ def candidates(
         for environment, path in paths.items()
         if names is None or environment in wanted
     ]
-    found = [x for x in found if not (skip_brax and x.environment in BRAX_NAMES)]
+    found = [x for x in found if not (skip_brax and environment_spec(x.environment).backends)]
     if not found:
         raise UserError("there is no bandit to measure: name some, or give --published.")
     return sorted(found, key=lambda x: (environment_rank(x.environment), BANDITS.index(x.kind)))
@@ -156,10 +154,11 @@ def measure(
     # One compiled program for all bandits of an environment that differ in their weights only.
     trainings: dict[tuple[BanditConfig, str], SyntheticTraining] = {}
     for candidate in found:
-        brax = candidate.environment in BRAX_NAMES
+        home = environment_spec(candidate.environment)
+        backend = home.physics(protocol.backend)
         if candidate.environment != environment:
             environment, trainings = candidate.environment, {}
-            env, env_params = make(environment, **({"backend": protocol.backend} if brax else {}))
+            env, env_params = home.make(backend)
         check_fits(candidate.bandit, env, env_params, environment)
         space = env.action_space(env_params)
         for algorithm in algorithms_for(space):
@@ -170,9 +169,9 @@ def measure(
                 "bandit": candidate.kind,
                 "sha256": candidate.sha256,
                 "agents": protocol.agents,
-                "episodes": protocol.brax_episodes if brax else protocol.episodes,
+                "episodes": protocol.brax_episodes if home.backends else protocol.episodes,
                 "seed": REPORTING.start,
-                "backend": protocol.backend if brax else None,
+                "backend": backend,
                 "training_steps": spec.steps,
                 "inner_loop": repr(spec),
             }

@@ -11,6 +11,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
 from scb import plotting
+from scb.environments.registry import environment_spec
 from scb.errors import UserError
 from scb.statistics import Estimate
 
@@ -53,20 +54,6 @@ PAPER: dict[str, dict[str, float]] = {
     "swimmer": {"ppo": 348.5, "sac": 361.6, "ddpg": 365.1, "td3": 365.4},
     "halfcheetah": {"ppo": 1657.4, "sac": 5810.4, "ddpg": 6162.4, "td3": 6555.8},
     "humanoidstandup": {"ppo": 13356.1, "sac": 21105.2, "ddpg": 21039.0, "td3": 20372.0},
-}
-# The same paper: SAC trained on the environment itself (classic control: its table of SAC experts;
-# Brax: SAC's column EE).
-PAPER_EXPERT = {
-    "CartPole-v1": 500.0,
-    "Acrobot-v1": -76.7,
-    "MountainCar-v0": -117.7,
-    "MountainCarContinuous-v0": 94.9,
-    "Pendulum-v1": -137.4,
-    "hopper": 3119.4,
-    "walker2d": 4140.1,
-    "swimmer": 124.8,
-    "halfcheetah": 7735.5,
-    "humanoidstandup": 23808.1,
 }
 
 
@@ -336,8 +323,10 @@ def figure(report: Mapping[str, Any]) -> Figure:
 
 
 def _paper_expert(name: str) -> float | None:
-    """By label; the paper's Brax has the generalized physics."""
-    return PAPER_EXPERT.get(name.removesuffix(" (generalized)"))
+    """What the paper's SAC agents earn in the environment itself, by label."""
+    environment, _, physics = name.removesuffix(")").partition(" (")
+    expert = environment_spec(environment).reference(physics or None, "sac")
+    return None if expert is None else expert.value
 
 
 def _panel_title(environment: str, entries: Sequence[Mapping[str, Any]]) -> str:

@@ -29,8 +29,7 @@ from lpo.objectives import Objective, closed_form
 from scb.agents.ppo import PPOHyperparameters
 from scb.agents.spec import AgentSpec, environment_agent
 from scb.artefacts import machine_description, package_versions
-from scb.environments.registry import make
-from scb.environments.zoo import home_of
+from scb.environments.registry import environment_spec, make
 from scb.errors import UserError
 from scb.evolution import map_population
 from scb.keys import root_key, split_key
@@ -60,10 +59,10 @@ class Regime:
     policy_output_scale: float | None = None
 
     def __post_init__(self) -> None:
-        if home_of(self.bandit) is None:
+        if not environment_spec(self.bandit).synthetic:
             raise UserError(
                 f"a regime asks for a bandit, and {self.bandit!r} is none: give a name such as "
-                "Synthetic-Pendulum-v1, or a file of that name."
+                "Synthetic-Pendulum-v1, or a bandit's file."
             )
         for name in ("iterations", "epochs", "minibatches", "contexts"):
             value = getattr(self, name)
@@ -373,7 +372,7 @@ def measure_alignment(
 def regime_label(row: Mapping[str, Any], environment: str) -> str:
     """A measured regime's name, which says the bandit wherever that is another environment's."""
     bandit = row["bandit"]
-    if bandit != Regime().bandit or home_of(bandit) == environment:
+    if bandit != Regime().bandit or bandit == environment_spec(environment).bandit:
         return str(row["name"])
     rest = "" if row["name"] == "default" else f", {row['name']}"
     return f"bandit {bandit}{rest}"

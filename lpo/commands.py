@@ -34,7 +34,7 @@ from scb import plotting
 from scb.agents.spec import environment_agent
 from scb.artefacts import machine_description, package_versions
 from scb.console import console
-from scb.environments.zoo import home_of
+from scb.environments.registry import environment_spec
 from scb.errors import UserError
 from scb.runs import Run, make_folder, write_json
 from scb.statistics import estimate
@@ -449,7 +449,7 @@ def align(
     ]
     if not regimes:
         raise UserError("no regimes: give at least one value of each.")
-    target = environment or str(home_of(regimes[0].bandit))
+    target = environment or environment_spec(regimes[0].bandit).evaluation_environment
     seeds = seed_list(agents, seed)
     if out is not None:
         _make_folder(out)

@@ -82,7 +82,7 @@ def meta_training_curve(
 
     Args:
       metrics: one dict a generation, as `scb.evolution.evolve` logs them.
-      environment: where the inner loop trained.
+      environment: where fitness is earned.
       fitness: "return", "area" or "transfer".
       population_size, mean_evaluations: candidates a generation, and agents that judge the search
         distribution's mean; stated in the figure where given.
@@ -445,11 +445,10 @@ def _protocol(curve: "LearningCurves") -> str:
 
 
 def _fitness_label(environment: str, fitness: str) -> str:
-    elsewhere = environment.removeprefix("Synthetic-")
     labels = {
         "return": f"fitness: mean return\nin {environment}",
         "area": f"fitness: mean return during training\nin {environment}",
-        "transfer": f"fitness: mean return\nin {elsewhere}",
+        "transfer": f"fitness: mean return\nin {environment}",
     }
     return labels.get(fitness, f"fitness: {fitness}")
 

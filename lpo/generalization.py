@@ -16,7 +16,7 @@ import numpy as np
 from lpo.objectives import Objective
 from scb.agents.ppo import PPO, PPOConfig
 from scb.agents.spec import AgentSpec, environment_agent
-from scb.environments.registry import make
+from scb.environments.registry import environment_spec, make
 from scb.errors import UserError
 from scb.evolution import map_population
 from scb.keys import root_key
@@ -215,7 +215,7 @@ def _family_curves(
     return [
         LearningCurves(
             environment,
-            getattr(env, "backend", None),
+            environment_spec(environment).physics(backend),
             objective.name,
             steps,
             of_it,

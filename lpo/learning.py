@@ -50,7 +50,7 @@ def learn_objective(
     plotting.save(
         figures.meta_training_curve(
             outcome.metrics,
-            ", ".join(config.tasks),
+            ", ".join(config.judged_in),
             config.fitness,
             config.evolution.population_size,
             config.evolution.mean_evaluations,

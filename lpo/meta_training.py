@@ -10,7 +10,7 @@ makes it rank objectives almost as the environment does.
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -20,13 +20,10 @@ from jax.typing import ArrayLike
 
 from lpo.drifts import Drift, LearnedDrift
 from lpo.fitness import FITNESSES, Fitness
-from lpo.suite import REFERENCES, random_return
 from scb.agents.ppo import PPOConfig, PPOHyperparameters, PPOState
 from scb.agents.spec import AgentSpec, check_lists, environment_agent
-from scb.environments.brax import BRAX_NAMES
-from scb.environments.registry import make
-from scb.environments.synthetic import SyntheticBandit
-from scb.environments.zoo import home_of
+from scb.environments.registry import environment_spec, families
+from scb.environments.spec import EnvironmentSpec, Made
 from scb.errors import UserError, unknown_name
 from scb.evolution import EnvironmentSteps, EvolutionConfig, Outcome, evolve
 from scb.keys import key_at, named_key, root_key, split_key
@@ -101,17 +98,13 @@ class MetaTrainingConfig:
         for name in self.tasks:
             if self.tasks.count(name) > 1:
                 raise UserError(f"the task {name} is there twice: give each once.")
-            if self.judgement.at_home and home_of(name) is None:
+            if self.judgement.at_home and not environment_spec(name).synthetic:
                 raise UserError(
                     f"fitness {self.fitness!r} asks for a bandit, and {name!r} is none: use 'return' or 'area', or "
-                    f"train on 'Synthetic-{name}'."
+                    f"train on {environment_spec(name).bandit!r}."
                 )
-        unknown = [name for name in self.homes if name not in REFERENCES]
-        if self.validation and len(self.homes) > 1 and unknown:
-            raise UserError(
-                f"validation on several environments needs a reference return of each, and {', '.join(unknown)} has "
-                f"none: take {', '.join(REFERENCES)}, or leave validation out."
-            )
+        if self.validation and len(self.homes) > 1:
+            _check_references(self.homes, self.backend)
         if self.agent is not None and len(self.tasks) > 1:
             raise UserError(
                 "one agent configuration does not fit several tasks: leave it out, and each takes its own."
@@ -149,14 +142,35 @@ class MetaTrainingConfig:
     @property
     def homes(self) -> tuple[str, ...]:
         """The tasks' evaluation environments, each once."""
-        return tuple(dict.fromkeys(home_of(name) or name for name in self.tasks))
+        homes = (environment_spec(name).evaluation_environment for name in self.tasks)
+        return tuple(dict.fromkeys(homes))
+
+    @property
+    def judged_in(self) -> tuple[str, ...]:
+        """Where fitness is earned."""
+        return self.homes if self.judgement.at_home else self.tasks
+
+
+def _check_references(names: Sequence[str], backend: str | None) -> None:
+    known = [
+        name
+        for family in families().values()
+        for name in family.suite
+        if environment_spec(name).reference(backend)
+    ]
+    unknown = [name for name in names if environment_spec(name).reference(backend) is None]
+    if unknown:
+        raise UserError(
+            f"validation on several environments needs a reference return of each, and {', '.join(unknown)} has "
+            f"none: take {', '.join(known)}, or leave validation out."
+        )
 
 
 def task_agent(task: str, contexts: int) -> AgentSpec:
     """PPO as the evaluation environment has it, or on a bandit its image (`AgentSpec.on_bandit`)."""
-    home = home_of(task)
-    spec = environment_agent("ppo", home or task)
-    return spec if home is None else spec.on_bandit(contexts)
+    place = environment_spec(task)
+    spec = environment_agent("ppo", place.evaluation_environment)
+    return spec.on_bandit(contexts) if place.synthetic else spec
 
 
 class TaskTraining:
@@ -173,27 +187,31 @@ class TaskTraining:
         self, config: MetaTrainingConfig, environment: str, drift: Drift | None = None
     ) -> None:
         self.config, self.environment = config, environment
-        self.home = home_of(environment) or environment
+        spec = environment_spec(environment)
+        self.home = spec.evaluation_environment
 
-        def physics(name: str) -> dict[str, str]:
-            # Of several tasks only Brax's have a choice; a single one is told where it has none.
-            elsewhere = len(config.tasks) > 1 and name not in BRAX_NAMES
-            return {} if config.backend is None or elsewhere else {"backend": config.backend}
+        def made(spec: EnvironmentSpec) -> Made:
+            # Of several tasks some may have a choice of physics; a single one is told where it has none.
+            several = len(config.tasks) > 1
+            return spec.make(spec.physics(config.backend) if several else config.backend)
 
         if config.judgement.at_home:
             # The bandit has no physics; the environment that it stands for may.
-            self.env, self.env_params = make(environment)
-            self.evaluation_env, self.evaluation_params = make(self.home, **physics(self.home))
+            self.env, self.env_params = spec.make()
+            judged_in = environment_spec(self.home)
+            self.evaluation_env, self.evaluation_params = made(judged_in)
         else:
-            self.env, self.env_params = make(environment, **physics(environment))
+            self.env, self.env_params = made(spec)
+            judged_in = spec
             self.evaluation_env, self.evaluation_params = self.env, self.env_params
-        spec = task_agent(environment, config.contexts)
-        self.spec = replace(spec, config=config.agent or spec.config, lists=config.hyperparameters)
+        agent = task_agent(environment, config.contexts)
+        self.spec = replace(
+            agent, config=config.agent or agent.config, lists=config.hyperparameters
+        )
         self.agent = self.spec.agent(self.env, drift or config.drift)
-        one_step = isinstance(self.evaluation_env, SyntheticBandit)
-        self.evaluation_episodes = config.evaluation_episodes or (50 if one_step else 20)
+        self.evaluation_episodes = config.evaluation_episodes or (50 if judged_in.is_bandit else 20)
         self.training_params = self.env_params
-        if isinstance(self.env, SyntheticBandit) and config.reward_noise:
+        if spec.is_bandit and config.reward_noise:
             scale = self.env.reward_scale(self.env_params, named_key(root_key(0), "reward scale"))
             self.training_params = self.env_params.replace(reward_noise=config.reward_noise * scale)
 
@@ -287,9 +305,13 @@ class MetaTraining:
             self.judges = {name: TaskTraining(own, name) for name in homes}
             self.scales = dict.fromkeys(homes, (0.0, 1.0))
             if len(homes) > 1:
+                specs = map(environment_spec, homes)
                 self.scales = {
-                    name: (random_return(judge.env, judge.env_params), REFERENCES[name])
-                    for name, judge in self.judges.items()
+                    spec.name: (
+                        spec.random_return(config.backend),
+                        spec.reference_return(config.backend),
+                    )
+                    for spec in specs
                 }
 
     def initial_solution(self, key: jax.Array) -> Any:

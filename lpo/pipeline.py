@@ -24,9 +24,8 @@ from lpo.objectives import Objective, load_objective, save_objective
 from scb import plotting
 from scb.agents.spec import environment_agent
 from scb.artefacts import machine_description, package_versions
-from scb.environments.registry import make
-from scb.environments.synthetic import SyntheticBandit
-from scb.environments.zoo import bandit_metadata, home_of
+from scb.environments.registry import environment_spec, make
+from scb.environments.zoo import bandit_metadata
 from scb.evolution import EvolutionConfig, Outcome, evolve
 from scb.runs import Run, Stopwatch, write_json
 from scb.seeds import reporting
@@ -195,6 +194,7 @@ def _learn(
     on_environment = environment_problem(config).steps()
     meta = {
         "environment": ", ".join(config.tasks),
+        "evaluation_environment": ", ".join(config.homes),
         "fitness": config.fitness,
         "config": _plain(config),
         "seconds": round(run.seconds(), 1),
@@ -213,8 +213,7 @@ def _learn(
 
 def environment_problem(config: MetaTrainingConfig) -> MetaTraining:
     """The same meta-training on the bandits' evaluation environments themselves."""
-    homes = tuple(home_of(name) or name for name in config.tasks)
-    return MetaTraining(replace(config, tasks=homes, fitness="return", agent=None))
+    return MetaTraining(replace(config, tasks=config.homes, fitness="return", agent=None))
 
 
 def meta_training_artefact(
@@ -231,7 +230,7 @@ def meta_training_artefact(
         if key in ("mean/fitness", "final_mean/fitness")
     ]
     config = {"meta_training": _plain(problem.config), "settings": dict(settings)}
-    bandits = [n for n, task in problem.tasks.items() if isinstance(task.env, SyntheticBandit)]
+    bandits = [name for name in problem.tasks if environment_spec(name).is_bandit]
     if bandits:
         # The name alone does not say which weights it stood for.
         config["bandit_sha256"] = {name: bandit_metadata(name)["sha256"] for name in bandits}
@@ -299,7 +298,7 @@ def _figures(
     if meta:
         drawn["meta_training"] = figures.meta_training_curve(
             meta["metrics"],
-            ", ".join(config.tasks),
+            ", ".join(config.judged_in),
             config.fitness,
             config.evolution.population_size,
             config.evolution.mean_evaluations,

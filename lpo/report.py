@@ -60,7 +60,7 @@ def headline(results: Mapping[str, Any]) -> Headline:
     """
     name = results["objective"]["name"]
     comparisons = results["comparisons"]
-    home = results.get("meta_training", {}).get("environment", "").removeprefix("Synthetic-")
+    home = results.get("meta_training", {}).get("evaluation_environment")
     for environment in [e for e in (home, *comparisons) if e in comparisons]:
         comparison = comparisons[environment]
         if name in comparison["paired_differences"]:
@@ -92,7 +92,7 @@ def write_report(folder: Path, results: Mapping[str, Any], figures: Mapping[str,
         versions, machine: {name: text}.
         seconds: wall-clock of the whole run.
         objective: {"name", "certificate": `Certificate.as_dict()`}; the certificate is optional.
-        meta_training (optional): {"environment", "config" (nested), "seconds", "generations",
+        meta_training (optional): {"environment", "evaluation_environment", "config" (nested), "seconds", "generations",
           "steps": {"training", "evaluation", "total"} of all candidates, "environment_steps":
           the same for meta-training on the environment itself (optional)}.
         comparisons: {environment: `Comparison.as_dict()`}.
@@ -293,7 +293,7 @@ def _meta_training(meta: Mapping[str, Any]) -> dict[str, Any]:
     ]
     return {
         "environment": meta["environment"],
-        "home": meta["environment"].removeprefix("Synthetic-"),
+        "home": meta["evaluation_environment"],
         "generations": meta["generations"],
         "duration": _duration(meta["seconds"]),
         "total": thousands(steps["total"]),

@@ -9,76 +9,30 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import jax
 import numpy as np
-from gymnax.environments import environment
 
 from lpo.generalization import Comparison, check_names, compare
 from lpo.objectives import Objective
 from scb.agents.spec import environment_agent
-from scb.environments.brax import BRAX_NAMES
-from scb.environments.gymnax import MinAtarFamily
-from scb.environments.registry import make
+from scb.environments.registry import environment_spec, families
 from scb.errors import UserError, unknown_name
-from scb.evaluation import evaluate
-from scb.keys import root_key
 from scb.statistics import Estimate, iqm, normalized_score
 
-SUITES: dict[str, tuple[str, ...]] = {
-    "classic": (
-        "CartPole-v1",
-        "Acrobot-v1",
-        "MountainCar-v0",
-        "MountainCarContinuous-v0",
-        "Pendulum-v1",
-    ),
-    "minatar": MinAtarFamily.suite,
-    "brax": (
-        "hopper",
-        "walker2d",
-        "halfcheetah",
-        "reacher",
-        "inverted_pendulum",
-        "inverted_double_pendulum",
-    ),
-}
-SUITES["all"] = tuple(name for suite in tuple(SUITES.values()) for name in suite)
-
-# What Liesen et al. (2024) report of agents trained on the environment itself: SAC in classic control,
-# PPO in Brax ("generalized" physics).
-REFERENCES: dict[str, float] = {
-    "CartPole-v1": 500.0,
-    "Acrobot-v1": -76.7,
-    "MountainCar-v0": -117.7,
-    "MountainCarContinuous-v0": 94.9,
-    "Pendulum-v1": -137.4,
-}
-BRAX_REFERENCES: dict[str, float] = {
-    "hopper": 2521.9,
-    "walker2d": 2039.6,
-    "halfcheetah": 3487.1,
-}
-RANDOM_EPISODES = 256
 # Resampling is over seeds within environments, on [objectives, environments, seeds].
 RESAMPLES = 2000
 
 
+def suites() -> dict[str, tuple[str, ...]]:
+    """{name: environments}: every family's own suite, and all of them together."""
+    found = {name: family.suite for name, family in families().items() if family.suite}
+    return found | {"all": tuple(name for names in found.values() for name in names)}
+
+
 def suite(name: str) -> tuple[str, ...]:
     """The environments of a suite: classic, minatar, brax or all."""
-    if name not in SUITES:
-        raise unknown_name("suite", name, SUITES)
-    return SUITES[name]
-
-
-def random_return(
-    env: environment.Environment[Any, Any], env_params: Any, episodes: int = RANDOM_EPISODES
-) -> float:
-    """Mean return of uniformly random actions."""
-    space = env.action_space(env_params)
-    result = jax.jit(
-        lambda key: evaluate(env, env_params, lambda _, k: space.sample(k), key, episodes)
-    )(root_key(0))
-    return float(np.mean(result.returns))
+    if name not in suites():
+        raise unknown_name("suite", name, suites())
+    return suites()[name]
 
 
 @dataclass(frozen=True)
@@ -211,11 +165,9 @@ def suite_scores(
 
 def reference_of(name: str, comparison: Comparison) -> tuple[float, str]:
     """The return that counts as 1, and where it is from: a published one, else the best of the comparison."""
-    physics = comparison.curves[0].backend
-    if name in REFERENCES:
-        return REFERENCES[name], "SAC, Liesen et al. (2024)"
-    if name in BRAX_REFERENCES and physics == "generalized":
-        return BRAX_REFERENCES[name], "PPO, Liesen et al. (2024)"
+    reference = environment_spec(name).reference(comparison.curves[0].backend)
+    if reference is not None:
+        return reference.value, reference.source
     best = max(float(iqm(curve.final)) for curve in comparison.curves)
     return best, "the best objective here"
 
@@ -252,11 +204,9 @@ def run_suite(
     comparisons: dict[str, Comparison] = {}
     random: dict[str, float] = {}
     for environment_name in suite(name):
-        physics = backend if environment_name in BRAX_NAMES else None
-        env, env_params = make(
-            environment_name, **({} if physics is None else {"backend": physics})
-        )
-        random[environment_name] = random_return(env, env_params)
+        spec = environment_spec(environment_name)
+        physics = spec.physics(backend)
+        random[environment_name] = spec.random_return(physics)
         if done is not None and environment_name in done:
             comparisons[environment_name] = done[environment_name]
             continue

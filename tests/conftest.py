@@ -96,3 +96,14 @@ def small_agents() -> Generator[None]:
 
     with probes.small_agents():
         yield
+
+
+@pytest.fixture
+def corridors(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A family of environments of the tests' own, registered for one test."""
+    # Here and not above: they import JAX.
+    from scb.environments import registry
+    from tests.scb.probes import Corridors
+
+    monkeypatch.setattr(registry, "_FAMILIES", registry.families())
+    registry.register(Corridors())

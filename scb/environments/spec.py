@@ -135,6 +135,18 @@ class EnvironmentSpec:
         experts = self.experts.get(self.physics(backend), {})
         return experts.get(next(iter(experts), "") if algorithm is None else algorithm)
 
+    def reference_return(self, backend: str | None = None) -> float:
+        """The reference's value.
+
+        Raises:
+          UserError: none is known.
+        """
+        reference = self.reference(backend)
+        if reference is None:
+            physics = f" with {self.physics(backend)} physics" if self.backends else ""
+            raise UserError(f"no reference return of {self.name}{physics} is known: measure one.")
+        return reference.value
+
     def standing_still(self, backend: str | None = None) -> float | None:
         """What an episode of full length without a fall and without moving earns; None where that means nothing."""
         return self.standing.get(self.physics(backend))

@@ -208,7 +208,7 @@ def test_the_final_judgement_of_the_mean_stands_after_the_last_generation():
     metrics = generations(4)
     metrics[-1]["final_mean/fitness"] = 9.0
     figure = figures.meta_training_curve(
-        metrics, "Synthetic-Pendulum-v1", "transfer", population_size=8, mean_evaluations=64
+        metrics, "Pendulum-v1", "transfer", population_size=8, mean_evaluations=64
     )
     judged = line(figure.axes[0], "search distribution's mean (64 agents a point)")
     np.testing.assert_array_equal(judged.get_xdata(), [0, 2, 4])

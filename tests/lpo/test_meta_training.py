@@ -20,6 +20,7 @@ from lpo.meta_training import (
 )
 from scb.agents.ppo import PPOConfig
 from scb.agents.spec import environment_agent
+from scb.environments.spec import EnvironmentSpec
 from scb.environments.synthetic import BanditConfig, SyntheticBandit
 from scb.errors import UserError
 from scb.evaluation import Episodes
@@ -392,9 +393,7 @@ def test_reward_noise_is_given_in_the_bandits_own_standard_deviations(config, mo
     noise = {}
     for factor in (1.0, 3.0):
         scaled = bandit(factor)
-        monkeypatch.setattr(
-            meta_training, "make", lambda name, b=scaled, **_: (b, b.default_params)
-        )
+        monkeypatch.setattr(EnvironmentSpec, "make", lambda *_, b=scaled: (b, b.default_params))
         problem = TaskTraining(replace(config, reward_noise=5.0), PENDULUM)
         noise[factor] = float(problem.training_params.reward_noise)
         assert problem.evaluation_params.reward_noise == 0.0
@@ -428,8 +427,8 @@ def test_environments_take_no_reward_noise(config):
     ("environment", "fitness", "made"),
     [
         # A bandit has no physics: the backend is for the environment that it stands for.
-        ("Synthetic-hopper", "transfer", [("Synthetic-hopper", {}), ("hopper", {"backend": "x"})]),
-        ("hopper", "return", [("hopper", {"backend": "x"})]),
+        ("Synthetic-hopper", "transfer", [("Synthetic-hopper", None), ("hopper", "x")]),
+        ("hopper", "return", [("hopper", "x")]),
     ],
 )
 def test_physics_go_to_the_environment_and_not_to_its_bandit(
@@ -437,11 +436,11 @@ def test_physics_go_to_the_environment_and_not_to_its_bandit(
 ):
     calls = []
 
-    def record(name, **arguments):
-        calls.append((name, arguments))
+    def record(spec, backend=None):
+        calls.append((spec.name, backend))
         return bandit(), bandit().default_params
 
-    monkeypatch.setattr(meta_training, "make", record)
+    monkeypatch.setattr(EnvironmentSpec, "make", record)
     MetaTraining(replace(config, tasks=(environment,), fitness=fitness, backend="x"))
     assert calls == made
 
@@ -465,7 +464,11 @@ def test_physics_go_to_the_environment_and_not_to_its_bandit(
             "one agent configuration does not fit several tasks",
         ),
         (
-            {"tasks": ("Synthetic-hopper", "Pendulum-v1"), "validation": True},
+            {
+                "tasks": ("Synthetic-hopper", "Pendulum-v1"),
+                "validation": True,
+                "backend": "spring",
+            },
             "needs a reference return of each, and hopper has none: take CartPole-v1",
         ),
         ({"horizons": (0.5, 0.0)}, "a horizon is 0.0: it must be larger than 0"),

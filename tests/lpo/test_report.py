@@ -97,6 +97,7 @@ def results(**changes: Any) -> dict[str, Any]:
         "objective": {"name": "mine", "certificate": certificate},
         "meta_training": {
             "environment": "Synthetic-Pendulum-v1",
+            "evaluation_environment": "Pendulum-v1",
             "config": {
                 "fitness": "transfer",
                 "evolution": {"seed": 7, "population_size": 32},

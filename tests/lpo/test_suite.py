@@ -8,10 +8,11 @@ import pytest
 from lpo import commands, figures, suite
 from lpo.generalization import Comparison, LearningCurves, learning_curves
 from lpo.objectives import load_objective
-from lpo.suite import RESAMPLES, SUITES, SuiteScores, random_return, run_suite, suite_scores
+from lpo.suite import RESAMPLES, SuiteScores, run_suite, suite_scores, suites
 from scb import plotting
 from scb.agents.spec import environment_agent
-from scb.environments.registry import environment_names, make
+from scb.environments.registry import environment_names
+from scb.environments.spec import EnvironmentSpec
 from scb.errors import UserError
 
 
@@ -29,19 +30,20 @@ def comparison(environment: str, **finals) -> Comparison:
 
 
 def test_every_environment_of_the_suites_can_be_made():
-    known = environment_names()
-    assert set(SUITES["all"]) <= set(known)
-    assert len(SUITES["brax"]) >= 6
-    assert {"CartPole-v1", "Pendulum-v1", "Breakout-MinAtar", "hopper"} <= set(SUITES["all"])
+    found = suites()
+    assert list(found) == ["classic", "minatar", "brax", "all"]
+    assert set(found["all"]) <= set(environment_names())
+    assert len(found["brax"]) >= 6
+    assert {"CartPole-v1", "Pendulum-v1", "Breakout-MinAtar", "hopper"} <= set(found["all"])
 
 
 def test_zero_is_random_and_one_is_the_reference():
     scores = suite_scores(
         {
             "CartPole-v1": comparison("CartPole-v1", ppo=[20.0, 260.0], dpo=[500.0, 500.0]),
-            "made-up": comparison("made-up", ppo=[0.0, 10.0], dpo=[5.0, 15.0]),
+            "Catch-bsuite": comparison("Catch-bsuite", ppo=[0.0, 10.0], dpo=[5.0, 15.0]),
         },
-        {"CartPole-v1": 20.0, "made-up": 0.0},
+        {"CartPole-v1": 20.0, "Catch-bsuite": 0.0},
     )
     # 500 is published for CartPole; what nobody published has the best objective's: IQM 10.
     np.testing.assert_allclose(scores.scores[0], [[0.0, 0.5], [0.0, 1.0]])
@@ -58,29 +60,34 @@ def test_published_brax_returns_are_of_one_physics():
 
 
 def test_an_environment_that_nobody_learned_is_left_out_and_said_so():
+    catch, sea = "Catch-bsuite", "DeepSea-bsuite"
     scores = suite_scores(
         {
-            "a": comparison("a", ppo=[1.0, 1.0], dpo=[2.0, 2.0]),
-            "b": comparison("b", ppo=[-5.0, -5.0], dpo=[-6.0, -6.0]),
+            catch: comparison(catch, ppo=[1.0, 1.0], dpo=[2.0, 2.0]),
+            sea: comparison(sea, ppo=[-5.0, -5.0], dpo=[-6.0, -6.0]),
         },
-        {"a": 0.0, "b": -5.0},
+        {catch: 0.0, sea: -5.0},
     )
-    assert (scores.environments, scores.left_out) == (["a"], ["b"])
+    assert (scores.environments, scores.left_out) == ([catch], [sea])
     with pytest.raises(UserError, match="no objective is better than random actions anywhere"):
-        suite_scores({"b": comparison("b", ppo=[-5.0, -5.0])}, {"b": -5.0})
+        suite_scores({sea: comparison(sea, ppo=[-5.0, -5.0])}, {sea: -5.0})
 
 
 @pytest.mark.parametrize(
     ("second", "message"),
     [
-        (comparison("b", ppo=[1.0, 2.0]), "b was run with other objectives than the rest"),
-        (comparison("b", ppo=[1.0], dpo=[2.0]), "different numbers of seeds"),
+        (
+            comparison("DeepSea-bsuite", ppo=[1.0, 2.0]),
+            "DeepSea-bsuite was run with other objectives than the rest",
+        ),
+        (comparison("DeepSea-bsuite", ppo=[1.0], dpo=[2.0]), "different numbers of seeds"),
     ],
 )
 def test_what_does_not_compare_is_refused(second, message):
-    first = comparison("a", ppo=[1.0, 1.0], dpo=[2.0, 2.0])
+    first = comparison("Catch-bsuite", ppo=[1.0, 1.0], dpo=[2.0, 2.0])
+    random = {"Catch-bsuite": 0.0, "DeepSea-bsuite": 0.0}
     with pytest.raises(UserError, match=message):
-        suite_scores({"a": first, "b": second}, {"a": 0.0, "b": 0.0})
+        suite_scores({x.curves[0].environment: x for x in (first, second)}, random)
 
 
 def scores_of(values) -> SuiteScores:
@@ -114,12 +121,6 @@ def test_a_profile_is_the_share_of_runs_above_a_threshold():
     assert np.all(low <= share) and np.all(share <= high)
 
 
-def test_random_actions_earn_what_they_earn():
-    env, env_params = make("CartPole-v1")
-    # Random actions keep a pole up for about 22 steps.
-    assert 19.0 < random_return(env, env_params) < 26.0
-
-
 @pytest.fixture
 def trained(monkeypatch):
     """Trainings that are instantaneous; the list of those that were asked for."""
@@ -133,9 +134,9 @@ def trained(monkeypatch):
         return comparison(environment, **finals)
 
     monkeypatch.setattr(suite, "compare", compare)
-    monkeypatch.setattr(suite, "random_return", lambda *arguments: -1000.0)
-    monkeypatch.setitem(suite.SUITES, "classic", ("CartPole-v1", "Pendulum-v1"))
-    monkeypatch.setitem(suite.SUITES, "brax", ("hopper", "CartPole-v1"))
+    monkeypatch.setattr(EnvironmentSpec, "random_return", lambda *arguments: -1000.0)
+    short = {"classic": ("CartPole-v1", "Pendulum-v1"), "brax": ("hopper", "CartPole-v1")}
+    monkeypatch.setattr(suite, "suites", lambda: short)
     return asked
 
 
@@ -144,6 +145,13 @@ def test_physics_are_for_brax_alone(trained):
     scores, comparisons = run_suite("brax", objectives, [1, 2], "spring", tell=lambda _: None)
     assert trained == [("hopper", "spring"), ("CartPole-v1", None)]
     assert list(comparisons) == scores.environments == ["hopper", "CartPole-v1"]
+
+
+def test_a_new_family_has_its_suite(corridors, trained, monkeypatch):
+    monkeypatch.setattr(suite, "suites", suites)
+    scores, _ = run_suite("corridors", [load_objective("ppo")], [1, 2], tell=lambda _: None)
+    assert scores.environments == ["Corridor-v0", "LongCorridor-v0"]
+    assert set(scores.environments) <= set(suites()["all"])
 
 
 @pytest.mark.slow

@@ -1,6 +1,6 @@
 """Environments whose values and optima are known, for the tests of everything that trains or evaluates."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import fields, replace
 from functools import partial
@@ -13,6 +13,7 @@ from flax import struct
 from gymnax.environments import environment, spaces
 
 from scb.agents.spec import ALGORITHMS
+from scb.environments.spec import Family, Made
 from scb.environments.synthetic import BanditConfig, SyntheticBandit
 from scb.evolution import EnvironmentSteps
 
@@ -82,6 +83,20 @@ class Corridor(environment.Environment[CorridorState, CorridorParams]):
 
     def observation_space(self, params: CorridorParams | None = None) -> spaces.Box:
         return spaces.Box(0.0, 1.0, (self.cells,), jnp.float32)
+
+
+class Corridors(Family):
+    """All that a new family of environments is, but for its line in `scb/environments/__init__.py`."""
+
+    name = "corridors"
+    suite = ("Corridor-v0", "LongCorridor-v0")
+
+    def names(self) -> Sequence[str]:
+        return self.suite
+
+    def make(self, name: str, **arguments: Any) -> Made:
+        env = Corridor(**{"cells": 3 if name == "Corridor-v0" else 9} | arguments)
+        return env, env.default_params
 
 
 class ContinuousCorridor(Corridor):

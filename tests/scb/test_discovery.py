@@ -147,7 +147,7 @@ def discovered():
 def test_a_discovery_ends_with_weights_of_its_bandit(discovered):
     problem, outcome = discovered
     assert problem.bandit.name == "Synthetic-CartPole-v1"
-    assert shapes(outcome.mean) == shapes(outcome.best_mean) == problem.bandit.shapes()
+    assert shapes(outcome.mean) == shapes(outcome.best_mean) == problem.bandit.weight_shapes()
     assert len(outcome.metrics) == 2
     for line in outcome.metrics:
         # CartPole pays 1 a step until the pole falls, after 500 at most.
@@ -441,7 +441,7 @@ def test_a_synthetic_mdp_is_discovered_and_opens_as_an_environment(parameterizat
         {"initial_state"} if parameterization == "TI" else set()
     )
     assert [line["failed"] for line in outcome.metrics] == [0, 0]
-    assert shapes(outcome.mean) == problem.bandit.shapes()
+    assert shapes(outcome.mean) == problem.bandit.weight_shapes()
     metadata = {**METADATA, "config": {"evaluation_environment": "CartPole-v1"}}
     path = save_synthetic_mdp(tmp_path / "mdp.npz", problem.bandit, outcome.mean, metadata)
     env, env_params = make(str(path))
@@ -477,7 +477,7 @@ def test_an_expert_start_is_fitted_once_and_from_the_seed_alone(monkeypatch):
     )
     problem = BanditDiscovery(replace(CONFIG, init="expert", warm_start=warm))
     start = problem.initial_solution(jax.random.key(3))
-    assert shapes(start) == problem.bandit.shapes()
+    assert shapes(start) == problem.bandit.weight_shapes()
     # A resumed run asks again, whatever its key: same weights.
     assert problem.initial_solution(jax.random.key(4)) is start
     report = problem.warm_start_report

@@ -1,13 +1,11 @@
-"""What is known of environments, and what a new family of them takes."""
+"""What is known of environments, and what a new family of them takes: what `probes.Corridors` shows."""
 
-import jax
 import pytest
-from gymnax.environments.classic_control.pendulum import Pendulum
 
-from scb.environments import registry
-from scb.environments.registry import environment_names, environment_spec, make, register
+from scb.agents.spec import bandit_agent, environment_agent
+from scb.discovery import BanditDiscovery, DiscoveryConfig
+from scb.environments.registry import environment_names, environment_spec, make
 from scb.environments.returns import random_return
-from scb.environments.spec import Family
 from scb.environments.zoo import bandit_metadata, open_bandit, save_bandit, zoo_names
 from scb.errors import UserError
 
@@ -67,32 +65,26 @@ def test_the_table_of_random_returns_is_what_is_measured(name):
     assert spec.random_return() < spec.reference().value
 
 
-class Corridors(Family):
-    """All that a new family is."""
-
-    name = "corridors"
-    suite = ("Corridor-v0",)
-
-    def names(self):
-        return self.suite
-
-    def make(self, name, **arguments):
-        env = Pendulum(**arguments)
-        return env, env.default_params
-
-
-def test_a_new_family_takes_a_class_and_a_line(monkeypatch):
-    monkeypatch.setattr(registry, "_FAMILIES", registry.families())
-    register(Corridors())
+def test_a_new_family_takes_a_class_and_a_line(corridors):
     spec = environment_spec("Corridor-v0")
     assert (spec.family, spec.bandit) == ("corridors", "Synthetic-Corridor-v0")
-    assert spec.reference() is None and spec.standing_still() is None and spec.episode_limit == 200
-    # Not in the table: measured. Near Pendulum's own, by the standard error above.
-    known = environment_spec("Pendulum-v1").random_return()
-    assert spec.random_return() == pytest.approx(known, rel=0.06)
-    env, env_params = make("Corridor-v0")
-    assert env.reset(jax.random.key(0), env_params)[0].shape == (3,)
+    assert spec.reference() is None and spec.standing_still() is None and spec.episode_limit == 100
+    # Not in the table: measured. Three cells, each of which pays 1.
+    assert spec.random_return() == 3.0
+    env, env_params = make("Corridor-v0", num_actions=4)
+    assert env.action_space(env_params).n == 4
     with pytest.raises(UserError, match="environment 'Corridor-v0' does not take"):
         make("Corridor-v0", "spring")
     with pytest.raises(UserError, match="did you mean Corridor-v0"):
         make("Coridor-v0")
+
+
+def test_a_new_family_is_trained_in_with_general_settings(corridors):
+    for agent in bandit_agent, environment_agent:
+        assert agent("ppo", "Corridor-v0") == agent("ppo", "CartPole-v1")
+
+
+def test_a_bandit_can_be_discovered_for_a_new_family(corridors):
+    problem = BanditDiscovery(DiscoveryConfig(environment="Corridor-v0", init="random"))
+    assert problem.bandit.name == "Synthetic-Corridor-v0"
+    assert (problem.bandit.observation_size, problem.bandit.num_actions) == (3, 2)

@@ -264,7 +264,7 @@ def test_contexts_are_drawn_through_the_configured_latent(name):
 def test_weight_shapes_are_those_of_the_weights():
     # [3 latent -> 4 -> 3 context] and [3 context + 2 action -> 4 -> 1].
     bandit = small_bandit(BOX)
-    assert bandit.shapes() == {
+    assert bandit.weight_shapes() == {
         "initial_state/Dense_0/bias": (4,),
         "initial_state/Dense_0/kernel": (3, 4),
         "initial_state/Dense_1/bias": (3,),
@@ -281,7 +281,7 @@ def test_weight_shapes_are_those_of_the_weights():
         for layer, arrays in layers.items()
         for name, array in arrays.items()
     }
-    assert shapes == bandit.shapes()
+    assert shapes == bandit.weight_shapes()
 
 
 @pytest.mark.parametrize(

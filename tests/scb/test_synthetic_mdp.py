@@ -377,7 +377,7 @@ def test_weight_shapes_are_those_of_the_weights(parameterization):
             f"{network}/Dense_1/kernel": (4, outputs),
             f"{network}/Dense_1/bias": (outputs,),
         }
-    assert mdp.shapes() == expected
+    assert mdp.weight_shapes() == expected
     flat = artefacts.flatten(mdp.init_weights(jax.random.key(0)))
     assert {name: array.shape for name, array in flat.items()} == expected
 

@@ -312,7 +312,7 @@ def test_the_fitted_weights_are_a_bandits(fitted):
         for layer, arrays in layers.items()
         for name, array in arrays.items()
     }
-    assert shapes == bandit.shapes()
+    assert shapes == bandit.weight_shapes()
 
 
 def test_a_discrete_bandit_is_fitted_too(corridor_dataset):

@@ -51,7 +51,7 @@ def test_a_saved_bandit_comes_back_exactly(tmp_path, original):
     bandit = load_bandit(path)
     assert bandit.name == "Synthetic-Test"
     assert bandit.config == original.config
-    assert bandit.shapes() == original.shapes()
+    assert bandit.weight_shapes() == original.weight_shapes()
     restored = bandit.default_params.weights
     assert jax.tree.structure(restored) == jax.tree.structure(weights)
     jax.tree.map(np.testing.assert_array_equal, restored, weights)
