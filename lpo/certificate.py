@@ -2,7 +2,8 @@
 
 Kuba et al. (2022) ask of a drift f that f >= 0 everywhere, and that its value and its gradient
 vanish where the new policy equals the old. Those carry the guarantee of monotonic improvement; a
-learned drift should not be used without them.
+drift should not be used without them. Learned drifts and formulas meet them by construction, whatever
+their weights are: of those the slope beside ratio 1 is what is judged.
 """
 
 from dataclasses import asdict, dataclass
@@ -15,6 +16,9 @@ import numpy as np
 from lpo.drifts.contract import Drift
 from scb.agents.ppo import MAX_LOG_RATIO
 
+# As much as the advantages of a minibatch of 1000 correlate with any direction by chance, 1 / sqrt(1000).
+LARGEST_KINK = 0.03
+
 
 @dataclass(frozen=True)
 class Certificate:
@@ -25,13 +29,15 @@ class Certificate:
       minimum: smallest penalty on the grid.
       value_at_one, gradient_at_one: largest |f| and |df/dr| at ratio 1 over all advantages.
       slope_at_0_001, slope_at_0_01: largest |df/dr| at |r - 1| = 0.001 and 0.01. Not a condition,
-        but a drift whose slope jumps just outside its dead zone is one in name only.
+        but a drift whose slope jumps just outside its dead zone is one in name only: see `stalls`.
       kink: how much the penalty rises per unit of |log-ratio| around ratio 1 (at |r - 1| = 0.01), the
         mean over standard normal advantages. No condition either: but where the advantages of a
         minibatch correlate less than that with every direction that the policy could take, an update
         stays where it is.
       finite: no NaN or infinity, out to the largest ratio that training meets.
       grid: what the grid was.
+      by_construction: whether every drift of its family holds, so that `holds` says no more than that
+        the weights are finite.
     """
 
     holds: bool
@@ -43,12 +49,26 @@ class Certificate:
     kink: float
     finite: bool
     grid: str
+    by_construction: bool = False
+
+    @property
+    def stalls(self) -> bool:
+        """Whether it may hold a policy still: the penalty rises right at ratio 1, and by more than `LARGEST_KINK`.
+
+        One that begins smoothly, as KL does, or further out, as a clip, has less than half of the slope
+        at |r - 1| = 0.01 already at 0.001.
+        """
+        return self.kink > LARGEST_KINK and self.slope_at_0_001 > 0.5 * self.slope_at_0_01
 
     def as_dict(self) -> dict[str, Any]:
         return asdict(self)
 
     def __str__(self) -> str:
         verdict = "is a drift" if self.holds else "is NOT a drift"
+        if self.holds and self.by_construction:
+            verdict += " whatever its weights"
+        if self.stalls:
+            verdict += f", but one that MAY HOLD A POLICY STILL, with a kink above {LARGEST_KINK}"
         return (
             f"{verdict}: min f {self.minimum:.3g}, at ratio 1 |f| {self.value_at_one:.3g} and |df/dr| "
             f"{self.gradient_at_one:.3g}, |df/dr| {self.slope_at_0_001:.3g} at |r - 1| = 0.001 and "
@@ -118,4 +138,5 @@ def certify(
         finite=finite,
         grid=f"{len(log_ratios)} log-ratios in [-{MAX_LOG_RATIO:g}, {MAX_LOG_RATIO:g}] x "
         f"{len(advantages)} advantages in [-10, 10] x 3 training fractions",
+        by_construction=getattr(drift, "always_holds", False),
     )

@@ -525,7 +525,10 @@ def distill_command(
 
 
 def certify_command(objective: str) -> None:
-    """Check that an objective is a drift: the mirror-learning conditions on a dense grid.
+    """Check that an objective is a drift, and lets policies move: its conditions and its slope on a dense grid.
+
+    Learned drifts and formulas meet the conditions of mirror learning by construction; of those look at
+    slope and kink. Exits with 1 where a condition fails, or where the kink may hold a policy still.
 
     Args:
       objective: ppo, ppo-0.3, dpo, none, a zoo name, or path.npz.
@@ -533,7 +536,7 @@ def certify_command(objective: str) -> None:
     loaded = load_objective(objective)
     certificate = certify(loaded.drift, loaded.parameters)
     print(f"{loaded.name} {certificate}")
-    if not certificate.holds:
+    if not certificate.holds or certificate.stalls:
         sys.exit(1)
 
 

@@ -156,19 +156,7 @@ def distill(objective: "Objective", config: DistillConfig | None = None) -> Dist
     shorter = [_drop_terms(*found, fit, config.tolerance) for found in longest]
     front = _front([*tuned, *grown, *shorter])
     held_out = sample_updates(rng, config.samples)
-    best = max(score for _, score, _ in front)
-    # Shortest first: the first that is good enough and holds. By construction, all of them hold.
-    for text, score, _ in front:
-        if score < best - config.tolerance:
-            continue
-        closed = replace(nothing, expression=text)
-        parameters = closed.init(root_key(0))
-        if certify(closed, parameters).holds:
-            break
-    else:
-        raise UserError(
-            f"no formula for {objective.name} passes as a drift: search with another seed."
-        )
+    closed, parameters = _shortest(nothing, front, config.tolerance)
     return Distillation(
         drift=closed,
         parameters=parameters,
@@ -177,6 +165,21 @@ def distill(objective: "Objective", config: DistillConfig | None = None) -> Dist
         front=[{"size": size, "r2": score, "expression": text} for text, score, size in front],
         seconds=time.perf_counter() - start,
     )
+
+
+def _shortest(
+    around: ClosedFormDrift, front: Sequence[tuple[str, float, int]], tolerance: float
+) -> tuple[ClosedFormDrift, dict[str, jax.Array]]:
+    """The shortest formula that is good enough, of those that hold no policy still where there are any.
+
+    All of them are drifts by construction.
+    """
+    best = max(score for _, score, _ in front)
+    good = [
+        replace(around, expression=text) for text, score, _ in front if score >= best - tolerance
+    ]
+    found = [(closed, closed.init(root_key(0))) for closed in good]
+    return next((pair for pair in found if not certify(*pair).stalls), found[0])
 
 
 def sample_updates(rng: np.random.Generator, samples: int) -> dict[str, NDArray[np.floating]]:

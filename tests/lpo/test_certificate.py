@@ -168,5 +168,29 @@ def test_a_gate_takes_the_kink_from_any_weights():
     weights = jax.tree.map(lambda w: 3.0 * w, drift.init(jax.random.key(1)))
     plain, gated = (certify(replace(drift, gate=g), weights, **GRID) for g in (0.0, 0.1))
     assert plain.kink > 0.1
-    assert gated.holds
     assert gated.kink < 0.03 * plain.kink + 1e-3
+    # Both are drifts, as any weights are: what tells them apart is what is judged.
+    assert plain.holds and plain.by_construction and gated.holds and gated.by_construction
+    assert plain.stalls and not gated.stalls
+    assert str(plain).startswith(
+        "is a drift whatever its weights, but one that MAY HOLD A POLICY STILL, with a kink above 0.03"
+    )
+    assert str(gated).startswith("is a drift whatever its weights: min f 0")
+
+
+@pytest.mark.parametrize(
+    ("formula", "stalls"),
+    [
+        # KL, ten times: as steep at 0.01 as |log r| / 10, but not at 0.001.
+        (lambda x, a, p: 10.0 * (jnp.exp(x) * x - jnp.expm1(x)), False),
+        (lambda x, a, p: 0.1 * jnp.abs(x), True),
+        # Less than what a thousand advantages correlate with anything by chance, 1 / sqrt(1000) = 0.03.
+        (lambda x, a, p: 0.02 * jnp.abs(x), False),
+        # A narrow clip begins beyond 0.001.
+        (lambda x, a, p: jax.nn.relu(jnp.abs(x) - 0.005), False),
+    ],
+)
+def test_a_drift_stalls_where_its_penalty_rises_right_at_ratio_one(formula, stalls):
+    found = certificate(formula)
+    assert found.stalls == stalls
+    assert not found.by_construction

@@ -17,11 +17,11 @@ from gymnax.environments import spaces
 import lpo
 import scb.cli
 from lpo import cli, commands, learning
-from lpo.drifts import NoDrift
+from lpo.drifts import ClosedFormDrift, NoDrift
 from lpo.fitness import LABELS
 from lpo.generalization import LearningCurves
 from lpo.meta_training import MetaTrainingConfig
-from lpo.objectives import Objective, load_objective
+from lpo.objectives import Objective, closed_form, load_objective
 from scb.environments.synthetic import BanditConfig, SyntheticBandit
 from scb.environments.zoo import save_bandit
 from scb.errors import UserError
@@ -454,6 +454,15 @@ def test_certify_exits_with_one_where_the_conditions_fail(monkeypatch, capsys):
         cli.main(["certify", "--objective", "mine"])
     assert stop.value.code == 1
     assert capsys.readouterr().out.startswith("mine is NOT a drift: min f 1, at ratio 1 |f| 1")
+
+
+def test_certify_exits_with_one_where_a_drift_holds_policies_still(monkeypatch, capsys):
+    barrier = closed_form("mine", ClosedFormDrift("0.2*abs(log_r)"))
+    monkeypatch.setattr(commands, "load_objective", lambda name: barrier)
+    with pytest.raises(SystemExit) as stop:
+        cli.main(["certify", "--objective", "mine"])
+    assert stop.value.code == 1
+    assert "is a drift whatever its weights, but one that MAY HOLD" in capsys.readouterr().out
 
 
 def measured(environment, objective, seeds, mode_actions=True, **_) -> LearningCurves:

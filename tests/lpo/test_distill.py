@@ -11,7 +11,7 @@ import pytest
 
 from lpo import cli, commands
 from lpo.certificate import certify
-from lpo.distill import DistillConfig, _as_sum, as_text, distill
+from lpo.distill import DistillConfig, _as_sum, _shortest, as_text, distill
 from lpo.drifts import ClipDrift, ClosedFormDrift, DPODrift, LearnedDrift
 from lpo.drifts.formula import parse
 from lpo.objectives import Objective, load_objective, save_objective
@@ -267,6 +267,15 @@ def test_a_learned_drift_keeps_its_base():
     assert certify(found.drift, found.parameters, **GRID).holds
 
 
+def test_a_formula_that_holds_policies_still_is_taken_only_where_no_other_fits():
+    barrier, smooth = "0.2*abs(log_r)", "0.7*abs(A)*d*d"
+    front = [(barrier, 0.91, 3), (smooth, 0.9, 5)]
+    for tolerance, chosen in ((0.05, smooth), (0.001, barrier)):
+        closed, parameters = _shortest(ClosedFormDrift("0*d"), front, tolerance)
+        assert closed.expression == chosen
+        assert certify(closed, parameters).stalls == (chosen == barrier)
+
+
 def test_a_drift_that_charges_nothing_is_refused(one_sentence):
     with pytest.raises(UserError) as error:
         distill(load_objective("none"), QUICK)
@@ -312,7 +321,7 @@ def test_the_command_writes_an_objective(tmp_path, monkeypatch, capsys):
     loaded = load_objective(tmp_path / "runs" / "mine" / "closed_form.npz")
     assert f"expression: {loaded.drift.expression}\n" in output
     assert "R² on unseen points: drift 0." in output
-    assert "it is a drift:" in output
+    assert "it is a drift whatever its weights" in output
     assert loaded.metadata["command"].startswith("lpo distill dpo --samples=200")
     assert loaded.metadata["config"]["distill"]["population_size"] == 50
     assert loaded.metadata["results"]["r2"].keys() == {"drift", "slope"}
