@@ -324,9 +324,10 @@ def measure(preset: str, runs: Path, out: Path, report: dict[str, Any]) -> None:
                 f"{out} was measured when the preset {preset} was another one: choose another --out."
             )
         for learned in group[len(entry["curves"]) :]:
-            entry["steps_to_judge"] = learned.objective.metadata["cost"][
-                "environment_steps_validation"
-            ]
+            cost = learned.objective.metadata["cost"]
+            # A run folder of before November 2026 has the second name.
+            names = ("environment_steps_judgements", "environment_steps_validation")
+            entry["steps_to_judge"] = next(cost[name] for name in names if name in cost)
             entry["curves"].append(_curve_of(learned.folder))
             write_json(out, report)
     for label, scale in SCALES.items():

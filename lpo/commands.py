@@ -35,15 +35,14 @@ from scb.agents.spec import environment_agent
 from scb.artefacts import machine_description, package_versions
 from scb.console import console
 from scb.environments.registry import environment_spec
-from scb.errors import UserError
+from scb.errors import UserError, at_least
 from scb.runs import Run, make_folder, write_json
 from scb.statistics import estimate
 
 
-def seed_list(count: int, first: int) -> list[int]:
-    """`count` consecutive seeds; a UserError where there are none or one is negative."""
-    if count < 1:
-        raise UserError(f"seeds is {count}: give at least 1.")
+def seed_list(count: int, first: int, counted: str = "seeds") -> list[int]:
+    """`count` consecutive seeds; a UserError, which says what is `counted`, for none or a negative one."""
+    at_least(1, **{counted: count})
     if first < 0:
         raise UserError(f"seed is {first}: it must be 0 or larger.")
     return list(range(first, first + count))
@@ -450,7 +449,7 @@ def align(
     if not regimes:
         raise UserError("no regimes: give at least one value of each.")
     target = environment or environment_spec(regimes[0].bandit).evaluation_environment
-    seeds = seed_list(agents, seed)
+    seeds = seed_list(agents, seed, "agents")
     if out is not None:
         _make_folder(out)
     printer = console()

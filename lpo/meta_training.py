@@ -10,7 +10,7 @@ makes it rank objectives almost as the environment does.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -63,7 +63,7 @@ class MetaTrainingConfig:
         their normalised scores (`lpo.suite`). The longer a search
         on a bandit, the more it learns about the bandit alone; the best judged mean
         (`Outcome.best_mean`) is then where it carries over best. Takes environment steps, which
-        `MetaTraining.validation_steps` counts; the search itself still sees none of them.
+        the artefact's cost counts; the search itself still sees none of them.
       backend: Brax physics, where the environment is Brax's (with "transfer": the evaluation
         environment).
       evolution: the outer loop's.
@@ -273,16 +273,13 @@ class TaskTraining:
         iterations = self.spec.config.num_iterations
         return next(n for n in range(max(1, iterations // 5), 0, -1) if iterations % n == 0)
 
-    def steps(self) -> EnvironmentSteps:
-        """Of one candidate; with random horizons the mean over them."""
-        config, points = self.config, 1
-        if config.judgement.along:
+    def steps(self, agents: int, share: float = 1.0) -> EnvironmentSteps:
+        """Of so many agents that train for this share of the agent's steps."""
+        points = 1
+        if self.config.judgement.along:
             points = self.spec.config.num_iterations // self.area_every + 1
-        agents = config.agents_per_candidate
-        share = sum(config.horizons) / len(config.horizons) if config.horizons else 1.0
-        training = self.spec.steps
         return EnvironmentSteps(
-            training=round(agents * training * share),
+            training=round(agents * self.spec.steps * share),
             evaluation=agents
             * points
             * self.evaluation_episodes
@@ -346,27 +343,22 @@ class MetaTraining:
         ]
         return {"fitness": jnp.stack(scores).mean(), **apart}
 
-    def validation_steps(self) -> EnvironmentSteps:
-        """Environment steps of all judgements of a whole search; none without validation."""
-        if not self.config.validation:
-            return EnvironmentSteps(0, 0)
-        evolution = self.config.evolution
-        judgements = -(-evolution.num_generations // evolution.evaluate_mean_every) + 1
-        agents = judgements * evolution.mean_evaluations
-        one = [
-            TaskTraining(replace(judge.config, agents_per_candidate=1), name).steps()
-            for name, judge in self.judges.items()
-        ]
-        return EnvironmentSteps(
-            training=agents * sum(c.training for c in one),
-            evaluation=agents * sum(c.evaluation for c in one),
+    def steps(self) -> EnvironmentSteps:
+        """Of one candidate; with random horizons the mean over them."""
+        horizons = self.config.horizons or (1.0,)
+        share = sum(horizons) / len(horizons)
+        return _sum(
+            task.steps(self.config.agents_per_candidate, share) for task in self.tasks.values()
         )
 
-    def steps(self) -> EnvironmentSteps:
-        counts = [task.steps() for task in self.tasks.values()]
-        return EnvironmentSteps(
-            training=sum(c.training for c in counts), evaluation=sum(c.evaluation for c in counts)
-        )
+    def judgement_steps(self) -> EnvironmentSteps:
+        """Of one agent for each judge, trained in full."""
+        return _sum(judge.steps(1) for judge in self.judges.values())
+
+
+def _sum(counts: Iterable[EnvironmentSteps]) -> EnvironmentSteps:
+    training, evaluation = zip(*((c.training, c.evaluation) for c in counts), strict=True)
+    return EnvironmentSteps(sum(training), sum(evaluation))
 
 
 def meta_train(config: MetaTrainingConfig, run: Run | None = None, quiet: bool = False) -> Outcome:

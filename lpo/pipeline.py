@@ -9,6 +9,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from rich.console import Console
 
 from lpo import drift_figures, figures, report
@@ -28,7 +29,8 @@ from scb.environments.registry import environment_spec, make
 from scb.environments.zoo import bandit_metadata
 from scb.evolution import EvolutionConfig, Outcome, evolve
 from scb.runs import Run, Stopwatch, write_json
-from scb.seeds import reporting
+from scb.seeds import VALIDATING, reporting
+from scb.statistics import estimate
 
 PRESETS: dict[str, dict[str, Any]] = {
     "tiny": {
@@ -221,14 +223,13 @@ def meta_training_artefact(
 ) -> dict[str, Any]:
     """What a learned objective's .json says of its meta-training."""
     evolution: EvolutionConfig = problem.config.evolution
-    evaluations = evolution.num_generations * evolution.population_size
-    steps = problem.steps()
     judged = [
         {"generation": line["generation"], "fitness": value}
         for line in outcome.metrics
         for key, value in line.items()
         if key in ("mean/fitness", "final_mean/fitness")
     ]
+    end = outcome.validate(chosen_mean(problem.config, outcome))["fitness"]
     config = {"meta_training": _plain(problem.config), "settings": dict(settings)}
     bandits = [name for name in problem.tasks if environment_spec(name).is_bandit]
     if bandits:
@@ -236,22 +237,12 @@ def meta_training_artefact(
         config["bandit_sha256"] = {name: bandit_metadata(name)["sha256"] for name in bandits}
     return {
         "config": config,
-        "seeds": {"meta_training": evolution.seed},
-        "results": {"mean_fitness": judged},
-        "cost": {
-            "environment_steps_training": evaluations * steps.training,
-            "environment_steps_evaluation": evaluations * steps.evaluation,
-            **(
-                {
-                    "environment_steps_validation": problem.validation_steps().total,
-                    "generation": outcome.best_mean_generation,
-                }
-                if problem.config.validation
-                else {}
-            ),
-            "seconds": round(outcome.seconds, 1),
-            "machine": machine_description(),
+        "seeds": {"meta_training": evolution.seed, "validation": VALIDATING.start},
+        "results": {
+            "mean_fitness": judged,
+            "validation": estimate(end).as_dict() if np.isfinite(end).all() else None,
         },
+        "cost": outcome.cost(problem, evolution, best=problem.config.validation),
         "command": command,
     }
 

@@ -12,7 +12,6 @@ from gymnax.environments import environment as environments
 from rich.table import Column, Table
 
 from scb.agents.spec import algorithms_for, bandit_agent
-from scb.artefacts import machine_description
 from scb.command_line import LongRun, Output
 from scb.console import console
 from scb.discovery import (
@@ -146,8 +145,6 @@ class Discover(LongRun):
                 self.judgement.judge_agents,
                 self.judgement.judge_episodes,
             )
-        steps = problem.steps()
-        evaluations = config.evolution.num_generations * config.evolution.population_size
         metadata = {
             "config": {
                 "evaluation_environment": config.environment,
@@ -158,12 +155,8 @@ class Discover(LongRun):
             "seeds": {"discovery": config.evolution.seed, "validation": VALIDATING.start},
             "results": results,
             "cost": {
-                "environment_steps_training": evaluations * steps.training,
-                "environment_steps_evaluation": evaluations * steps.evaluation,
+                **outcome.cost(problem, config.evolution, best),
                 "warm_start": problem.warm_start_report,
-                "seconds": round(outcome.seconds, 1),
-                **({"generation": outcome.best_mean_generation} if best else {}),
-                "machine": machine_description(),
             },
             "command": self.command,
         }
@@ -279,11 +272,17 @@ def list_command() -> None:
         for algorithm in algorithms:
             result = metadata["results"].get(algorithm)
             cells.append("" if result is None else _cell(result))
-        minutes = f"{metadata['cost']['seconds'] / 60:.0f}"
+        minutes = f"{_seconds(metadata['cost'], metadata['config'].get('started_from')) / 60:.0f}"
         table.add_row(name, *cells, minutes)
     console().print(table)
     for name in zoo_names():
         print(f"{name}: {bandit_metadata(name)['command']}")
+
+
+def _seconds(cost: Mapping[str, Any], started_from: Mapping[str, Any] | None) -> float:
+    """Of a search, the warm start before it, and the searches that it goes on from."""
+    before = _seconds(started_from["cost"], started_from["started_from"]) if started_from else 0.0
+    return float(cost["seconds"] + cost.get("warm_start", {}).get("seconds", 0.0) + before)
 
 
 def _cell(result: Mapping[str, Any]) -> str:

@@ -421,6 +421,14 @@ class BanditDiscovery:
             evaluation=agents * evaluations * config.evaluation_episodes * limit,
         )
 
+    def judgement_steps(self) -> EnvironmentSteps:
+        """Of one agent of each algorithm, in episodes of the environment's own length."""
+        episodes = len(self.trainings) * self.config.evaluation_episodes
+        return EnvironmentSteps(
+            training=sum(t.spec.steps for t in self.trainings.values()),
+            evaluation=episodes * int(self.env_params.max_steps_in_episode),
+        )
+
 
 def standardize_reward(
     bandit: SyntheticBandit, weights: Weights, std: float, num_samples: int = 10_000
@@ -432,7 +440,14 @@ def standardize_reward(
     rewards = bandit.sample_rewards(
         bandit.params(weights), named_key(root_key(0), "reward scale"), num_samples
     )
-    factor = std / rewards.std()
+    spread = float(rewards.std())
+    # Of a constant, in 32 bits, some rounding is left.
+    if not spread > 1e-6 * max(1.0, float(jnp.abs(rewards).max())):
+        raise UserError(
+            f"the reward that the search starts from is {float(rewards.mean()):.4g} everywhere, and no factor gives it "
+            f"a standard deviation of {std}: leave reward_std out, or start from other weights."
+        )
+    factor = std / spread
     # Through the network's last layer, which is linear.
     reward = dict(weights["reward"])
     name = max(reward)

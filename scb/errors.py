@@ -11,6 +11,13 @@ class UserError(Exception):
     """
 
 
+def at_least(minimum: int, **values: float | None) -> None:
+    """Raises a UserError where one of the values, told by name, is smaller; None is left alone."""
+    for name, value in values.items():
+        if value is not None and not value >= minimum:
+            raise UserError(f"{name} is {value}: it must be at least {minimum}.")
+
+
 def unknown_name(kind: str, name: str, known: Iterable[str]) -> UserError:
     """The error for a name that nobody registered; near matches first, else all known names."""
     names = sorted(known)

@@ -18,16 +18,16 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import tyro
-from jax.experimental import multihost_utils
 from jax.sharding import NamedSharding, PartitionSpec
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from scipy.stats import rankdata
 
+from scb.artefacts import machine_description
 from scb.errors import UserError, unknown_name
 from scb.keys import key_at, root_key, split_key
 from scb.runs import Checkpoints, Run, Stopwatch
-from scb.seeds import searching
+from scb.seeds import VALIDATING, searching
 from scb.statistics import iqm
 
 # These take constructor arguments of their own that no common configuration can supply.
@@ -150,6 +150,9 @@ class Problem(Protocol):
     def steps(self) -> EnvironmentSteps:
         """Environment steps of one `evaluate`."""
 
+    def judgement_steps(self) -> EnvironmentSteps:
+        """Environment steps of one `evaluate_mean`."""
+
 
 @dataclass(frozen=True)
 class Outcome:
@@ -162,6 +165,8 @@ class Outcome:
       best_mean_generation: which one that was.
       metrics: the run's log.
       seconds: wall-clock of all generations.
+      validate: {"fitness": [N], ...} of a solution, by `evaluate_mean` with N = `mean_evaluations`
+        agents of validation seeds, which neither moved the search nor chose in it.
     """
 
     mean: Any
@@ -169,6 +174,27 @@ class Outcome:
     best_mean_generation: int
     metrics: list[dict[str, Any]]
     seconds: float
+    validate: Callable[[Any], dict[str, np.ndarray]]
+
+    def cost(self, problem: Problem, config: EvolutionConfig, best: bool) -> dict[str, Any]:
+        """What an artefact says of the search's cost; `best` where the mean judged best was taken."""
+        steps, evaluations = problem.steps(), config.num_generations * config.population_size
+        # The last mean is judged too; a strategy that keeps a population has none to begin with.
+        judgements = -(-config.num_generations // config.evaluate_mean_every) + has_mean(config)
+        agents = judgements * config.mean_evaluations
+        return {
+            "environment_steps_training": evaluations * steps.training,
+            "environment_steps_evaluation": evaluations * steps.evaluation,
+            "environment_steps_judgements": agents * problem.judgement_steps().total,
+            "seconds": round(self.seconds, 1),
+            **({"generation": self.best_mean_generation} if best else {}),
+            "machine": machine_description(),
+        }
+
+
+def has_mean(config: EvolutionConfig) -> bool:
+    """Whether the strategy has a mean; others keep a population, and have nothing to judge before the first tell."""
+    return config.strategy in evosax.algorithms.distribution_based_algorithms
 
 
 def combine_tasks(fitness: np.ndarray, how: str) -> np.ndarray:
@@ -190,27 +216,21 @@ def combine_tasks(fitness: np.ndarray, how: str) -> np.ndarray:
     return np.where(failed, np.nan, ranks)
 
 
-def rank_failed_last(fitness: np.ndarray) -> tuple[np.ndarray, int]:
-    """Replaces NaN and infinite fitness by a value below the worst finite one.
+def rank_failed_last(fitness: np.ndarray) -> np.ndarray:
+    """[N] fitness, not all of it failed, with a value below the worst finite one for NaN and infinities.
 
-    One NaN under a strategy that standardises would poison the mean for ever.
-
-    Returns:
-      ([N] finite fitness, number of failed candidates); all zeros where every candidate failed.
+    For the strategy alone: one NaN, where it standardises, would poison the mean for ever.
     """
     finite = np.isfinite(fitness)
-    failed = int(np.sum(~finite))
-    if failed == len(fitness):
-        return np.zeros_like(fitness), failed
     best, worst = fitness[finite].max(), fitness[finite].min()
     below = worst - max((best - worst) / len(fitness), 1e-6 * max(1.0, abs(worst)))
-    return np.where(finite, fitness, below), failed
+    return np.where(finite, fitness, below)
 
 
 def map_population(
     function: Callable[..., Any], size: int, in_axes: tuple[int | None, ...]
 ) -> Callable[..., Any]:
-    """`jit(vmap(function))` whose mapped axis is spread over all devices, with results as numpy arrays on every host.
+    """`jit(vmap(function))` whose mapped axis is spread over all devices, with results as numpy arrays.
 
     Each device runs its part alone: no collective inside, so a device that is late holds nobody up,
     and a vmapped `while_loop` ends when the device's own part has ended. A size that the devices
@@ -221,7 +241,7 @@ def map_population(
       size: length of the mapped axes, which are all first axes.
       in_axes: 0 for arguments with one entry a member, None for those that all share.
     """
-    devices = jax.devices()[: max(size, jax.process_count())]
+    devices = jax.devices()[:size]
     mesh = jax.sharding.Mesh(np.array(devices), ("population",))
     padded = np.arange(-(-size // len(devices)) * len(devices)) % size
     specs = tuple(
@@ -243,10 +263,8 @@ def map_population(
         return jax.device_put(argument, NamedSharding(mesh, spec))
 
     def call(*arguments: Any) -> Any:
-        results = mapped(*map(place, arguments, in_axes, specs))
-        if jax.process_count() > 1:
-            results = multihost_utils.process_allgather(results, tiled=True)
-        return jax.tree.map(lambda x: x[:size], jax.device_get(results))
+        results = jax.device_get(mapped(*map(place, arguments, in_axes, specs)))
+        return jax.tree.map(lambda x: x[:size], results)
 
     return call
 
@@ -256,7 +274,7 @@ class _Strategy:
 
     def __init__(self, config: EvolutionConfig, solution: Any) -> None:
         algorithm = STRATEGIES[config.strategy]
-        self.has_mean = config.strategy in evosax.algorithms.distribution_based_algorithms
+        self.has_mean = has_mean(config)
         arguments: dict[str, Any] = {}
         accepted = algorithm.__init__.__annotations__
         scheduled = "std_schedule" in accepted
@@ -370,16 +388,18 @@ def evolve(
     total_seconds = 0.0
     watch = Stopwatch()
 
+    def judged(solution: Any, key: jax.Array) -> dict[str, np.ndarray]:
+        return dict(evaluate_mean(solution, split_key(key, config.mean_evaluations)))
+
     def judge_mean(generation: int) -> dict[str, float]:
         mean = strategy.mean(state["strategy"])
         # The same seeds at every judgement: means of different generations are then compared in
         # pairs.
-        keys = split_key(key_mean, config.mean_evaluations)
-        judged = evaluate_mean(mean, keys)
-        outcome = {name: float(np.mean(v)) for name, v in judged.items()}
+        returns = judged(mean, key_mean)
+        outcome = {name: float(np.mean(v)) for name, v in returns.items()}
         # The interquartile mean too: of agents with random hyperparameters a few fail far below the rest.
         middles = {
-            f"{name}_iqm": float(iqm(v)) for name, v in judged.items() if np.isfinite(v).all()
+            f"{name}_iqm": float(iqm(v)) for name, v in returns.items() if np.isfinite(v).all()
         }
         score = middles.get("fitness_iqm", -np.inf)
         if score > float(state["best_mean_fitness"]):
@@ -392,8 +412,8 @@ def evolve(
         for generation in range(first, config.num_generations):
             key_ask, key_evaluate, key_tell = split_key(key_at(key_generations, generation), 3)
             metrics: dict[str, Any] = {}
-            if generation % config.evaluate_mean_every == 0 and strategy_is_ready(
-                strategy, generation
+            if generation % config.evaluate_mean_every == 0 and (
+                strategy.has_mean or generation > 0
             ):
                 metrics |= judge_mean(generation)
             population, state["strategy"] = strategy.ask(key_ask, state["strategy"])
@@ -403,17 +423,21 @@ def evolve(
             tasks = np.asarray(results.pop("fitness"), np.float32).reshape(
                 config.population_size, -1
             )
-            fitness, failed = rank_failed_last(tasks.mean(axis=1))
-            if failed < len(fitness):
-                told, _ = rank_failed_last(combine_tasks(tasks, config.combine))
+            fitness = tasks.mean(axis=1)
+            # What failed has no fitness: it is counted, and the log's numbers are of the others.
+            finite = fitness[np.isfinite(fitness)]
+            if finite.size:
+                told = rank_failed_last(combine_tasks(tasks, config.combine))
                 state["strategy"] = strategy.tell(key_tell, population, told, state["strategy"])
+                metrics |= {
+                    "fitness/mean": finite.mean(),
+                    "fitness/std": finite.std(),
+                    "fitness/max": finite.max(),
+                    "fitness/min": finite.min(),
+                }
             done = (generation + 1) * config.population_size
             metrics |= {
-                "fitness/mean": fitness.mean(),
-                "fitness/std": fitness.std(),
-                "fitness/max": fitness.max(),
-                "fitness/min": fitness.min(),
-                "failed": failed,
+                "failed": config.population_size - finite.size,
                 "steps/training": done * steps.training,
                 "steps/evaluation": done * steps.evaluation,
                 "steps/total": done * steps.total,
@@ -443,12 +467,8 @@ def evolve(
         best_mean_generation=int(state["best_mean_generation"]),
         metrics=run.metrics() if run else history,
         seconds=run.seconds() if run else total_seconds,
+        validate=lambda solution: judged(solution, root_key(VALIDATING.start)),
     )
-
-
-def strategy_is_ready(strategy: _Strategy, generation: int) -> bool:
-    """Whether the strategy has a solution to judge: those that keep a population have none before the first tell."""
-    return strategy.has_mean or generation > 0
 
 
 class _progress:
@@ -476,11 +496,10 @@ class _progress:
         self._done += 1
         self._seconds = [*self._seconds, seconds][-20:]
         judged = [v for k, v in metrics.items() if k.endswith("mean/fitness")]
-        text = f"fitness {metrics['fitness/mean']:.4g}" + (
-            f", mean {judged[-1]:.4g}" if judged else ""
-        )
-        if metrics["failed"]:
-            text += f", {metrics['failed']} failed"
+        parts = [f"fitness {metrics['fitness/mean']:.4g}"] if "fitness/mean" in metrics else []
+        parts += [f"mean {value:.4g}" for value in judged[-1:]]
+        parts += [f"{metrics['failed']} failed"] if metrics["failed"] else []
+        text = ", ".join(parts)
         self._bar.update(self._task, advance=1, fitness=text)
         milestone = judged or self._done in (1, self._total)
         if not self._console.is_terminal and milestone:

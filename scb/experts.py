@@ -186,6 +186,10 @@ class _PolicySearch:
     def steps(self) -> EnvironmentSteps:
         return EnvironmentSteps(training=0, evaluation=self.config.episodes * self.longest)
 
+    def judgement_steps(self) -> EnvironmentSteps:
+        limit = int(self.env_params.max_steps_in_episode)
+        return EnvironmentSteps(training=0, evaluation=self.config.episodes * limit)
+
 
 def evolve_expert(
     env: environment.Environment[Any, Any],

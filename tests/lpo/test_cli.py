@@ -125,6 +125,7 @@ def test_a_number_out_of_range_is_told_its_range(refused, arguments, message):
         ("meta-train --environment a --tasks b,c", "the environment a and the tasks b,c are both"),
         ("meta-train --horizons 0.5,x", "horizons '0.5,x' are no numbers"),
         ("align --bandits Pendulum-v1", "'Pendulum-v1' is none"),
+        ("align --agents -4", "agents is -4: it must be at least 1."),
         ("align --contexts 0", "contexts is 0: it must be at least 1."),
         ("evaluate --objectives", "no objectives: give at least one"),
         ("evaluate --objectives ppo ppo", "objective 'ppo' is there twice"),

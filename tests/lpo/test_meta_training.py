@@ -312,10 +312,9 @@ def test_validation_judges_the_mean_on_the_environment_and_the_search_never_sees
     # A pendulum that hangs, and not one reward of the bandit.
     assert WORST_PENDULUM_RETURN < min(judged) <= max(judged) < -100
     np.testing.assert_array_equal(outcome.mean["output"], plain.mean["output"])
-    # Judged twice, before and after two generations, by two agents: 20 steps, and 2 episodes of 200.
-    steps = MetaTraining(validated).validation_steps()
-    assert (steps.training, steps.evaluation) == (4 * 20, 4 * 2 * 200)
-    assert MetaTraining(config).validation_steps().total == 0
+    # An agent that judges: 20 steps, and 2 episodes of 200.
+    steps = MetaTraining(validated).judgement_steps()
+    assert (steps.training, steps.evaluation) == (20, 2 * 200)
 
 
 def test_several_environments_validate_by_their_normalised_scores(config):

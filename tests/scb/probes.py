@@ -171,6 +171,9 @@ class Parabola:
     def steps(self) -> EnvironmentSteps:
         return EnvironmentSteps(training=10, evaluation=3)
 
+    def judgement_steps(self) -> EnvironmentSteps:
+        return EnvironmentSteps(training=7, evaluation=2)
+
 
 @contextmanager
 def small_agents() -> Iterator[None]:

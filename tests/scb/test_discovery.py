@@ -17,6 +17,7 @@ from scb.discovery import (
     check_fits,
     discover,
     judge,
+    standardize_reward,
 )
 from scb.environments.registry import make
 from scb.environments.synthetic import BanditConfig, SyntheticBandit, bandit_for
@@ -528,6 +529,11 @@ def test_the_starts_reward_can_be_standardized(environment):
     # 5000 other samples know the mean to 8 / sqrt(5000) = 0.11 and the deviation to 1 %.
     assert abs(rewards[1].mean()) < 0.5
     assert rewards[1].std() == pytest.approx(8.0, rel=0.05)
+    constant = {**plain, "reward": jax.tree.map(jnp.zeros_like, plain["reward"])}
+    last = constant["reward"][max(constant["reward"])]
+    last["bias"] = last["bias"] + 1.1
+    with pytest.raises(UserError, match=r"is 1\.1 everywhere, and no factor gives it"):
+        standardize_reward(bandit, constant, 8.0)
     # An affine function of the same reward in the same contexts.
     slope, offset = np.polyfit(rewards[0], rewards[1], 1)
     np.testing.assert_allclose(rewards[1], slope * rewards[0] + offset, atol=1e-3)
