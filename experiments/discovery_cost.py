@@ -24,6 +24,7 @@ from experiments.zoo_table_page import ENVIRONMENTS, TARGETS, label
 from scb import plotting
 from scb.cli import configure_jax
 from scb.discovery import DiscoveryConfig
+from scb.environments.registry import environment_spec
 from scb.errors import UserError
 from scb.runs import read_config
 
@@ -144,7 +145,7 @@ def _by_algorithm(row: Mapping[str, Any], prefix: str) -> dict[str, float]:
 
 def _warm_start(folder: Path, environment: str) -> dict[str, Any]:
     """What the warm start took, as the run's bandit says it; None where that is unknown."""
-    path = folder / f"Synthetic-{environment}.json"
+    path = folder / f"{environment_spec(environment).bandit}.json"
     unknown: dict[str, Any] = {"steps": None, "minutes": None, "machine": None}
     if not path.is_file():
         return unknown

@@ -25,12 +25,9 @@ from scb.environments.registry import environment_spec, make
 from scb.environments.synthetic import SyntheticBandit, Weights
 from scb.environments.synthetic_mdp import SyntheticMDP
 from scb.environments.zoo import (
-    PREFIX,
     bandit_metadata,
-    load,
-    open_bandit,
-    save_bandit,
-    save_synthetic_mdp,
+    open_synthetic,
+    save,
     zoo_names,
 )
 from scb.errors import UserError
@@ -129,6 +126,7 @@ class Discover(LongRun):
         # The problem first: where a name is wrong, no folder is left behind to be in the next try's way.
         problem = BanditDiscovery(self.config)
         config, best = problem.config, self.config.select == "best"
+        spec = environment_spec(config.environment)
         folder = self.open()
         outcome = evolve(problem, config.evolution, folder)
         folder.close()
@@ -148,7 +146,7 @@ class Discover(LongRun):
         metadata = {
             "config": {
                 "evaluation_environment": config.environment,
-                "backend": getattr(problem.env, "backend", None),
+                "backend": spec.physics(config.backend),
                 "discovery": config_dict(config),
                 "started_from": None if config.start is None else _origin(config.start),
             },
@@ -160,11 +158,7 @@ class Discover(LongRun):
             },
             "command": self.command,
         }
-        path = folder.folder / f"{PREFIX}{config.environment}.npz"
-        if isinstance(problem.bandit, SyntheticBandit):
-            path = save_bandit(path, problem.bandit, weights, metadata)
-        else:
-            path = save_synthetic_mdp(path, problem.bandit, weights, metadata)
+        path = save(folder.folder / f"{spec.bandit}.npz", problem.bandit, weights, metadata)
         console().print(f"bandit: {path}", soft_wrap=True)
 
 
@@ -240,10 +234,8 @@ def train(
             raise UserError(f"{name} is {value}: give at least 1.")
     if seed < 0:
         raise UserError(f"seed is {seed}: it must be 0 or larger.")
-    loaded: SyntheticBandit | SyntheticMDP = (
-        load(bandit) if bandit.endswith(".npz") else open_bandit(bandit)
-    )
-    target = evaluation_environment or loaded.name.removeprefix(PREFIX)
+    loaded = open_synthetic(bandit)
+    target = evaluation_environment or environment_spec(bandit).evaluation_environment
     env, env_params = make(target, backend)
     check_fits(loaded, env, env_params, target)
     spec = bandit_agent(algorithm, target, not fixed_hyperparameters)

@@ -36,7 +36,7 @@ from scb.curriculum import (
     read_curriculum,
     with_limit,
 )
-from scb.environments.registry import make
+from scb.environments.registry import environment_spec, make
 from scb.environments.synthetic import (
     BanditConfig,
     SyntheticBandit,
@@ -282,7 +282,7 @@ class BanditDiscovery:
             self.env_params,
             config.parameterization,
             config.bandit,
-            f"Synthetic-{config.environment}",
+            environment_spec(config.environment).bandit,
             config.max_steps,
         )
         self.trainings = {

@@ -15,9 +15,9 @@ import numpy as np
 import tyro
 
 from scb.artefacts import read_arrays, unflatten
-from scb.environments.registry import make
+from scb.environments.registry import environment_spec, make
 from scb.environments.synthetic import BanditConfig, SyntheticBandit, Weights, bandit_for
-from scb.environments.zoo import PREFIX, save_bandit
+from scb.environments.zoo import save_bandit
 from scb.errors import UserError, unknown_name
 
 # The release's name of a bandit -> its evaluation environment.
@@ -61,7 +61,7 @@ def published_bandit(path: str | Path, environment: str | None = None) -> Synthe
     _check_is_npz(path)
     home = _environment_of(path) if environment is None else environment
     env, env_params = make(home)
-    bandit = bandit_for(env, env_params, _CONFIG, f"{PREFIX}{home}")
+    bandit = bandit_for(env, env_params, _CONFIG, environment_spec(home).bandit)
     arrays = _arrays(path)
     _check_arrays(path, arrays, bandit, home)
     # Checked above to be exactly what `Weights` is.
@@ -93,7 +93,7 @@ def import_published(source: str | Path, out: str | Path) -> list[Path]:
             Path(out) / f"{bandit.name}.npz",
             bandit,
             bandit.default_params.weights,
-            _metadata(path, bandit),
+            _metadata(path),
         )
         for path, bandit in bandits
     ]
@@ -188,9 +188,9 @@ def _check_arrays(
             )
 
 
-def _metadata(path: Path, bandit: SyntheticBandit) -> dict[str, Any]:
+def _metadata(path: Path) -> dict[str, Any]:
     return {
-        "config": {"evaluation_environment": bandit.name.removeprefix(PREFIX)},
+        "config": {"evaluation_environment": _environment_of(path)},
         # The release says none of these.
         "seeds": {},
         "results": {},

@@ -16,9 +16,9 @@ from scb.analysis.planes import observation_names, plane_for
 from scb.analysis.states import bandit_states, follow
 from scb.console import console
 from scb.discovery import check_fits
-from scb.environments.registry import make
+from scb.environments.registry import environment_spec, make
 from scb.environments.synthetic import SyntheticBandit
-from scb.environments.zoo import PREFIX, open_bandit
+from scb.environments.zoo import open_bandit
 from scb.errors import UserError
 from scb.keys import root_key, split_key
 from scb.runs import make_folder, write_json
@@ -124,7 +124,7 @@ def explain_command(
     if seed < 0:
         raise UserError(f"seed is {seed}: it must be 0 or larger.")
     loaded = open_bandit(bandit)
-    target = evaluation_environment or loaded.name.removeprefix(PREFIX)
+    target = evaluation_environment or environment_spec(bandit).evaluation_environment
     env, env_params = make(target, backend)
     check_fits(loaded, env, env_params, target)
     folder = Path("runs") / "explain" / loaded.name if out is None else out

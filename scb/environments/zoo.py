@@ -46,8 +46,7 @@ class SyntheticFamily(Family):
         return name.endswith(".npz") or super().owns(name)
 
     def make(self, name: str, **arguments: Any) -> Made:
-        opened = load if name.endswith(".npz") else open_bandit
-        synthetic = opened(name, **arguments)  # which takes none, and says so
+        synthetic = open_synthetic(name, **arguments)  # which takes none, and says so
         return synthetic, synthetic.default_params
 
     def facts(self, name: str) -> Mapping[str, Any]:
@@ -62,11 +61,6 @@ def _evaluation_environment(metadata: Mapping[str, Any]) -> str | None:
     if stated is None and named in environment_names():
         return named
     return stated
-
-
-def home_of(name: str) -> str | None:
-    """The evaluation environment of a bandit; None where it isn't a bandit's."""
-    return environment_spec(name).stands_for
 
 
 def register_zoo() -> None:
@@ -153,6 +147,23 @@ def open_bandit(name: str) -> SyntheticBandit:
     if name not in zoo_names():
         raise unknown_name("bandit", name, [*zoo_names(), "path/to/bandit.npz"])
     return _make_zoo_bandit(name)
+
+
+def open_synthetic(name: str) -> SyntheticBandit | SyntheticMDP:
+    """A bandit by zoo name, or a bandit or synthetic MDP by file."""
+    return load(name) if name.endswith(".npz") else open_bandit(name)
+
+
+def save(
+    path: str | Path,
+    synthetic: SyntheticBandit | SyntheticMDP,
+    weights: Weights,
+    metadata: Mapping[str, Any],
+) -> Path:
+    """Writes a bandit or a synthetic MDP: `save_bandit` or `save_synthetic_mdp`."""
+    if isinstance(synthetic, SyntheticMDP):
+        return save_synthetic_mdp(path, synthetic, weights, metadata)
+    return save_bandit(path, synthetic, weights, metadata)
 
 
 def save_bandit(

@@ -1,6 +1,8 @@
 """Learning an objective: what a candidate is worth, what it costs, and where the noise goes."""
 
+import shutil
 from dataclasses import replace
+from importlib import resources
 
 import jax
 import jax.numpy as jnp
@@ -168,6 +170,16 @@ def test_the_inner_loop_on_a_bandit_keeps_the_number_of_updates():
     assert (here.num_iterations, here.batch_size) == (15, 200)
     for name in ("num_epochs", "num_minibatches", "hidden_sizes", "activation"):
         assert getattr(here, name) == getattr(there, name)
+
+
+def test_a_renamed_bandit_is_trained_in_as_before(tmp_path):
+    with resources.as_file(resources.files("scb") / "zoo") as folder:
+        for end in ("npz", "json"):
+            shutil.copy(folder / f"{PENDULUM}.{end}", tmp_path / f"mine.{end}")
+    renamed = str(tmp_path / "mine.npz")
+    assert task_agent(renamed, 200) == task_agent(PENDULUM, 200)
+    config = MetaTrainingConfig(tasks=(renamed,), fitness="transfer")
+    assert config.homes == config.judged_in == ("Pendulum-v1",)
 
 
 @pytest.mark.parametrize("environment", ["Synthetic-Pendulum-v1", "Pendulum-v1"])

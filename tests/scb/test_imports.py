@@ -64,3 +64,13 @@ def test_no_module_imports_what_lies_above_it(package):
 @pytest.mark.parametrize("package", MODULES)
 def test_no_package_imports_its_tests(package):
     assert not any("tests" in imported(path.read_text()) for path in MODULES[package])
+
+
+def test_what_a_family_is_made_of_is_known_to_its_adapter_alone():
+    # Everything else asks `environment_spec`. Brax's viewer takes Brax's environments.
+    adapters = {"scb.environments.brax", "scb.environments.gymnax"}
+    allowed = {"scb/environments/__init__.py", "scb/analysis/animation.py"}
+    for path in (path for paths in MODULES.values() for path in paths):
+        nodes = ast.walk(ast.parse(path.read_text()))
+        names = {node.module for node in nodes if isinstance(node, ast.ImportFrom)}
+        assert str(path.relative_to(ROOT)) in allowed or not names & adapters, path
