@@ -8,7 +8,8 @@ distribution's mean, checkpoints, resume, and logs.
 
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Annotated, Any, Protocol
 
 import evosax.algorithms
@@ -332,6 +333,27 @@ class _Strategy:
         return self._algorithm._unravel_solution(state.best_solution)
 
 
+def _strategy(config: EvolutionConfig, solution: Any) -> _Strategy:
+    """One for all searches that differ in nothing it sees: evosax compiles anew for every algorithm made."""
+    leaves, structure = jax.tree.flatten(solution)
+    shapes = tuple((np.shape(leaf), jnp.result_type(leaf)) for leaf in leaves)
+    config = replace(
+        config,
+        num_generations=1,
+        combine="mean",
+        mean_evaluations=1,
+        evaluate_mean_every=1,
+        checkpoint_every=1,
+        seed=0,
+    )
+    return _shared_strategy(config, structure, shapes)
+
+
+@lru_cache(maxsize=8)
+def _shared_strategy(config: EvolutionConfig, structure: Any, shapes: Any) -> _Strategy:
+    return _Strategy(config, jax.tree.unflatten(structure, [jnp.zeros(*x) for x in shapes]))
+
+
 def evolve(
     problem: Problem,
     config: EvolutionConfig,
@@ -359,7 +381,7 @@ def evolve(
     key = root_key(config.seed) if key is None else key
     key_solution, key_strategy, key_generations, key_mean = split_key(key, 4)
     solution = problem.initial_solution(key_solution)
-    strategy = _Strategy(config, solution)
+    strategy = _strategy(config, solution)
     state = {
         "strategy": strategy.start(key_strategy, solution),
         "best_mean": solution,

@@ -304,10 +304,11 @@ def test_in_the_mode_sequential_a_generation_trains_the_algorithm_whose_turn_it_
         np.testing.assert_array_equal(actual, expected)
 
 
-def test_in_the_mode_sequential_the_others_are_not_run(trained_in_turns):
+def test_in_the_mode_sequential_the_others_are_not_run():
     # The turn stays a branch over a population; as a choice of results it would run all of them.
-    _, problem, outcome = trained_in_turns
-    population = jax.tree.map(lambda x: jnp.stack([x, x]), outcome.mean)
+    problem = BanditDiscovery(SEQUENTIAL)
+    start = problem.initial_solution(jax.random.key(0))
+    population = jax.tree.map(lambda x: np.stack([x, x]), start)
     evaluate = jax.vmap(problem.evaluate, in_axes=(0, None, None))
     program = jax.make_jaxpr(evaluate)(population, jax.random.key(0), jnp.int32(0))
     branches = [
@@ -319,6 +320,7 @@ def test_in_the_mode_sequential_the_others_are_not_run(trained_in_turns):
     assert [len(of_turn) for of_turn in branches] == [2]
 
 
+@pytest.mark.slow
 def test_in_the_mode_sequential_the_mean_is_judged_by_every_algorithm(trained_in_turns):
     judged = trained_in_turns[2].metrics[0]
     both = judged["mean/fitness/ppo"] + judged["mean/fitness/dqn"]
