@@ -1,148 +1,160 @@
-"""The paper's experiments: what there is, and all of them in one go.
+"""The paper's experiments: what there is, one of them, or all of them in one go.
 
     python -m experiments --list
+    python -m experiments lemma --preset paper
     python -m experiments --preset quick
 
-The second runs every experiment of the paper with a preset, continues what was interrupted, keeps what
+The last runs every experiment of the paper with a preset, continues what was interrupted, keeps what
 has the paper's size already, and writes docs/experiments.md, which says of each what the paper claims
 and what was found.
 """
 
-import argparse
 import importlib
 import pkgutil
 import sys
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, Literal
 
-from experiments import page
-from experiments.page import Experiment
+import tyro
+
+from experiments import claims, harness, rendering
+from experiments.harness import DATA, DOCS, Experiment, Files, Preset
+from scb.cli import configure_jax
 from scb.errors import UserError
 from scb.runs import make_folder
 
 
-def modules() -> list[str]:
-    """Names of the modules that are commands."""
-    folder = Path(__file__).parent
-    names = (m.name for m in pkgutil.iter_modules([str(folder)]))
-    return [
-        n
-        for n in names
-        if n not in ("__main__", "page", "rejax_peer", "searches", "zoo_table_page")
-    ]
+@dataclass(frozen=True)
+class All:
+    """What all experiments of the paper are run with."""
+
+    list: bool = False
+    """what there is, and how long it takes"""
+    preset: Literal["quick", "paper"] = "quick"
+    """quick has fewer runs or steps than the paper"""
+    only_render: bool = False
+    """measure nothing"""
+    data: Path = DATA
+    """for the reports"""
+    docs: Path = DOCS
+    """for pages and figures"""
 
 
 def found() -> dict[str, Experiment]:
-    """{name: experiment} of the paper."""
-    loaded = {name: importlib.import_module(f"experiments.{name}") for name in modules()}
-    return {name: m.EXPERIMENT for name, m in loaded.items() if hasattr(m, "EXPERIMENT")}
+    """{name: experiment} of all modules that have one."""
+    folder = Path(__file__).parent
+    names = [m.name for m in pkgutil.iter_modules([str(folder)])]
+    # The one is this module, the other runs under another Python.
+    others = [x for x in names if x not in ("__main__", "rejax_peer")]
+    modules = (importlib.import_module(f"experiments.{name}") for name in others)
+    return {m.EXPERIMENT.name: m.EXPERIMENT for m in modules if hasattr(m, "EXPERIMENT")}
+
+
+def of_the_paper() -> list[Experiment]:
+    """Those with a claim of the paper."""
+    return [x for x in found().values() if x.presets]
 
 
 def listing() -> str:
     """What `--list` prints."""
-    experiments = found()
-    lines = ["The paper's experiments (python -m experiments.NAME --preset quick|paper):", ""]
-    for name, experiment in experiments.items():
-        minutes = ", ".join(
-            f"{p} {m} min" if m.isdigit() else f"{p} {m}" for p, m in experiment.minutes.items()
-        )
+    lines = ["The paper's experiments (python -m experiments NAME --preset quick|paper):", ""]
+    for experiment in of_the_paper():
+        takes = (experiment.minutes or {}).items()
+        minutes = ", ".join(f"{p} {m} min" if m.isdigit() else f"{p} {m}" for p, m in takes)
         lines += [
-            f"  {name}: {experiment.title}",
+            f"  {experiment.name}: {experiment.title}",
             f"    {experiment.paper}; on two cores {minutes}; {experiment.needs or 'needs nothing more'}",
         ]
     lines += ["", "Others (--help says what they take):", ""]
-    for name in modules():
-        if name not in experiments:
-            document = importlib.import_module(f"experiments.{name}").__doc__ or ""
-            lines.append(f"  {name}: {document.splitlines()[0]}")
-    return "\n".join(lines)
+    others = [x for x in found().values() if not x.presets]
+    return "\n".join(lines + [f"  {x.name}: {x.description().splitlines()[0]}" for x in others])
 
 
 def overview(experiments: Sequence[Experiment], data: Path) -> str:
     """The page with all verdicts, from the reports that there are."""
-    rows, sections = [], []
+    sections: list[dict[str, Any]] = []
     for experiment in experiments:
         path = data / f"{experiment.name}.json"
         if not path.exists():
             continue
+        entry: dict[str, Any] = {"experiment": experiment, "outcome": ""}
+        sections.append(entry)
         try:
-            report = page.read(path)
+            report = harness.read(path)
         except UserError:
-            sections += [f"## {experiment.title}", "", "Its report cannot be read.", ""]
+            entry["problem"] = "Its report cannot be read."
             continue
-        if not page.complete(report):
-            sections += [f"## {experiment.title}", "", "Measured in part only.", ""]
+        if not harness.complete(report):
+            entry["problem"] = "Measured in part only."
             continue
-        link = f"[{experiment.title}]({experiment.name}.md)"
-        outcome = experiment.outcome(report)
-        rows.append([link, experiment.paper, outcome, report["preset"]])
-        sections += [
-            f"## {link}",
-            "",
-            f"**The paper** ({experiment.paper}): {experiment.claim}",
-            "",
-            f"**Here** (preset {report['preset']}) it {page.said(outcome)}: "
-            f"{experiment.verdict(report)}",
-            "",
-            f"![{experiment.title}](figures/{experiment.name}.png)",
-            "",
-        ]
-    head = ["experiment", "in the paper", "its claim here", "preset"]
-    summary = [*page.table(head, rows), ""] if rows else []
-    title = ["# The paper's experiments", "", "`python -m experiments --preset quick`", ""]
-    return "\n".join([*title, *summary, *sections])
+        outcome = claims.outcome(experiment.judged(report))
+        entry |= {
+            "report": report,
+            "outcome": outcome,
+            "verdict": experiment.block("verdict", report),
+        }
+    rows = [entry for entry in sections if entry["outcome"]]
+    return rendering.template("experiments").render(rows=rows, sections=sections)
 
 
 def _is_whole_paper(out: Path) -> bool:
-
     try:
-        report = page.read(out, missing_is_new=True)
+        report = harness.read(out, missing_is_new=True)
     except UserError:
         return False  # the experiment says so itself
-    return report.get("preset") == "paper" and page.complete(report)
+    return report.get("preset") == "paper" and harness.complete(report)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """The command."""
-    parser = argparse.ArgumentParser(
+    given = list(sys.argv[1:] if argv is None else argv)
+    if given and not given[0].startswith("-"):
+        name, *rest = given
+        if (experiment := found().get(name)) is None:
+            names = ", ".join(found())
+            print(f"experiments: no experiment {name!r}: choose from {names}.", file=sys.stderr)
+            return 2
+        return experiment.main(rest)
+    arguments = tyro.cli(
+        tyro.conf.FlagCreatePairsOff[All],
+        args=given,
         prog="python -m experiments",
         description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("--list", action="store_true", help="what there is, and how long it takes")
-    parser.add_argument("--preset", choices=("quick", "paper"), default="quick")
-    parser.add_argument("--only-render", action="store_true", help="measure nothing")
-    parser.add_argument("--data", type=Path, default=page.DATA, help="for the reports")
-    parser.add_argument("--docs", type=Path, default=page.DOCS, help="for pages and figures")
-    arguments = parser.parse_args(argv)
     if arguments.list:
         print(listing())
         return 0
-    return page.exit_status("experiments", lambda: _all(arguments))
+    configure_jax()
+    return harness.exit_status("experiments", lambda: _all(arguments))
 
 
-def _all(arguments: argparse.Namespace) -> int:
-
-    experiments = found()
-    reports = [arguments.data / f"{name}.json" for name in experiments]
-    if arguments.only_render and not any(path.exists() for path in reports):
+def _all(arguments: All) -> int:
+    experiments = of_the_paper()
+    reports = {x.name: arguments.data / f"{x.name}.json" for x in experiments}
+    if arguments.only_render and not any(path.exists() for path in reports.values()):
         raise UserError(f"{arguments.data} holds no report of an experiment: measure first.")
     make_folder(arguments.docs, "--docs")
-    failed = []
-    for name, experiment in experiments.items():
-        out = arguments.data / f"{name}.json"
+    failed = False
+    for experiment in experiments:
+        out = reports[experiment.name]
         if arguments.only_render and not out.exists():
             continue
         # What was measured at the paper's size is worth more than the quick preset.
         kept = arguments.preset == "quick" and _is_whole_paper(out)
-        print(f"{name} ..." + (" kept: it has the paper's size" if kept else ""), flush=True)
-        flags = ["--preset", arguments.preset, "--out", str(out), "--docs", str(arguments.docs)]
-        if arguments.only_render or kept:
-            flags.append("--only-render")
-        if page.main(experiment, flags):
-            failed.append(name)
-    text = overview(list(experiments.values()), arguments.data)
-    (arguments.docs / "experiments.md").write_text(text)
+        note = " kept: it has the paper's size" if kept else ""
+        print(f"{experiment.name} ...{note}", flush=True)
+        files = Files(out, arguments.docs, arguments.only_render or kept)
+        options = Preset(arguments.preset)
+
+        def run(
+            experiment: Experiment = experiment, options: Preset = options, files: Files = files
+        ) -> int:
+            return experiment.run(options, files)
+
+        failed |= bool(harness.exit_status(experiment.name, run))
+    (arguments.docs / "experiments.md").write_text(overview(experiments, arguments.data))
     print(f"written: {arguments.docs / 'experiments.md'}")
     return 2 if failed else 0
 

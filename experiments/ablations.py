@@ -7,7 +7,6 @@ learned (T the transition, I the initial state, C with a curriculum), the latent
 curriculum's shape. Run folders are under runs/ablations and are resumed.
 """
 
-import sys
 from collections.abc import Mapping
 from typing import Any
 
@@ -15,11 +14,12 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from experiments import searches
-from experiments.page import Experiment, Save, table
-from experiments.page import main as run
+from experiments.claims import OF_THE_WAY, TENTH, Claim
+from experiments.harness import Experiment, Report, Save
 from experiments.searches import ENOUGH, NONE, PAPER_SIZES, Final
 from scb import plotting
 from scb.discovery import DiscoveryConfig
+from scb.environments.registry import environment_spec
 from scb.environments.synthetic import BanditConfig
 
 ENVIRONMENTS = ("Pendulum-v1", "MountainCar-v0")
@@ -106,145 +106,60 @@ def _never_reached(report: Mapping[str, Any], environment: str, search: str) -> 
     return environment in WORST and bool(means) and max(means) <= WORST[environment]
 
 
-def _rows(report: Mapping[str, Any], environment: str) -> dict[str, dict[str, Final]]:
-    """{row of the figure: {label: what its searches were worth}}."""
-    return {
-        row: {label: finals(report, environment, search) for label, search in labels.items()}
-        for row, labels in rows(environment).items()
-    }
-
-
 def _goal_unseen(report: Mapping[str, Any], environment: str) -> bool:
     """Whether no agent of any search ever reached the goal."""
     return all(_never_reached(report, environment, x) for x in searches_of(environment))
 
 
-def _few(report: Mapping[str, Any], environment: str) -> bool:
-    return int(report["plan"]["environments"][environment]["seeds"]) < ENOUGH
+def claims(report: Report) -> list[Claim]:
+    """For each environment: TI above T, I not below TI, continuous latents; then T's goal and every curriculum."""
+    return [claim for environment in ENVIRONMENTS for claim in _claims_of(report, environment)]
 
 
-def _continuous_better(found: Mapping[str, Final]) -> bool:
-    """Whether every continuous latent is clearly better than every categorical one."""
-    categorical = {label for label in found if "categorical" in label}
-    return all(
-        found[x].clearly_above(found[y]) for x in found.keys() - categorical for y in categorical
-    )
+def _claims_of(report: Report, environment: str) -> list[Claim]:
+    curves, untold = report["environments"][environment], _goal_unseen(report, environment)
+    spec = environment_spec(environment)
+    tenth = round(TENTH * (spec.reference_return() - spec.random_return()), 1)
 
+    def above(text: str, row: str, label: str, other: str, margin: float = 0.0) -> Claim:
+        one, than = (curves[rows(environment)[row][x]] for x in (label, other))
+        evidence = None if untold else searches.difference(one, than, np.mean)
+        reason = OF_THE_WAY if margin else ""
+        return Claim(f"{environment}: {text}", evidence, 0.0, margin, reason, places=0)
 
-def _helpful(found: Mapping[str, Final]) -> list[str]:
-    """The curricula that are clearly better than none."""
-    return [x for x, e in found.items() if e.clearly_above(found[NONE])]
-
-
-def parts(report: Mapping[str, Any]) -> list[bool | None]:
-    """For each environment: TI above T, I not below TI, continuous latents; then T's goal and every curriculum.
-
-    None where there are too few searches, or none that got anywhere.
-    """
-    told: list[bool | None] = []
-    for environment in ENVIRONMENTS:
-        found = _rows(report, environment)
-        learned = found["what is learned"]
-        of_it: list[bool | None] = [
-            learned["TI"].clearly_above(learned["T"]),
-            not learned["TI"].clearly_above(learned["I"]),
-            _continuous_better(found["latent"]),
+    found = [
+        above("TI is better than T", "what is learned", "TI", "T"),
+        above("I is no worse than TI", "what is learned", "I", "TI", tenth),
+    ]
+    for latent in ("normal", "uniform"):
+        for other in ("categorical, equal", "categorical, softmax"):
+            text = f"{latent} latents are better than {other} ones"
+            found.append(above(text, "latent", latent, other))
+    if environment in WITH_CURRICULUM:
+        never = _never_reached(report, environment, name_of("T", "normal", NONE))
+        text = f"{environment}: with T no agent ever reaches the goal"
+        found.append(Claim(text, None if untold else never))
+        found += [
+            above(f"the {x} curriculum is better than none", "curriculum", x, NONE) for x in SHAPES
         ]
-        if environment in WITH_CURRICULUM:
-            helpful = _helpful(found["curriculum"])
-            of_it.append(_never_reached(report, environment, name_of("T", "normal", NONE)))
-            of_it += [x in helpful for x in SHAPES]
-        untold = _few(report, environment) or _goal_unseen(report, environment)
-        told += [None] * len(of_it) if untold else of_it
-    return told
+    return found
 
 
-def verdict(report: Mapping[str, Any]) -> str:
-    """The paper's claims in its order, each with its figures; "clearly" where intervals are apart."""
-    told = []
-    for environment in ENVIRONMENTS:
-        if _goal_unseen(report, environment):
-            told.append(
-                f"{environment}: no agent of any search reaches the goal after so few generations, which leaves the "
-                "paper's claims about it untested."
-            )
-            continue
-        found = _rows(report, environment)
-        described = {
-            row: ", ".join(f"{label} {x.text()}" for label, x in estimates.items())
-            for row, estimates in found.items()
-        }
-        learned = found["what is learned"]
-        few = _few(report, environment)
-        said = [
-            f"{environment}"
-            + (" (too few searches to tell anything clearly apart)" if few else "")
-            + f": {described['what is learned']}",
-            f"TI {_compared(learned['TI'], learned['T'])} T, I {_compared(learned['I'], learned['TI'])} TI",
-        ]
-        if _never_reached(report, environment, name_of("T", "normal", NONE)):
-            said.append("with T no agent ever reaches the goal, as in the paper")
-        better = (
-            "clearly better" if _continuous_better(found["latent"]) else "not all clearly better"
-        )
-        said += [f"latents: {described['latent']}", f"the continuous ones are {better}"]
-        if "curriculum" in found:
-            helpful = ", ".join(_helpful(found["curriculum"])) or "no shape"
-            said.append(f"curricula: {described['curriculum']}")
-            said.append(f"clearly better than none: {helpful}")
-        told.append("; ".join(said) + ".")
-    return " ".join(told)
-
-
-def _compared(a: Final, b: Final) -> str:
-    if a.clearly_above(b):
-        return "is clearly better than"
-    return "is clearly worse than" if b.clearly_above(a) else "is not clearly apart from"
-
-
-def body(report: Mapping[str, Any]) -> list[str]:
-    """What was searched with, and the table of final judgements."""
-    plan = report["plan"]
-    sizes = "; ".join(
-        f"{name}: {x['generations']} generations of {x['population_size']} candidates (agents of each: "
-        f"{x['agents_per_candidate']}), searches a line: {x['seeds']}"
-        for name, x in plan["environments"].items()
-    )
-    algorithms = searches.algorithms_text(plan["algorithms"])
-    lines = []
+def facts(report: Report) -> dict[str, Any]:
+    """{environment: {row of the figure: {label: what its searches were worth}}}, and where they led nowhere."""
+    found: dict[str, dict[str, dict[str, Any]]] = {}
     for environment in ENVIRONMENTS:
         for row, labels in rows(environment).items():
+            of_it = found.setdefault(environment, {}).setdefault(row, {})
             for label, search in labels.items():
-                found = finals(report, environment, search)
-                seconds = [
-                    c["seconds"] for c in report["environments"][environment][search].values()
-                ]
-                lines.append(
-                    [
-                        environment,
-                        row,
-                        label,
-                        found.text(1),
-                        f"{_worst_failing(report, environment, search):.0%}",
-                        f"{np.mean(seconds):.0f}",
-                    ]
-                )
-    return [
-        f"SNES from random weights with standard deviation 0.05, inner loop: {algorithms} with hyperparameters drawn "
-        f"from the paper's lists, {plan['evaluation_episodes']} evaluation episodes. {sizes}. The mean of the "
-        f"search distribution is judged by {plan['mean_evaluations']} agents; a line is the mean over searches of "
-        "their interquartile mean, with the 95 % bootstrap interval over searches. T: transition, reward and "
-        "termination are learned; TI: and the initial state; I: a bandit; IC: with a linear curriculum of the "
-        "evaluation's length, with which MountainCar's latents are searched too. "
-        "*Without a number* is the largest share of candidates that failed (NaN or infinite returns) between two "
-        "judgements; networks are the paper's, with one hidden layer of tanh, whose states are bounded, unlike those "
-        "of the ReLU networks in the authors' released code.",
-        "",
-        *table(
-            ["environment", "row", "", "final return", "without a number", "seconds a search"],
-            lines,
-        ),
-    ]
+                curves = report["environments"][environment][search].values()
+                of_it[label] = {
+                    "final": finals(report, environment, search),
+                    "failing": _worst_failing(report, environment, search),
+                    "seconds": float(np.mean([c["seconds"] for c in curves])),
+                }
+    unseen = [x for x in ENVIRONMENTS if _goal_unseen(report, x)]
+    return {"rows": found, "unseen": unseen, "enough": ENOUGH}
 
 
 def draw(report: Mapping[str, Any]) -> Figure:
@@ -259,30 +174,29 @@ def draw(report: Mapping[str, Any]) -> Figure:
         plotting.PURPLE,
     )
     styles = ("-", "--", "-.", ":", (0, (3, 1, 1, 1)), (0, (5, 1)))
-    with plotting.figure_style():
-        figure = Figure(figsize=(plotting.WIDTH, 8.4))
-        panels: Any = figure.subplots(3, len(ENVIRONMENTS))
-        for column, environment in enumerate(ENVIRONMENTS):
-            drawn = rows(environment)
-            for axes, row in zip(
-                panels[:, column], ("what is learned", "latent", "curriculum"), strict=True
+    figure = Figure(figsize=(plotting.WIDTH, 8.4))
+    panels: Any = figure.subplots(3, len(ENVIRONMENTS))
+    for column, environment in enumerate(ENVIRONMENTS):
+        drawn = rows(environment)
+        for axes, row in zip(
+            panels[:, column], ("what is learned", "latent", "curriculum"), strict=True
+        ):
+            if row not in drawn:
+                axes.axis("off")
+                axes.text(0.5, 0.5, "the paper has no curriculum for it", ha="center")
+                continue
+            for (label, search), color, style in zip(
+                drawn[row].items(), colors, styles, strict=False
             ):
-                if row not in drawn:
-                    axes.axis("off")
-                    axes.text(0.5, 0.5, "the paper has no curriculum for it", ha="center")
-                    continue
-                for (label, search), color, style in zip(
-                    drawn[row].items(), colors, styles, strict=False
-                ):
-                    curves = list(report["environments"][environment][search].values())
-                    plotting.search_curve(axes, curves, label, color, style)
-                axes.set_title(f"{environment}: {row}")
-                axes.set_xlabel("generation")
-                axes.set_ylabel("return of agents")
-                axes.legend(fontsize=8, ncols=2)
-        plotting.figure_title(
-            figure, "Meta-training curves: mean over searches, 95 % interval over searches"
-        )
+                curves = list(report["environments"][environment][search].values())
+                plotting.search_curve(axes, curves, label, color, style)
+            axes.set_title(f"{environment}: {row}")
+            axes.set_xlabel("generation")
+            axes.set_ylabel("return of agents")
+            axes.legend(fontsize=8, ncols=2)
+    plotting.figure_title(
+        figure, "Meta-training curves: mean over searches, 95 % interval over searches"
+    )
     return figure
 
 
@@ -335,13 +249,12 @@ EXPERIMENT = Experiment(
     presets=_presets(),
     minutes={"quick": "30", "paper": "weeks; for a GPU"},
     measure=measure,
-    parts=parts,
-    verdict=verdict,
-    body=body,
+    claims=claims,
+    facts=facts,
     draw=draw,
     needs="keeps its searches under runs/ablations",
 )
 
 
 if __name__ == "__main__":
-    sys.exit(run(EXPERIMENT))
+    raise SystemExit(EXPERIMENT.main())

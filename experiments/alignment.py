@@ -23,7 +23,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from experiments.page import exit_status, run_name
+from experiments.harness import exit_status, run_name
 from lpo import figures
 from lpo.alignment import (
     Regime,

@@ -36,7 +36,7 @@ import jax
 import numpy as np
 
 import scb
-from experiments.page import exit_status
+from experiments.harness import exit_status
 from scb.agents.spec import bandit_agent
 from scb.artefacts import flatten, machine_description, package_versions
 from scb.cli import configure_jax

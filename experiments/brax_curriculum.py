@@ -7,7 +7,6 @@ runs/brax_curriculum and are resumed.
 """
 
 import math
-import sys
 from collections.abc import Mapping
 from typing import Any
 
@@ -15,8 +14,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from experiments import searches
-from experiments.page import Experiment, Save, table
-from experiments.page import main as run
+from experiments.claims import Claim
+from experiments.harness import Experiment, Report, Save
 from experiments.searches import NONE, curriculum_of
 from scb import plotting
 from scb.curriculum import horizon
@@ -25,8 +24,8 @@ from scb.environments.registry import environment_spec
 from scb.statistics import iqm
 
 ENVIRONMENT = "hopper"
-# What standing still earns in an episode of 1000 steps, the local optimum of searches without a curriculum.
-STANDING = environment_spec("hopper").standing_still() or 0.0
+# What standing still earns, the local optimum of searches without a curriculum.
+LOCAL_OPTIMUM = environment_spec(ENVIRONMENT).standing_still() or 0.0
 
 
 def config_of(shape: str, seed: int, plan: Mapping[str, Any]) -> DiscoveryConfig:
@@ -60,87 +59,28 @@ def finals(report: Mapping[str, Any]) -> dict[str, searches.Final]:
     return {shape: searches.final(curves, iqm) for shape, curves in report["curves"].items()}
 
 
-def _best_without(report: Mapping[str, Any]) -> float:
+def _best_without(report: Report) -> float:
     """Where the best search without a curriculum ends; minus infinity where all failed."""
-    without = [c["fitness"][-1] for c in report["curves"][NONE].values()]
-    return max((x for x in without if x is not None), default=-math.inf)
+    return max(searches.last(report["curves"][NONE]), default=-math.inf)
 
 
-def _above(report: Mapping[str, Any]) -> list[str]:
-    """The curricula that end above the best search without one; a failed search is worse than any."""
-    best = _best_without(report)
+def claims(report: Report) -> list[Claim]:
+    """Shape by shape: whether it ends above; untold where no search reached the local optimum of standing still."""
+    curves, untold = report["curves"], -math.inf < _best_without(report) < LOCAL_OPTIMUM
     return [
-        shape
-        for shape, x in finals(report).items()
-        if shape != NONE and x.estimate is not None and not x.failed and x.estimate.value > best
-    ]
-
-
-def parts(report: Mapping[str, Any]) -> list[bool | None]:
-    """Shape by shape: whether it ends above; None where no search reached the local optimum of standing still."""
-    above, shapes = _above(report), [x for x in report["curves"] if x != NONE]
-    return [None if _untold(_best_without(report)) else x in above for x in shapes]
-
-
-def _untold(best: float) -> bool:
-    """Whether searches without a curriculum stay below the local optimum that the claim is about."""
-    return -math.inf < best < STANDING
-
-
-def verdict(report: Mapping[str, Any]) -> str:
-    """Every curriculum against every search without one."""
-    found, best, above = finals(report), _best_without(report), _above(report)
-    shapes = [shape for shape in found if shape != NONE]
-    said = (
-        "every curriculum ends above the best of them"
-        if len(above) == len(shapes)
-        else "no curriculum ends above the best of them"
-        if not above
-        else f"{' and '.join(above)} {'ends' if len(above) == 1 else 'end'} above the best of them, "
-        f"{', '.join(x for x in shapes if x not in above)} not"
-    )
-    generations = report["plan"]["generations"]
-    return (
-        f"after {generations} generations (the paper's searches take 2000) the agents earn {found[NONE].text()} "
-        f"without a curriculum, over {found[NONE].searches} searches; with one: "
-        + ", ".join(f"{shape} {found[shape].text()}" for shape in shapes)
-        + (
-            f". Of the searches without one the best ends at {best:.0f}: {said}."
-            if math.isfinite(best)
-            else ". Every search without one failed."
+        Claim(
+            f"with a curriculum ({shape}) searches end higher",
+            None if untold else searches.difference(curves[shape], curves[NONE], iqm),
+            places=0,
         )
-        + (
-            f" None of them earns what standing still does ({STANDING:.0f}), the local optimum that the claim is "
-            "about: so few generations do not test it."
-            if _untold(best)
-            else ""
-        )
-    )
+        for shape in curves
+        if shape != NONE
+    ]
 
 
-def body(report: Mapping[str, Any]) -> list[str]:
-    """How it was searched, and the final judgements."""
-    plan = report["plan"]
-    algorithms = searches.algorithms_text(plan["algorithms"])
-    rows = [
-        [
-            shape,
-            str(found.searches),
-            found.text(),
-            f"{np.mean([c['seconds'] for c in report['curves'][shape].values()]) / 60:.1f}",
-        ]
-        for shape, found in finals(report).items()
-    ]
-    return [
-        f"Hopper in `{plan['backend']}` physics. SNES from random weights with standard deviation 0.05, "
-        f"{plan['generations']} generations of {plan['population_size']} candidates, inner loop {algorithms} with the "
-        f"paper's fixed hyperparameters, {plan['evaluation_episodes']} evaluation episodes. The paper's curriculum "
-        "(100 to 1000 steps between the first and the ninth tenth of the search) in several shapes; the mean of the "
-        f"search distribution is judged over whole episodes by {plan['mean_evaluations']} agents, whatever "
-        "the curriculum. Interquartile means, 95 % intervals over searches where there are several.",
-        "",
-        *table(["curriculum", "searches", "return at the end", "minutes a search"], rows),
-    ]
+def facts(report: Report) -> dict[str, Any]:
+    """Where searches end."""
+    return {"finals": finals(report), "best": _best_without(report), "standing": LOCAL_OPTIMUM}
 
 
 def draw(report: Mapping[str, Any]) -> Figure:
@@ -155,28 +95,27 @@ def draw(report: Mapping[str, Any]) -> Figure:
         (plotting.VERMILLION, (0, (5, 1))),
     )
     generations = report["plan"]["generations"]
-    with plotting.figure_style():
-        figure = Figure(figsize=(plotting.WIDTH, 3.8))
-        left, right = figure.subplots(1, 2)
-        for (shape, curves), (color, style) in zip(report["curves"].items(), looks, strict=False):
-            curriculum = curriculum_of(ENVIRONMENT, shape, generations)
-            times = np.arange(generations + 1)
-            lengths: Any = (
-                np.full(times.size, 1000)
-                if curriculum is None
-                else np.asarray(horizon(curriculum)(times))
-            )
-            left.plot(times, lengths, color=color, linestyle=style, label=shape)
-            number = len(curves)
-            label = f"{shape} ({number} {'search' if number == 1 else 'searches'})"
-            plotting.search_curve(right, list(curves.values()), label, color, style, iqm)
-        left.set_title("Evaluation episodes' length")
-        left.set_ylabel("steps")
-        right.set_title("Meta-training on Hopper")
-        right.set_ylabel("return of agents")
-        for axes in (left, right):
-            axes.set_xlabel("generation")
-        right.legend(fontsize=8)
+    figure = Figure(figsize=(plotting.WIDTH, 3.8))
+    left, right = figure.subplots(1, 2)
+    for (shape, curves), (color, style) in zip(report["curves"].items(), looks, strict=False):
+        curriculum = curriculum_of(ENVIRONMENT, shape, generations)
+        times = np.arange(generations + 1)
+        lengths: Any = (
+            np.full(times.size, 1000)
+            if curriculum is None
+            else np.asarray(horizon(curriculum)(times))
+        )
+        left.plot(times, lengths, color=color, linestyle=style, label=shape)
+        number = len(curves)
+        label = f"{shape} ({number} {'search' if number == 1 else 'searches'})"
+        plotting.search_curve(right, list(curves.values()), label, color, style, iqm)
+    left.set_title("Evaluation episodes' length")
+    left.set_ylabel("steps")
+    right.set_title("Meta-training on Hopper")
+    right.set_ylabel("return of agents")
+    for axes in (left, right):
+        axes.set_xlabel("generation")
+    right.legend(fontsize=8)
     return figure
 
 
@@ -223,13 +162,12 @@ EXPERIMENT = Experiment(
     },
     minutes={"quick": "25", "paper": "weeks; for a GPU"},
     measure=measure,
-    parts=parts,
-    verdict=verdict,
-    body=body,
+    claims=claims,
+    facts=facts,
     draw=draw,
     needs="keeps its searches under runs/brax_curriculum",
 )
 
 
 if __name__ == "__main__":
-    sys.exit(run(EXPERIMENT))
+    raise SystemExit(EXPERIMENT.main())

@@ -4,15 +4,14 @@
 
 Learning curves of agents in bandits (ours and the published ones, each said) and of agents with the
 paper's expert hyperparameters in the environments, the final returns, and the steps that the latter
-need to match the former. Published bandits are read from ../shared/published_scbs where that is, or
-from the folder in the variable SCB_PUBLISHED; without them ours are measured alone.
+need to match the former. Published bandits are read from --published DIRECTORY; without it ours are
+measured alone.
 """
 
-import os
-import sys
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,8 +20,8 @@ from matplotlib.figure import Figure
 
 import scb
 from experiments import zoo_table, zoo_table_page
-from experiments.page import Experiment, Save, table, text
-from experiments.page import main as run
+from experiments.claims import Claim
+from experiments.harness import Experiment, Preset, Report, Save
 from scb import plotting
 from scb.agents.spec import bandit_agent, environment_agent
 from scb.environments.registry import environment_spec
@@ -34,15 +33,16 @@ from scb.seeds import REPORTING
 from scb.statistics import estimate
 
 OURS, PUBLISHED = "ours", "published"
-# Whose experts and published bandits the paper has; `zoo_table_page.PAPER` says what these bandits are worth.
-PAPER = ("hopper", "walker2d", "swimmer", "halfcheetah", "humanoidstandup")
+BRAX = ("hopper", "walker2d", "swimmer", "halfcheetah", "humanoidstandup")
 ROUGHLY = 50  # times as many steps are roughly two orders of magnitude
 
 
-def published_folder() -> Path | None:
-    """Where the published bandits' arrays are; None where they are not."""
-    folder = Path(os.environ.get("SCB_PUBLISHED", "../shared/published_scbs"))
-    return folder if folder.is_dir() else None
+@dataclass(frozen=True)
+class Options(Preset):
+    """A preset, and what it needs beside the library."""
+
+    published: Path | None = None
+    """folder with the published bandits' .npz files"""
 
 
 def place(environment: str, backend: str | None) -> str:
@@ -59,12 +59,14 @@ def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None
     """A learning curve at a time: those in bandits, then those in environments."""
     bandits = report.setdefault("bandits", {})
     environments = report.setdefault("environments", {})
-    at_hand = published_folder() is not None
+    published = plan["published"]
 
     def there(of: list[Any]) -> bool:
         return set(plan["bandit_algorithms"]) <= set(bandits.get(task(*of), ()))
 
-    left_out = [x for x in plan["bandits"] if x[0] == PUBLISHED and not at_hand and not there(x)]
+    left_out = [
+        x for x in plan["bandits"] if x[0] == PUBLISHED and published is None and not there(x)
+    ]
     report["left_out"] = [task(*x) for x in left_out]
     for name in report["left_out"]:
         bandits.pop(name, None)  # a part of its algorithms can't be shown
@@ -93,8 +95,7 @@ def _in_bandit(
         digest = bandit_metadata(bandit.name)["sha256"]
     else:
         (name,) = (n for n, home in PUBLISHED_BANDITS.items() if home == environment)
-        folder = published_folder()
-        assert folder is not None
+        folder = Path(plan["published"])
         bandit = published_bandit(folder / f"{name}.npz")
         digest = zoo_table.arrays_digest(folder / f"{name}.npz")
     spec = bandit_agent(algorithm, environment)
@@ -200,20 +201,26 @@ def matches(report: Mapping[str, Any]) -> list[dict[str, Any]]:
 
     rows = []
     for name, algorithms in report["bandits"].items():
+        environment, _, backend = _environment_of(name).partition(" (")
         for algorithm, curves in report["environments"][_environment_of(name)].items():
             level = estimate(finals(algorithms[algorithm]))
             steps = steps_to_match(curves, level.value)
             low = level.value if level.low is None else level.low
+            each_low = steps_to_match(curves, low)
             rows.append(
                 {
                     "bandit": name,
+                    "environment": environment,
+                    "backend": backend.rstrip(")") or None,
                     "algorithm": algorithm,
+                    "finals": finals(algorithms[algorithm]),
                     "level": level,
                     "bandit_steps": algorithms[algorithm]["steps"][-1],
                     "reached": sum(x is not None for x in steps),
                     "agents": len(steps),
                     "steps": median(steps),
-                    "steps_low": median(steps_to_match(curves, low)),
+                    "each_low": each_low,
+                    "steps_low": median(each_low),
                     "trained": curves["steps"][-1],
                     "spacing": curves["steps"][1] - curves["steps"][0],
                 }
@@ -221,184 +228,102 @@ def matches(report: Mapping[str, Any]) -> list[dict[str, Any]]:
     return rows
 
 
-def parts(report: Mapping[str, Any]) -> list[bool | None]:
-    """Row by row of `matches`: whether the environment takes 50 times the steps or more, roughly two orders.
+def claims(report: Report) -> list[Claim]:
+    """Row by row of `matches`: the environment takes 50 times the steps or more, for agents that locomote.
 
-    To the lower end of the bandit's level, so that the luck of its agents does not decide. None where the
-    environment was trained for less and its agents did not get there.
+    The steps are those to the lower end of the bandit's level, so that the luck of its agents does not decide. An agent
+    that never gets there counts with all steps of its training; where that was for less than 50 times, nothing is told.
     """
-    found: list[bool | None] = []
+    found = []
     for row in matches(report):
-        times = (row["steps_low"] or row["trained"]) / row["bandit_steps"]
-        found.append(None if row["steps_low"] is None and times < ROUGHLY else times >= ROUGHLY)
+        times = np.array([x or row["trained"] for x in row["each_low"]]) / row["bandit_steps"]
+        told = None not in row["each_low"] or row["trained"] / row["bandit_steps"] >= ROUGHLY
+        name = f"{row['bandit']}, {row['algorithm'].upper()}"
+        text = f"{name}: the environment takes {ROUGHLY} times the steps, roughly two orders of magnitude"
+        evidence = partial(estimate, times, statistic=np.median) if told else None
+        found.append(Claim(text, evidence, ROUGHLY, places=0))
+        standing = environment_spec(row["environment"]).standing_still(row["backend"])
+        if standing is not None:
+            text = f"{name}: agents from the bandit earn more than standing still"
+            found.append(Claim(text, partial(estimate, row["finals"]), standing, places=0))
     return found
 
 
-def _times(row: Mapping[str, Any], steps: float | None) -> str:
-    """How many times the bandit's steps."""
-    if steps is None:
-        return f"more than {row['trained'] / row['bandit_steps']:.0f}"
-    return f"{steps / row['bandit_steps']:.0f}"
-
-
-def verdict(report: Mapping[str, Any]) -> str:
-    """How many times as many steps the environment takes; the median counts agents that never get there."""
-    told = []
-    for row in matches(report):
-        most = row["trained"] / row["bandit_steps"]
-        said = (
-            f"{row['bandit']}, {row['algorithm'].upper()}: {row['reached']} of {row['agents']} agents reach the "
-            f"bandit's {text(row['level'])}, "
-        )
-        said += (
-            f"in the median not within {row['trained']} steps, {_times(row, None)} times the bandit's"
-            if row["steps"] is None
-            else f"by {row['steps']:.0f} steps in the median (evaluations are {row['spacing']} apart), "
-            f"{_times(row, row['steps'])} times the bandit's"
-        )
-        if row["steps_low"] != row["steps"]:
-            said += f" ({_times(row, row['steps_low'])} to the lower end)"
-        if most < 100:
-            said += (
-                f" (trained up to {most:.0f} times as long: two orders of magnitude are not tested)"
-            )
-        told.append(said)
-    return "; ".join(told).replace("-", "\u2212") + "."
-
-
-def body(report: Mapping[str, Any]) -> list[str]:
-    """How it was measured, final returns beside the paper's, steps to match."""
-    plan = report["plan"]
-    rows = []
+def facts(report: Report) -> dict[str, Any]:
+    """Final returns, ours and the paper's, and steps to match."""
+    finals_of = []
     for name, algorithms in report["bandits"].items():
-        environment = name.split(" ")[0]
-        own = report["environments"][_environment_of(name)]
+        own, environment = report["environments"][_environment_of(name)], name.split(" ")[0]
         for algorithm, curves in algorithms.items():
-            paper = environment_spec(environment).reference(None, algorithm)
-            rows.append(
-                [
-                    name,
-                    algorithm.upper(),
-                    text(estimate(finals(curves))),
-                    text(estimate(finals(own[algorithm]))) if algorithm in own else "",
-                    "" if paper is None else f"{zoo_table_page.PAPER[environment][algorithm]:.0f}",
-                    "" if paper is None else f"{paper.value:.0f}",
-                    f"{curves['seconds'] / len(curves['returns']):.1f}",
-                    f"{own[algorithm]['seconds'] / len(own[algorithm]['returns']):.0f}"
-                    if algorithm in own
-                    else "",
-                ]
+            there = own.get(algorithm)
+            finals_of.append(
+                {
+                    "bandit": name,
+                    "algorithm": algorithm,
+                    "here": finals(curves),
+                    "there": None if there is None else finals(there),
+                    "paper": zoo_table_page.PAPER.get(environment, {}).get(algorithm),
+                    "paper_there": _paper(environment, algorithm),
+                    "seconds": _seconds(curves),
+                    "seconds_there": None if there is None else _seconds(there),
+                }
             )
-    matched = [
-        [
-            row["bandit"],
-            row["algorithm"].upper(),
-            text(row["level"]),
-            f"{row['reached']} of {row['agents']}",
-            f"more than {row['trained']}" if row["steps"] is None else f"{row['steps']:.0f}",
-            str(row["spacing"]),
-            _times(row, row["steps"]),
-            _times(row, row["steps_low"]),
-        ]
-        for row in matches(report)
-    ]
     of_all = [report["bandits"], report["environments"]]
     failed = sum(x.get("failed", 0) for by in of_all for y in by.values() for x in y.values())
-    return [
-        f"In bandits: {plan['bandit_agents']} agents of each algorithm with the paper's fixed inner-loop "
-        f"hyperparameters, 10 000 steps. In environments: {plan['environment_agents']} agents of "
-        f"{', '.join(x.upper() for x in plan['environment_algorithms'])} with the paper's expert hyperparameters, "
-        f"about {plan['environment_steps']} steps (the paper: 5 242 880). {plan['episodes']} episodes of most likely "
-        "actions at each point; reporting seed 10 000; interquartile means with 95 % intervals. *Ours* was found "
-        "here, on `spring` physics; *published* bandits are those that the paper's authors released, under our "
-        "agents. The paper's figures are for `generalized`. Seconds are wall-clock of an agent with its evaluations "
-        "and the compilation, shared over the agents."
-        + (
-            f" Left out, since SCB_PUBLISHED names no folder that holds them: {'; '.join(report['left_out'])}."
-            if report["left_out"]
-            else ""
-        )
-        + (
-            f" Agents with returns that are no number, counted as untrained: {failed}."
-            if failed
-            else ""
-        ),
-        "",
-        *table(
-            [
-                "bandit",
-                "algorithm",
-                "in the bandit",
-                "in the environment",
-                "paper, bandit",
-                "paper, environment",
-                "seconds, bandit",
-                "seconds, environment",
-            ],
-            rows,
-        ),
-        "",
-        "Steps in the environment until an agent's evaluation reaches what the bandit's agents earn; it may have been "
-        "there as much earlier as evaluations are apart:",
-        "",
-        *table(
-            [
-                "bandit",
-                "algorithm",
-                "level",
-                "agents that reach it",
-                "steps (median)",
-                "evaluations apart",
-                "times the bandit's",
-                "to the level's lower end",
-            ],
-            matched,
-        ),
-    ]
+    return {"finals": finals_of, "matches": matches(report), "lost": failed}
+
+
+def _seconds(curves: Mapping[str, Any]) -> float:
+    return float(curves["seconds"] / len(curves["returns"]))
+
+
+def _paper(environment: str, algorithm: str) -> float | None:
+    """What the paper's agents earn that were trained in the environment."""
+    found = environment_spec(environment).reference(algorithm=algorithm)
+    return None if found is None else found.value
 
 
 def draw(report: Mapping[str, Any]) -> Figure:
     """A row a bandit, a column an algorithm; steps on a logarithmic axis."""
 
     algorithms = list(next(iter(report["bandits"].values())))
-    with plotting.figure_style():
-        figure = Figure(figsize=(3.1 * len(algorithms), 2.9 * len(report["bandits"]) + 0.4))
-        panels: Any = figure.subplots(
-            len(report["bandits"]), len(algorithms), squeeze=False, sharey="row"
+    figure = Figure(figsize=(3.1 * len(algorithms), 2.9 * len(report["bandits"]) + 0.4))
+    panels: Any = figure.subplots(
+        len(report["bandits"]), len(algorithms), squeeze=False, sharey="row"
+    )
+    for row, (name, curves) in zip(panels, report["bandits"].items(), strict=True):
+        own = report["environments"][_environment_of(name)]
+        for axes, algorithm in zip(row, algorithms, strict=True):
+            for found, color, style in (
+                (curves[algorithm], plotting.BLUE, "-"),
+                (own.get(algorithm), plotting.VERMILLION, "--"),
+            ):
+                if found is None:
+                    continue
+                # A logarithmic axis has no zero: the untrained agent is left out.
+                shown = np.asarray(found["steps"]) > 0
+                steps = np.asarray(found["steps"])[shown]
+                estimates = [estimate(x) for x in np.transpose(found["returns"])[shown]]
+                plotting.estimate_curve(axes, steps, estimates, color, style)
+            paper = _paper(name.split(" ")[0], algorithm)
+            # The paper's physics.
+            if algorithm not in own and paper is not None and "(generalized)" in name:
+                axes.axhline(paper, color=plotting.GREY, linestyle=":")
+            axes.set_xscale("log")
+            axes.set_title(f"{name}\n{algorithm.upper()}", fontsize=9)
+            axes.set_xlabel("training steps")
+        row[0].set_ylabel("return in the environment")
+    handles: list[Any] = [
+        panels[0, 0].plot([], [], color=color, linestyle=style)[0]
+        for color, style in (
+            (plotting.BLUE, "-"),
+            (plotting.VERMILLION, "--"),
+            (plotting.GREY, ":"),
         )
-        for row, (name, curves) in zip(panels, report["bandits"].items(), strict=True):
-            own = report["environments"][_environment_of(name)]
-            for axes, algorithm in zip(row, algorithms, strict=True):
-                for found, color, style in (
-                    (curves[algorithm], plotting.BLUE, "-"),
-                    (own.get(algorithm), plotting.VERMILLION, "--"),
-                ):
-                    if found is None:
-                        continue
-                    # A logarithmic axis has no zero: the untrained agent is left out.
-                    shown = np.asarray(found["steps"]) > 0
-                    steps = np.asarray(found["steps"])[shown]
-                    estimates = [estimate(x) for x in np.transpose(found["returns"])[shown]]
-                    plotting.estimate_curve(axes, steps, estimates, color, style)
-                paper = environment_spec(name.split(" ")[0]).reference(None, algorithm)
-                # The paper's physics.
-                if algorithm not in own and paper is not None and "(generalized)" in name:
-                    axes.axhline(paper.value, color=plotting.GREY, linestyle=":")
-                axes.set_xscale("log")
-                axes.set_title(f"{name}\n{algorithm.upper()}", fontsize=9)
-                axes.set_xlabel("training steps")
-            row[0].set_ylabel("return in the environment")
-        handles: list[Any] = [
-            panels[0, 0].plot([], [], color=color, linestyle=style)[0]
-            for color, style in (
-                (plotting.BLUE, "-"),
-                (plotting.VERMILLION, "--"),
-                (plotting.GREY, ":"),
-            )
-        ]
-        labels = ["trained in the bandit", "trained in the environment", "the paper, environment"]
-        plotting.legend_below(figure, (handles, labels), columns=3)
-        plotting.figure_title(figure, "Interquartile mean over agents with its 95 % interval")
+    ]
+    labels = ["trained in the bandit", "trained in the environment", "the paper, environment"]
+    plotting.legend_below(figure, (handles, labels), columns=3)
+    plotting.figure_title(figure, "Interquartile mean over agents with its 95 % interval")
     return figure
 
 
@@ -422,7 +347,7 @@ EXPERIMENT = Experiment(
         "paper": {
             "bandits": [
                 [OURS, "hopper", "spring"],
-                *([PUBLISHED, name, "generalized"] for name in PAPER),
+                *([PUBLISHED, name, "generalized"] for name in BRAX),
             ],
             "bandit_algorithms": ["ppo", "sac", "ddpg", "td3"],
             "bandit_agents": 20,
@@ -435,13 +360,13 @@ EXPERIMENT = Experiment(
     },
     minutes={"quick": "45", "paper": "days; for a GPU"},
     measure=measure,
-    parts=parts,
-    verdict=verdict,
-    body=body,
+    claims=claims,
+    facts=facts,
     draw=draw,
-    needs="needs for the published bandits their arrays, beside the checkout or in SCB_PUBLISHED",
+    needs="needs for the published bandits --published DIRECTORY with their arrays",
+    options=Options,
 )
 
 
 if __name__ == "__main__":
-    sys.exit(run(EXPERIMENT))
+    raise SystemExit(EXPERIMENT.main())

@@ -7,8 +7,8 @@ reward, its Q-function as the reward) on two distributions of states (the bandit
 is learned depends on the expert, so there are several.
 """
 
-import sys
 from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 import jax.numpy as jnp
@@ -16,8 +16,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import scb
-from experiments.page import Experiment, Save, finite, table, text
-from experiments.page import main as run
+from experiments.claims import OF_THE_WAY, TENTH, Claim
+from experiments.harness import Experiment, Report, Save, finite
 from scb import plotting
 from scb.agents.spec import bandit_agent
 from scb.analysis import components
@@ -27,7 +27,7 @@ from scb.environments.registry import environment_spec
 from scb.environments.zoo import bandit_metadata, open_bandit
 from scb.keys import key_at, root_key, split_key
 from scb.seeds import ILLUSTRATING, REPORTING
-from scb.statistics import iqm, normalized_score, pooled_estimate
+from scb.statistics import Estimate, iqm, normalized_score, pooled_estimate
 
 ENVIRONMENT = "Pendulum-v1"
 BANDIT, CLONING, ACTION, Q = REWARDS = (
@@ -146,115 +146,87 @@ def scores_of(report: Mapping[str, Any], reward: str, states: str) -> np.ndarray
     return normalized_score(returns_of(report, reward, states), report["random"], ceilings)
 
 
-def _less(report: Mapping[str, Any], combination: tuple[str, str], than: tuple[str, str]) -> bool:
-    """Whether agents clearly earn less: the paired difference's interval lies below zero."""
-    difference = pooled_estimate(
-        scores_of(report, *combination), scores_of(report, *than), paired_groups=True
-    )
-    return difference.high is not None and difference.high < 0
-
-
-def parts(report: Mapping[str, Any]) -> list[bool]:
+def claims(report: Report) -> list[Claim]:
     """Whether each way to learn needs the contexts, Q works badly, and the other two ways do as well."""
+
+    def more(one: tuple[str, str], than: tuple[str, str]) -> partial[Estimate]:
+        scores, others = (scores_of(report, *x) for x in (one, than))
+        return partial(pooled_estimate, scores, others, paired_groups=True)
+
     itself = (BANDIT, SYNTHETIC)
     return [
-        *(_less(report, (r, EXPERT), (r, SYNTHETIC)) for r in (BANDIT, CLONING, ACTION)),
-        _less(report, (Q, SYNTHETIC), itself),
-        *(not _less(report, (r, SYNTHETIC), itself) for r in (CLONING, ACTION)),
-    ]
-
-
-def verdict(report: Mapping[str, Any]) -> str:
-    """Each part of the claim, with its figures."""
-
-    def of(reward: str, states: str) -> str:
-        return text(pooled_estimate(scores_of(report, reward, states)), 2)
-
-    ways = (BANDIT, CLONING, ACTION)
-    *needed, q_is_less, cloning_is_as_good, closeness_is_as_good = parts(report)
-    needing = [r for r, needs in zip(ways, needed, strict=True) if needs]
-    return (
-        f"Normalised scores (0 a random policy, 1 the expert) with {len(report['experts'])} experts; intervals over "
-        "experts and agents. On the expert's states instead of the bandit's contexts: "
-        + ", ".join(f"{of(r, EXPERT)} instead of {of(r, SYNTHETIC)} with {WITH[r]}" for r in ways)
-        + "; "
-        + (
-            "clearly less with each of them. "
-            if len(needing) == 3
-            else f"clearly less with {' and '.join(WITH[r] for r in needing)} only. "
-            if needing
-            else "clearly less with none of them. "
-        )
-        + f"The expert's Q-function as the reward gives {of(Q, SYNTHETIC)}: "
-        f"{'clearly' if q_is_less else 'not clearly'} less than the bandit's own reward does. "
-        "On the bandit's contexts, cloning is "
-        f"{'not clearly worse than' if cloning_is_as_good else 'worse than'}, and closeness to the expert's action "
-        f"{'not clearly worse than' if closeness_is_as_good else 'worse than'}, the bandit's own reward "
-        f"({of(BANDIT, SYNTHETIC)})."
-    )
-
-
-def body(report: Mapping[str, Any]) -> list[str]:
-    """The table: pooled, and expert by expert."""
-    plan = report["plan"]
-    rows = []
-    for reward in REWARDS:
-        for states in STATES:
-            scores = scores_of(report, reward, states)
-            rows.append(
-                [
-                    reward,
-                    states,
-                    text(pooled_estimate(returns_of(report, reward, states))),
-                    text(pooled_estimate(scores), 2),
-                    ", ".join(f"{x:z.2f}" for x in iqm(scores, axis=1)).replace("-", "\u2212"),
-                ]
+        *(
+            Claim(
+                f"with {WITH[r]}, contexts teach more than the expert's states",
+                more((r, SYNTHETIC), (r, EXPERT)),
             )
-    failed = report.get("failed", 0)
-    owns = ", ".join(f"{iqm(x['own']):.0f}" for x in report["experts"].values())
-    return [
-        f"{plan['agents']} PPO agents (ReLU, hyperparameters drawn from the paper's lists, 10 000 steps) a combination "
-        f"and expert, the same draws for each; {plan['episodes']} episodes of most likely actions; reporting seed "
-        "10 000. Cloning takes as many states and as many gradient steps, with PPO's learning rates. "
-        f"{len(report['experts'])} experts, each the best of {plan['candidates']} SAC agents trained on the "
-        f"environment, by other episodes; they earn {owns} over {plan['expert_episodes']} episodes, a random policy "
-        f"{report['random']:.0f}. Interquartile means with 95 % intervals that draw experts, and agents; the last "
-        "column is the score with each expert.".replace("-", "\u2212")
-        + (f" Agents whose return is no number, counted as random: {failed}." if failed else ""),
-        "",
-        *table(["learning from", "states", "return", "normalised score", "expert by expert"], rows),
+            for r in WITH
+        ),
+        Claim(
+            "the bandit's reward teaches more than the expert's Q-function",
+            more(itself, (Q, SYNTHETIC)),
+        ),
+        *(
+            Claim(
+                f"{WITH[r]} teaches no less than the bandit's reward",
+                more((r, SYNTHETIC), itself),
+                0.0,
+                TENTH,
+                OF_THE_WAY,
+            )
+            for r in (CLONING, ACTION)
+        ),
     ]
+
+
+def facts(report: Report) -> dict[str, Any]:
+    """Pooled returns and scores of every combination, and the scores expert by expert."""
+    rows = {
+        reward: {
+            states: {
+                "returns": pooled_estimate(returns_of(report, reward, states)),
+                "score": pooled_estimate(scores := scores_of(report, reward, states)),
+                "each": iqm(scores, axis=1).tolist(),
+            }
+            for states in STATES
+        }
+        for reward in REWARDS
+    }
+    return {
+        "rows": rows,
+        "own": [float(iqm(x["own"])) for x in report["experts"].values()],
+        "ways": WITH,
+    }
 
 
 def draw(report: Mapping[str, Any]) -> Figure:
     """A line a combination: the score with its interval, each expert a dot."""
 
     number = len(report["experts"])
-    with plotting.figure_style():
-        figure = Figure(figsize=(plotting.WIDTH, 3.6))
-        axes = figure.subplots()
-        for i, reward in enumerate(REWARDS):
-            for states, offset, color in (
-                (SYNTHETIC, -0.15, plotting.VERMILLION),
-                (EXPERT, 0.15, plotting.BLUE),
-            ):
-                scores = scores_of(report, reward, states)
-                plotting.estimate_row(
-                    axes, i + offset, iqm(scores, axis=1), pooled_estimate(scores), color
-                )
-        axes.axvline(1.0, color=plotting.BLACK, linestyle=":", linewidth=1.2)
-        axes.set_yticks(range(len(REWARDS)), list(REWARDS))
-        axes.invert_yaxis()
-        axes.set_xlabel("normalised score on Pendulum (0: random policy, 1: the SAC expert)")
-        plotting.figure_title(
-            figure,
-            f"Learning in a bandit with replaced parts: {number} experts (dots), "
-            f"{report['plan']['agents']} agents each",
-        )
-        handles: list[Any] = [
-            axes.plot([], [], "o", color=color)[0] for color in (plotting.VERMILLION, plotting.BLUE)
-        ]
-        plotting.legend_below(figure, (handles, list(STATES)), columns=2)
+    figure = Figure(figsize=(plotting.WIDTH, 3.6))
+    axes = figure.subplots()
+    for i, reward in enumerate(REWARDS):
+        for states, offset, color in (
+            (SYNTHETIC, -0.15, plotting.VERMILLION),
+            (EXPERT, 0.15, plotting.BLUE),
+        ):
+            scores = scores_of(report, reward, states)
+            plotting.estimate_row(
+                axes, i + offset, iqm(scores, axis=1), pooled_estimate(scores), color
+            )
+    axes.axvline(1.0, color=plotting.BLACK, linestyle=":", linewidth=1.2)
+    axes.set_yticks(range(len(REWARDS)), list(REWARDS))
+    axes.invert_yaxis()
+    axes.set_xlabel("normalised score on Pendulum (0: random policy, 1: the SAC expert)")
+    plotting.figure_title(
+        figure,
+        f"Learning in a bandit with replaced parts: {number} experts (dots), "
+        f"{report['plan']['agents']} agents each",
+    )
+    handles: list[Any] = [
+        axes.plot([], [], "o", color=color)[0] for color in (plotting.VERMILLION, plotting.BLUE)
+    ]
+    plotting.legend_below(figure, (handles, list(STATES)), columns=2)
     return figure
 
 
@@ -283,12 +255,11 @@ EXPERIMENT = Experiment(
     },
     minutes={"quick": "3", "paper": "16"},
     measure=measure,
-    parts=parts,
-    verdict=verdict,
-    body=body,
+    claims=claims,
+    facts=facts,
     draw=draw,
 )
 
 
 if __name__ == "__main__":
-    sys.exit(run(EXPERIMENT))
+    raise SystemExit(EXPERIMENT.main())

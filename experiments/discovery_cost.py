@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import EngFormatter, MaxNLocator
 
-from experiments.page import exit_status, read
+from experiments.harness import exit_status, read
 from experiments.zoo_table_page import ENVIRONMENTS, TARGETS, label
 from scb import plotting
 from scb.cli import configure_jax

@@ -6,7 +6,6 @@ Searches of the parameterisation TI (initial state, transition, reward and termi
 with several limits of the episode's length, in run folders under runs/episode_lengths.
 """
 
-import sys
 from collections.abc import Mapping
 from typing import Any
 
@@ -15,8 +14,8 @@ from matplotlib import colormaps
 from matplotlib.figure import Figure
 
 from experiments import searches
-from experiments.page import CLASSIC_CONTROL, Experiment, Save, finite, span, table, text
-from experiments.page import main as run
+from experiments.claims import OF_THE_WAY, TENTH, Claim
+from experiments.harness import CLASSIC_CONTROL, Experiment, Report, Save, finite
 from experiments.searches import PAPER_SIZES
 from scb import plotting
 from scb.agents.spec import algorithms_for, bandit_agent
@@ -141,111 +140,53 @@ def scores(report: Mapping[str, Any], environment: str, limit: str) -> Estimate:
     return estimate(normalized(report, environment, limit))
 
 
-def _brought(report: Mapping[str, Any]) -> dict[str, Estimate]:
-    """{environment: what a limit of one step changes}, with the same seeds and hyperparameters."""
-    return {
-        name: paired_difference(normalized(report, name, "1"), normalized(report, name, OWN))
-        for name in report["environments"]
-    }
-
-
-def _single(report: Mapping[str, Any]) -> dict[str, float]:
-    return {name: shares(x)["1"] for name, x in report["environments"].items()}
-
-
-def _searched(report: Mapping[str, Any]) -> list[str]:
+def searched(report: Report) -> list[str]:
     """Where the search without a limit is not far from its end."""
     return [name for name in report["environments"] if scores(report, name, OWN).value >= GOOD]
 
 
-def parts(report: Mapping[str, Any]) -> list[bool | None]:
-    """Whether most environments' episodes end after a step, and whether that limit costs nothing clearly.
+def claims(report: Report) -> list[Claim]:
+    """Most environments' episodes end after a step, and that limit costs nothing.
 
-    Neither is told where fewer than half of the searches got anywhere.
+    There is one search of each, so neither has an interval; and nothing to say where fewer than half got anywhere.
     """
-    single = _single(report)
-    if 2 * len(_searched(report)) < len(single):
-        return [None, None]
-    most = sum(share > 0.8 for share in single.values())
-    costs = any(x.high is not None and x.high < 0 for x in _brought(report).values())
-    return [2 * most > len(single), not costs]
+    environments = report["environments"]
+    single = np.median([shares(x)["1"] for x in environments.values()])
+    costs = np.mean([brought(report, name).value for name in environments])
+    told = 2 * len(searched(report)) >= len(environments)
 
+    def of_one_search(value: np.floating) -> Estimate | None:
+        return Estimate(float(value), None, None, 1) if told else None
 
-def verdict(report: Mapping[str, Any]) -> str:
-    """How many episodes end after a step, and what a limit of one step costs or brings."""
-    single, found = _single(report), _brought(report)
-    most = [name for name, share in single.items() if share > 0.8]
-    listed = ", ".join(f"{name} {share:.0%}" for name, share in single.items())
-    good = _searched(report)
-    differences = [f"{name} {text(x, 2, sign=True)}" for name, x in found.items()]
-    better = [name for name, x in found.items() if x.low is not None and x.low > 0]
-    worse = [name for name, x in found.items() if x.high is not None and x.high < 0]
-    return (
-        f"episodes of one step where many are allowed: {listed}; more than 80% in {len(most)} of {len(single)} "
-        f"environments. {_searched_enough(good, len(single))} What a limit of one step changes in the normalised "
-        f"score (one search each): {', '.join(differences)}; "
-        + (
-            "it costs nothing clearly"
-            if not worse
-            else f"it is clearly worse in {' and '.join(worse)}"
-        )
-        + (f", and is clearly better in {' and '.join(better)}." if better else ".")
-    )
-
-
-def _searched_enough(good: list[str], number: int) -> str:
-    half = f"agents of {GOOD:g} or more of the expert's score"
-    if len(good) == number:
-        return f"Every search without a limit trains {half}."
-    if not good:
-        return (
-            f"No search without a limit trains {half} after so few generations: these shares say "
-            "little."
-        )
-    return (
-        f"The search without a limit trains {half} in {' and '.join(good)} only: elsewhere it is far from its end, "
-        "and its share says little."
-    )
-
-
-def body(report: Mapping[str, Any]) -> list[str]:
-    """How it was searched, and both tables."""
-    plan = report["plan"]
-    limits, sizes = plan["limits"], plan["sizes"].values()
-    algorithms = searches.algorithms_text(plan["algorithms"])
-    judged = searches.algorithms_text(plan["judged_by"], "each of the paper's algorithms")
-    failed = sum(sum(x["failed"].values()) for x in report["environments"].values())
     return [
-        "SNES from random weights with standard deviation 0.05, inner loop: "
-        f"{algorithms}, {span(x['generations'] for x in sizes)} generations of "
-        f"{span(x['population_size'] for x in sizes)} candidates with "
-        f"{span(x['agents_per_candidate'] for x in sizes)} agents, MountainCar with the paper's curriculum; one "
-        f"search a limit. Then {plan['agents']} agents of {judged} are trained in the result. Lengths are of "
-        f"{plan['episodes']} episodes of each in the synthetic MDP whose limit is the environment's own. Scores are "
-        "normalised, 0 a random policy and 1 the paper's SAC expert (the paper divides by what each algorithm earns "
-        "after training in a bandit); interquartile mean over agents with its 95 % interval. Agents whose return was "
-        f"no number, counted as a random policy: {failed}.",
-        "",
-        "Share of episodes by length (steps):",
-        "",
-        *table(
-            ["environment", "limit", *BINS],
-            [
-                [name, str(entry["limit"]), *(f"{share:.0%}" for share in shares(entry).values())]
-                for name, entry in report["environments"].items()
-            ],
+        Claim(
+            "share of the median environment's episodes that end after a step",
+            of_one_search(single),
+            0.8,
         ),
-        "",
-        "Normalised score by the limit of an episode's length:",
-        "",
-        *table(
-            ["environment", *limits],
-            [
-                [name, *(text(scores(report, name, limit), 2) for limit in limits)]
-                for name in report["environments"]
-            ],
-        ),
+        Claim("a limit of one step costs nothing", of_one_search(costs), 0.0, TENTH, OF_THE_WAY),
     ]
+
+
+def brought(report: Report, environment: str) -> Estimate:
+    """What a limit of one step changes, with the same seeds and hyperparameters; the interval is over agents."""
+    limited, own = (normalized(report, environment, limit) for limit in ("1", OWN))
+    return paired_difference(limited, own)
+
+
+def facts(report: Report) -> dict[str, Any]:
+    """Shares and scores of every environment."""
+    environments, limits = report["environments"], report["plan"]["limits"]
+    return {
+        "shares": {name: shares(entry) for name, entry in environments.items()},
+        "brought": {name: brought(report, name) for name in environments},
+        "scores": {
+            name: [scores(report, name, limit) for limit in limits] for name in environments
+        },
+        "searched": searched(report),
+        "good": GOOD,
+        "lost": sum(sum(x["failed"].values()) for x in environments.values()),
+    }
 
 
 def draw(report: Mapping[str, Any]) -> Figure:
@@ -260,40 +201,39 @@ def draw(report: Mapping[str, Any]) -> Figure:
         (plotting.BLACK, "v", (0, (5, 1))),
     )
     limits = report["plan"]["limits"]
-    with plotting.figure_style():
-        figure = Figure(figsize=(12.0, 4.2))
-        left, right = figure.subplots(1, 2)
-        for row, entry in enumerate(report["environments"].values()):
-            start = 0.0
-            for (name, share), color in zip(shares(entry).items(), colors, strict=True):
-                label = name if row == 0 else None
-                left.barh(row, share, left=start, color=color, label=label)
-                start += share
-        left.set_yticks(range(len(report["environments"])), list(report["environments"]))
-        left.invert_yaxis()
-        left.set_xlabel("share of the episodes in the synthetic MDP")
-        left.set_title("Steps of an episode, where many are allowed")
-        below = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.16), "fontsize": 8}
-        left.legend(ncols=len(BINS), **below)
-        for i, (name, (color, marker, style)) in enumerate(
-            zip(report["environments"], looks, strict=False)
-        ):
-            found = [scores(report, name, limit) for limit in limits]
-            right.errorbar(
-                np.arange(len(limits)) + 0.06 * (i - 2),
-                [e.value for e in found],
-                plotting.error_bar(*found),
-                color=color,
-                marker=marker,
-                linestyle=style,
-                capsize=2,
-                label=name,
-            )
-        right.set_xticks(range(len(limits)), limits)
-        right.set_xlabel("longest episode (steps; max: the environment's own)")
-        right.set_ylabel("normalised score in the environment")
-        right.set_title("What the limit is worth")
-        right.legend(ncols=3, columnspacing=1.0, **below)
+    figure = Figure(figsize=(12.0, 4.2))
+    left, right = figure.subplots(1, 2)
+    for row, entry in enumerate(report["environments"].values()):
+        start = 0.0
+        for (name, share), color in zip(shares(entry).items(), colors, strict=True):
+            label = name if row == 0 else None
+            left.barh(row, share, left=start, color=color, label=label)
+            start += share
+    left.set_yticks(range(len(report["environments"])), list(report["environments"]))
+    left.invert_yaxis()
+    left.set_xlabel("share of the episodes in the synthetic MDP")
+    left.set_title("Steps of an episode, where many are allowed")
+    below = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.16), "fontsize": 8}
+    left.legend(ncols=len(BINS), **below)
+    for i, (name, (color, marker, style)) in enumerate(
+        zip(report["environments"], looks, strict=False)
+    ):
+        found = [scores(report, name, limit) for limit in limits]
+        right.errorbar(
+            np.arange(len(limits)) + 0.06 * (i - 2),
+            [e.value for e in found],
+            plotting.error_bar(*found),
+            color=color,
+            marker=marker,
+            linestyle=style,
+            capsize=2,
+            label=name,
+        )
+    right.set_xticks(range(len(limits)), limits)
+    right.set_xlabel("longest episode (steps; max: the environment's own)")
+    right.set_ylabel("normalised score in the environment")
+    right.set_title("What the limit is worth")
+    right.legend(ncols=3, columnspacing=1.0, **below)
     return figure
 
 
@@ -338,13 +278,12 @@ EXPERIMENT = Experiment(
     },
     minutes={"quick": "30", "paper": "days; for a GPU"},
     measure=measure,
-    parts=parts,
-    verdict=verdict,
-    body=body,
+    claims=claims,
+    facts=facts,
     draw=draw,
     needs="keeps its searches under runs/episode_lengths",
 )
 
 
 if __name__ == "__main__":
-    sys.exit(run(EXPERIMENT))
+    raise SystemExit(EXPERIMENT.main())

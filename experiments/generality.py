@@ -9,9 +9,9 @@ and the bandits' optimal policies need no training. The searches are run folders
 runs/generality and are resumed.
 """
 
-import sys
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -19,8 +19,8 @@ from matplotlib.figure import Figure
 
 import scb
 from experiments import searches
-from experiments.page import CLASSIC_CONTROL, Experiment, Save, finite, span, table, text
-from experiments.page import main as run
+from experiments.claims import OF_THE_WAY, TENTH, Claim
+from experiments.harness import CLASSIC_CONTROL, Experiment, Report, Save, finite
 from experiments.searches import PAPER_SIZES
 from scb import plotting
 from scb.agents.spec import AgentSpec, algorithms_for, bandit_agent
@@ -37,9 +37,11 @@ from scb.seeds import REPORTING
 from scb.statistics import (
     Estimate,
     estimate,
+    iqm,
     normalized_score,
     paired_difference,
     stratified_estimate,
+    worst_decile,
 )
 
 ZOO, DRAWN, FIXED, ENVIRONMENT = SOURCES = (
@@ -60,6 +62,7 @@ TICKS = {
     EVOLVED: "neuro-\nevolution",
     OPTIMAL: "optimal\npolicy",
 }
+RESAMPLES = 10_000  # enough for the ends of an interval that is corrected for many comparisons
 
 
 def config_of(environment: str, source: str, plan: Mapping[str, Any]) -> DiscoveryConfig:
@@ -240,135 +243,58 @@ def normalized(report: Mapping[str, Any], source: str, column: str) -> list[np.n
     ]
 
 
-def _unseen_worse(report: Mapping[str, Any]) -> list[str]:
-    """Which agents that no search saw are clearly worse in the zoo's bandits than the paper's algorithms.
-
-    Networks differ from the paper's agent by agent; other agents are compared by intervals that lie apart.
-    """
-    together = normalized(report, ZOO, TOGETHER)
-    own = stratified_estimate(together)
-
-    def worse(name: str) -> bool:
-        scores = normalized(report, ZOO, name)
-        if name in (WIDE, SWISH):
-            difference = stratified_estimate(scores, together)
-            return difference.high is not None and difference.high < 0
-        high = stratified_estimate(scores).high
-        return high is not None and own.low is not None and high < own.low
-
-    return [name for name in UNSEEN if worse(name)]
-
-
-def _differences(report: Mapping[str, Any]) -> tuple[Estimate, Estimate]:
-    """What the zoo's bandits bring over the environments, and drawn hyperparameters over fixed ones in a search."""
-    zoo, itself, drawn, fixed = (
-        normalized(report, source, TOGETHER) for source in (ZOO, ENVIRONMENT, DRAWN, FIXED)
-    )
-    return stratified_estimate(zoo, itself), stratified_estimate(drawn, fixed)
-
-
-def parts(report: Mapping[str, Any]) -> list[bool | None]:
-    """Robustness, what drawing hyperparameters brings (None where it is not clear), agents that no search saw."""
-    robust, drawn = map(_sign, _differences(report))
-    worse = _unseen_worse(report)
-    return [robust > 0, None if drawn == 0 else drawn > 0, *(x not in worse for x in UNSEEN)]
-
-
-def verdict(report: Mapping[str, Any]) -> str:
-    """Robustness to drawn hyperparameters, what drawing them in the search brings, and agents that no search saw."""
-    scores = {
-        source: stratified_estimate(normalized(report, source, TOGETHER)) for source in SOURCES
-    }
-    robust, drawn = _differences(report)
-    listed = ", ".join(f"{source} {text(x, 2)}" for source, x in scores.items())
-    unseen = {name: stratified_estimate(normalized(report, ZOO, name)) for name in UNSEEN}
-    worse = _unseen_worse(report)
-    return (
-        "normalised scores (0 a random policy, 1 the paper's expert; the mean over environments of the interquartile "
-        f"mean over agents) of the paper's algorithms with drawn hyperparameters: {listed}. The zoo's bandits "
-        + ("are" if _sign(robust) > 0 else "are not")
-        + f" more robust to hyperparameters than the environments (difference {text(robust, 2, sign=True)}). Drawing "
-        f"them in the search (one search each) changes {text(drawn, 2, sign=True)}: "
-        + {1: "it helps", 0: "no clear difference", -1: "it harms here"}[_sign(drawn)]
-        + f" ({_by_environment(report)}). Agents that are not in the paper's inner loop, in the zoo's bandits: "
-        + ", ".join(f"{name} {text(x, 2)}" for name, x in unseen.items())
-        + "; "
-        + (
-            f"clearly worse than those that are: {' and '.join(worse)}."
-            if worse
-            else "none is clearly worse than those that are."
+def claims(report: Report) -> list[Claim]:
+    """Robustness, by all agents and by the worst; what drawing hyperparameters brings; agents that no search saw."""
+    scores = {source: normalized(report, source, TOGETHER) for source in SOURCES}
+    robust = partial(stratified_estimate, scores[ZOO], scores[ENVIRONMENT], num_resamples=RESAMPLES)
+    # One search each: how far two others would be apart, agents can't tell.
+    brought = stratified_estimate(scores[DRAWN], scores[FIXED]).value
+    found = [
+        Claim(
+            "drawn hyperparameters: the mean score is better in the zoo's bandits",
+            partial(robust, statistic=np.mean),
+        ),
+        Claim("and so is the worst decile", partial(robust, statistic=worst_decile)),
+        Claim("more so where the search drew them", Estimate(brought, None, None, 1)),
+    ]
+    for name in UNSEEN:
+        # Networks differ from the paper's agent by agent; other agents have nothing in common with them.
+        evidence = partial(
+            stratified_estimate,
+            normalized(report, ZOO, name),
+            scores[ZOO],
+            paired=name in (WIDE, SWISH),
+            num_resamples=RESAMPLES,
         )
-    )
+        text = f"{name}: no worse than the paper's algorithms"
+        found.append(Claim(text, evidence, 0.0, TENTH, OF_THE_WAY))
+    return found
 
 
-def _by_environment(report: Mapping[str, Any]) -> str:
-    """Where drawing hyperparameters in the search helps or harms, and where neither search left its start."""
-    found: dict[str, list[str]] = {}
-    for name, entry in report["environments"].items():
-        chosen = report["generation"][name]
-        if chosen[DRAWN] == chosen[FIXED] == 0:
-            said = "the common start is still the best in"
-        else:
-            # The same seeds and the same drawn hyperparameters in both.
-            drawn, fixed = (columns(entry[source])[TOGETHER] for source in (DRAWN, FIXED))
-            said = {1: "clearly better in", 0: "not clearly apart in", -1: "clearly worse in"}[
-                _sign(paired_difference(drawn, fixed))
-            ]
-        found.setdefault(said, []).append(name)
-    return "; ".join(f"{said} {' and '.join(names)}" for said, names in found.items())
-
-
-def _sign(difference: Estimate) -> int:
-    """1 or -1 where the interval excludes zero, else 0."""
-    assert difference.low is not None and difference.high is not None
-    return int(difference.low > 0) - int(difference.high < 0)
-
-
-def body(report: Mapping[str, Any]) -> list[str]:
-    """How it was measured, and a table for each environment."""
-    plan = report["plan"]
-    own = plan["neuroevolution"]
-    steps = own["num_generations"] * own["population_size"] * own["episodes"]
-    algorithms = searches.algorithms_text(plan["algorithms"])
-    sizes = list(plan["sizes"].values())
-    failed = sum(report["failed"].values())
-    lines = [
-        f"{plan['agents']} agents of each algorithm with hyperparameters drawn from the paper's lists, 10 000 steps, "
-        f"{plan['episodes']} episodes of most likely actions; reporting seed 10 000. *{TOGETHER}*, *{WIDE}* and "
-        f"*{SWISH}* are over the agents of all algorithms. Neuroevolution is SNES on a policy network with {steps} "
-        f"steps: in bandits {own['num_generations']} generations of {own['population_size']} candidates on "
-        f"{own['episodes']} contexts, in environments as many steps with one episode a candidate. The two searches "
-        f"train {algorithms} for {span(x['generations'] for x in sizes)} generations of "
-        f"{span(x['population_size'] for x in sizes)} candidates (SNES, standard deviation {plan['sigma']:g}, returns "
-        f"combined by {plan['combine']}), from one "
-        f"{'fit to an expert' if plan['init'] == 'expert' else 'random start'}, and differ only in whether the inner "
-        "agents' hyperparameters are drawn or the paper's underlined ones. What the zoo's bandits were found with "
-        "stands in their commands (`scb list`). Interquartile means with 95 % intervals. Agents whose return was no "
-        f"number, counted as a random policy: {failed}.",
-    ]
-    generations = ", ".join(
-        f"{name} {chosen[DRAWN]} and {chosen[FIXED]}"
-        for name, chosen in report["generation"].items()
-    )
-    lines += [
-        "",
-        "A search gives the mean that was judged best, of these generations (drawn and fixed hyperparameters; 0 is the "
-        f"start, which both have in common): {generations}.",
-    ]
-    for name, entry in report["environments"].items():
-        by_source = {source: columns(entry[source]) for source in SOURCES}
-        rows = [
-            [
-                column,
-                *(
-                    text(estimate(found[column]), 1) if column in found else ""
-                    for found in by_source.values()
-                ),
-            ]
-            for column in by_source[ZOO]
-        ]
-        lines += ["", f"## {name}", "", *table(["agents", *SOURCES], rows)]
-    return lines
+def facts(report: Report) -> dict[str, Any]:
+    """Scores of every source by three statistics, and what the two searches differ by."""
+    scores = {source: normalized(report, source, TOGETHER) for source in SOURCES}
+    return {
+        "scores": {
+            source: [stratified_estimate(x, statistic=s) for s in (iqm, np.mean, worst_decile)]
+            for source, x in scores.items()
+        },
+        "unseen": {name: stratified_estimate(normalized(report, ZOO, name)) for name in UNSEEN},
+        "brought": {
+            name: paired_difference(
+                columns(entry[DRAWN])[TOGETHER], columns(entry[FIXED])[TOGETHER]
+            )
+            for name, entry in report["environments"].items()
+        },
+        "chosen": {name: (x[DRAWN], x[FIXED]) for name, x in report["generation"].items()},
+        "sources": SOURCES,
+        "columns": {
+            name: {source: columns(entry[source]) for source in SOURCES}
+            for name, entry in report["environments"].items()
+        },
+        "names": {"together": TOGETHER, "wide": WIDE, "swish": SWISH},
+        "lost": sum(report["failed"].values()),
+    }
 
 
 def draw(report: Mapping[str, Any]) -> Figure:
@@ -381,45 +307,40 @@ def draw(report: Mapping[str, Any]) -> Figure:
         (plotting.VERMILLION, "D"),
     )
     names = list(report["environments"])
-    with plotting.figure_style():
-        figure = Figure(figsize=(12.0, 3.1 * -(-len(names) // 2)))
-        panels = figure.subplots(-(-len(names) // 2), 2, squeeze=False).ravel()
-        for axes in panels[len(names) :]:
-            axes.axis("off")
-        for axes, name in zip(panels, names, strict=False):
-            entry = report["environments"][name]
-            shown = list(columns(entry[ZOO]))
-            for i, (source, (color, marker)) in enumerate(zip(SOURCES, looks, strict=True)):
-                for column, values in columns(entry[source]).items():
-                    found = estimate(values)
-                    x = shown.index(column) + 0.17 * (i - 1.5)
-                    axes.errorbar(
-                        x,
-                        found.value,
-                        plotting.error_bar(found),
-                        fmt=marker,
-                        color=color,
-                        capsize=2,
-                        markersize=4,
-                    )
-            axes.axvline(
-                shown.index(TOGETHER) + 0.5, color=plotting.BLACK, linestyle="--", linewidth=1
-            )
-            axes.set_xticks(
-                range(len(shown)),
-                [TICKS.get(x, x.upper()) for x in shown],
-                fontsize=8,
-            )
-            axes.set_ylabel("return")
-            axes.set_title(name)
-        handles: list[Any] = [
-            panels[0].plot([], [], marker, color=color)[0] for color, marker in looks
-        ]
-        plotting.legend_below(figure, (handles, list(SOURCES)), columns=4)
-        plotting.figure_title(
-            figure,
-            "Judged in the environment after training in ...; right of the line: not in the paper's inner loop",
+    figure = Figure(figsize=(12.0, 3.1 * -(-len(names) // 2)))
+    panels = figure.subplots(-(-len(names) // 2), 2, squeeze=False).ravel()
+    for axes in panels[len(names) :]:
+        axes.axis("off")
+    for axes, name in zip(panels, names, strict=False):
+        entry = report["environments"][name]
+        shown = list(columns(entry[ZOO]))
+        for i, (source, (color, marker)) in enumerate(zip(SOURCES, looks, strict=True)):
+            for column, values in columns(entry[source]).items():
+                found = estimate(values)
+                x = shown.index(column) + 0.17 * (i - 1.5)
+                axes.errorbar(
+                    x,
+                    found.value,
+                    plotting.error_bar(found),
+                    fmt=marker,
+                    color=color,
+                    capsize=2,
+                    markersize=4,
+                )
+        axes.axvline(shown.index(TOGETHER) + 0.5, color=plotting.BLACK, linestyle="--", linewidth=1)
+        axes.set_xticks(
+            range(len(shown)),
+            [TICKS.get(x, x.upper()) for x in shown],
+            fontsize=8,
         )
+        axes.set_ylabel("return")
+        axes.set_title(name)
+    handles: list[Any] = [panels[0].plot([], [], marker, color=color)[0] for color, marker in looks]
+    plotting.legend_below(figure, (handles, list(SOURCES)), columns=4)
+    plotting.figure_title(
+        figure,
+        "Judged in the environment after training in ...; right of the line: not in the paper's inner loop",
+    )
     return figure
 
 
@@ -469,13 +390,12 @@ EXPERIMENT = Experiment(
     },
     minutes={"quick": "60 to 120 min", "paper": "days; for a GPU"},
     measure=measure,
-    parts=parts,
-    verdict=verdict,
-    body=body,
+    claims=claims,
+    facts=facts,
     draw=draw,
     needs="keeps its searches under runs/generality",
 )
 
 
 if __name__ == "__main__":
-    sys.exit(run(EXPERIMENT))
+    raise SystemExit(EXPERIMENT.main())

@@ -9,7 +9,6 @@ nothing about states that it never shows, and does not choose among actions that
 tested is drawn at random among B's optima, ties included, and acts at random where B shows nothing.
 """
 
-import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
@@ -18,8 +17,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from experiments.page import Experiment, Save, table
-from experiments.page import main as run
+from experiments.claims import Claim
+from experiments.harness import Experiment, Report, Save
 from scb import plotting
 
 Floats = NDArray[np.floating]
@@ -180,55 +179,12 @@ def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None
     report["mdps"], report["policies"] = plan["mdps"], POLICIES
 
 
-def parts(report: Mapping[str, Any]) -> list[bool]:
-    """Whether every bandit has the MDP's optima that shows every optimal policy's states, or singles one out."""
+def claims(report: Report) -> list[Claim]:
+    """Every bandit has the MDP's optima that shows every optimal policy's states, or singles one out."""
     found = report["regrets"]
     enough = [f"{c} | {x}" for c in COVERED for x in (ANY, EVERY)] + [f"1 where a = a* | {ONE}"]
-    return [all(found[x]["optimal"] == 1.0 for x in enough)]
-
-
-def verdict(report: Mapping[str, Any]) -> str:
-    """Where it holds, with how many policies."""
-    found = report["regrets"]
-    (holds,) = parts(report)
-    lost = 1.0 - found[f"Q* | {ONE}"]["optimal"]
-    text = (
-        "where the bandit shows the states of every optimal policy, or where its reward singles out one, "
-        f"{'all' if holds else 'not all'} of {report['policies']} policies drawn from the optima of each of "
-        f"{report['mdps']:,} bandits are optimal in their MDP."
-    )
-    if lost > 0:
-        text += (
-            " Where actions tie it needs a word more than the paper's proof has: with Q* as the reward and the "
-            f"states of *one* optimal policy as contexts, {lost:.0%} of these MDPs have a policy that is optimal in "
-            "the bandit and not in the MDP. It takes a tied action into states that the bandit never shows."
-        )
-    return text
-
-
-def body(report: Mapping[str, Any]) -> list[str]:
-    """The table."""
-    found = report["regrets"]
-    rows = [
-        [
-            key.split(" | ")[0].replace("*", "\\*"),
-            key.split(" | ")[1],
-            f"{x['optimal']:.1%}",
-            f"{x['largest']:.2g}",
-        ]
-        for key, x in found.items()
-    ]
-    return [
-        f"{report['mdps']:,} random MDPs with 3 to 29 states and 2 to 5 actions, two successors for each action, "
-        "discount 0.5 to 0.99, a fifth of the states as starts; in three states of ten another action, which leads "
-        "elsewhere, ties with the best. Values are solutions of the linear Bellman equations. *Optimal*: in how many "
-        f"MDPs all {report['policies']} policies drawn at random from the bandit's optima earn what the best policy "
-        "earns (to 1e-6).",
-        "",
-        *table(["reward of the bandit", "contexts", "optimal", "largest regret"], rows),
-        "",
-        "The last two rewards are no constructions of the lemma and are there to show that the check can fail.",
-    ]
+    text = "every bandit that shows every optimal policy's states, or singles one out, has the MDP's optima"
+    return [Claim(text, all(found[x]["optimal"] == 1.0 for x in enough))]
 
 
 def draw(report: Mapping[str, Any]) -> Figure:
@@ -237,22 +193,21 @@ def draw(report: Mapping[str, Any]) -> Figure:
     found = report["regrets"]
     palette = (plotting.VERMILLION, plotting.BLUE, plotting.GREEN, plotting.GREY)
     colors = dict(zip(CONTEXTS, palette, strict=True))
-    with plotting.figure_style():
-        figure = Figure(figsize=(plotting.WIDTH, 4.6))
-        axes = figure.subplots()
-        for i, contexts in enumerate(CONTEXTS):
-            shares = [found[f"{c} | {contexts}"]["optimal"] for c in REWARDS]
-            positions = np.arange(len(REWARDS)) + (i - 1.5) * 0.2
-            axes.barh(positions, shares, height=0.18, color=colors[contexts], label=contexts)
-            for x, y in zip(shares, positions, strict=True):
-                axes.text(x + 0.01, y, f"{x:.1%}", va="center", fontsize=7)
-        axes.set_yticks(range(len(REWARDS)), list(REWARDS))
-        axes.invert_yaxis()
-        axes.set_xlim(0, 1.1)
-        axes.set_xlabel("share of MDPs where every optimal policy of the bandit is optimal")
-        plotting.figure_title(figure, f"The lemma on {report['mdps']:,} random MDPs")
-        handles, names = axes.get_legend_handles_labels()
-        plotting.legend_below(figure, (handles, [f"contexts: {n}" for n in names]), columns=2)
+    figure = Figure(figsize=(plotting.WIDTH, 4.6))
+    axes = figure.subplots()
+    for i, contexts in enumerate(CONTEXTS):
+        shares = [found[f"{c} | {contexts}"]["optimal"] for c in REWARDS]
+        positions = np.arange(len(REWARDS)) + (i - 1.5) * 0.2
+        axes.barh(positions, shares, height=0.18, color=colors[contexts], label=contexts)
+        for x, y in zip(shares, positions, strict=True):
+            axes.text(x + 0.01, y, f"{x:.1%}", va="center", fontsize=7)
+    axes.set_yticks(range(len(REWARDS)), list(REWARDS))
+    axes.invert_yaxis()
+    axes.set_xlim(0, 1.1)
+    axes.set_xlabel("share of MDPs where every optimal policy of the bandit is optimal")
+    plotting.figure_title(figure, f"The lemma on {report['mdps']:,} random MDPs")
+    handles, names = axes.get_legend_handles_labels()
+    plotting.legend_below(figure, (handles, [f"contexts: {n}" for n in names]), columns=2)
     return figure
 
 
@@ -265,12 +220,10 @@ EXPERIMENT = Experiment(
     presets={"quick": {"mdps": 300, "seed": 0}, "paper": {"mdps": 5000, "seed": 0}},
     minutes={"quick": "1", "paper": "4"},
     measure=measure,
-    parts=parts,
-    verdict=verdict,
-    body=body,
+    claims=claims,
     draw=draw,
 )
 
 
 if __name__ == "__main__":
-    sys.exit(run(EXPERIMENT))
+    raise SystemExit(EXPERIMENT.main())

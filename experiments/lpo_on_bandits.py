@@ -24,7 +24,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, LogLocator, NullFormatter, StrMethodFormatter
 
-from experiments.page import exit_status, read, text
+from experiments.harness import exit_status, read
+from experiments.rendering import text
 from lpo.generalization import compare
 from lpo.learning import objective_of_run
 from lpo.objectives import Objective, load_objective

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments.page import exit_status
+from experiments.harness import exit_status
 from lpo.meta_training import MetaTraining, MetaTrainingConfig
 from lpo.pipeline import environment_problem
 from scb.artefacts import machine_description, package_versions

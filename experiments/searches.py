@@ -1,18 +1,21 @@
 """Discoveries that experiments compare: each in a run folder of its own, so that a killed one goes on."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-from experiments.page import text
+import numpy as np
+
+from experiments.rendering import text
 from scb.curriculum import CurriculumConfig, paper_curriculum
 from scb.discovery import BanditDiscovery, DiscoveryConfig, discover
 from scb.errors import UserError
 from scb.evolution import EvolutionConfig, Outcome
 from scb.runs import Run, config_dict
-from scb.statistics import Estimate, estimate
+from scb.statistics import Estimate, Statistic, estimate, stratified_estimate
 
 NONE = "none"  # the curriculum that is none
 # Of two searches the bootstrap's interval is their range: two such lie apart by chance in every third comparison.
@@ -74,13 +77,6 @@ def curriculum_of(environment: str, shape: str, generations: int) -> CurriculumC
             f"the paper has no curriculum for {environment}: its shape must be {NONE!r}."
         )
     return replace(curriculum, shape=shape)
-
-
-def algorithms_text(
-    algorithms: Sequence[str], otherwise: str = "all of the paper's algorithms"
-) -> str:
-    """Such as "PPO, SAC"; a plan's empty list stands for all."""
-    return ", ".join(name.upper() for name in algorithms) or otherwise
 
 
 def search(config: DiscoveryConfig, folder: str | Path) -> tuple[BanditDiscovery, Outcome]:
@@ -151,23 +147,33 @@ class Final:
         found = text(self.estimate, places)
         return f"{found} ({self.failed} of {self.searches} failed)" if self.failed else found
 
-    def clearly_above(self, other: "Final") -> bool:
-        """Whether the interval lies above the other's; a failure is worse than any return.
 
-        Never of fewer than five searches.
-        """
-        if self.estimate is None or self.failed or min(self.searches, other.searches) < ENOUGH:
-            return False
-        if other.estimate is None:
-            return True
-        low, high = self.estimate.low, other.estimate.high
-        return low is not None and high is not None and low > high
+def last(curves: Mapping[str, Mapping[str, Any]]) -> list[float]:
+    """The last judgements of the searches of {seed: curve} that didn't fail."""
+    return [c["fitness"][-1] for c in curves.values() if c["fitness"][-1] is not None]
 
 
-def final(curves: Mapping[str, Mapping[str, Any]], statistic: Any) -> Final:
+def final(curves: Mapping[str, Mapping[str, Any]], statistic: Statistic) -> Final:
     """The last judgement, over the searches of {seed: curve}."""
-    last = [c["fitness"][-1] for c in curves.values() if c["fitness"][-1] is not None]
-    return Final(estimate(last, statistic) if last else None, len(curves) - len(last))
+    found = last(curves)
+    return Final(estimate(found, statistic) if found else None, len(curves) - len(found))
+
+
+def difference(
+    one: Mapping[str, Mapping[str, Any]],
+    other: Mapping[str, Mapping[str, Any]],
+    statistic: Statistic,
+) -> Callable[..., Estimate] | Estimate:
+    """How far the searches of one kind end above those of another, as evidence of a claim.
+
+    There is no interval of fewer than five searches, and none where one of the first failed, which is worse
+    than any return.
+    """
+    above, below = last(one), last(other)
+    if len(above) == len(one) and min(len(above), len(below)) >= ENOUGH:
+        return partial(stratified_estimate, [above], [below], statistic=statistic, paired=False)
+    value = np.nan if not (above and below) else float(statistic(above) - statistic(below))
+    return Estimate(value, None, None, len(one))
 
 
 def _rounded(value: float | None, digits: int = 2) -> float | None:

@@ -5,8 +5,8 @@
 The experts are those of `experiments.experts`, trained again.
 """
 
-import sys
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import jax
@@ -15,8 +15,16 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from experiments import experts
-from experiments.page import ACTIONS, CLASSIC_CONTROL, Experiment, Save, packed, table, unpacked
-from experiments.page import main as run
+from experiments.claims import Claim
+from experiments.harness import (
+    CLASSIC_CONTROL,
+    Experiment,
+    Report,
+    Save,
+    packed,
+    unpacked,
+)
+from experiments.interpretability import ACTIONS
 from scb import plotting
 from scb.agents.agent import flat_bounds
 from scb.analysis import figures
@@ -28,6 +36,7 @@ from scb.environments.registry import environment_spec
 from scb.environments.synthetic import SyntheticBandit
 from scb.environments.zoo import bandit_metadata, open_bandit
 from scb.keys import root_key, split_key
+from scb.statistics import Estimate, estimate
 
 POINTS = 50  # of the grid of best actions, in either direction
 CELLS = 20  # of the grid whose share of visited cells is the coverage
@@ -137,98 +146,64 @@ def summary(entry: Mapping[str, Any]) -> dict[str, float]:
     }
 
 
-def parts(report: Mapping[str, Any]) -> list[bool]:
-    """Environment by environment: whether the contexts cover more; then whether actions are smoother in two or more."""
+def claims(report: Report) -> list[Claim]:
+    """The contexts cover more, and the actions are smoother.
+
+    An environment has one bandit and one expert here, so environments are what the intervals draw.
+    """
     found = [summary(x) for x in report["environments"].values()]
-    return [*map(_wider, found), sum(map(_smoother, found)) >= 2]
 
+    def mean(of: str, minus: str) -> partial[Estimate]:
+        return partial(estimate, [x[of] - x[minus] for x in found], statistic=np.mean)
 
-def _wider(x: Mapping[str, float]) -> bool:
-    return x[BANDIT_COVERAGE] > x[EXPERT_COVERAGE]
-
-
-def _smoother(x: Mapping[str, float]) -> bool:
-    return x[BANDIT_ROUGHNESS] < x[EXPERT_ROUGHNESS]
-
-
-def verdict(report: Mapping[str, Any]) -> str:
-    """Whose states cover more of the plane, and whose best actions change less over it."""
-    found = {name: summary(x) for name, x in report["environments"].items()}
-    covered = ", ".join(
-        f"{n} {x[BANDIT_COVERAGE]:.0%} against {x[EXPERT_COVERAGE]:.0%}"
-        + (f", with {x[OUTSIDE]:.0%} of its contexts off the plane" if x[OUTSIDE] > MANY else "")
-        for n, x in found.items()
-    )
-    changes = ", ".join(
-        f"{n} {x[BANDIT_ROUGHNESS]:.1%} against {x[EXPERT_ROUGHNESS]:.1%}" for n, x in found.items()
-    )
-    wider, smoother = (sum(map(f, found.values())) for f in (_wider, _smoother))
-    return (
-        f"the bandit's contexts cover more of the plane than the expert's states in {wider} of {len(found)} "
-        f"environments ({covered}); its best actions change less over the plane than the expert's in "
-        f"{smoother} of {len(found)} ({changes})."
-    )
-
-
-def body(report: Mapping[str, Any]) -> list[str]:
-    """How they were drawn, and the numbers."""
-    rows = [
-        [
-            name,
-            f"{entry['expert']:.1f}".replace("-", "\u2212"),
-            *(f"{x:.1%}" for x in summary(entry).values()),
-        ]
-        for name, entry in report["environments"].items()
-    ]
     return [
-        f"{STATES} states each. Top: visited by the best of {report['plan']['agents']} SAC agents (most likely "
-        "actions), over the action with the largest Q-value of that agent. Bottom: contexts of the zoo's bandit, over "
-        "the action with its largest reward. Where an observation has more than three entries, two of them span the "
-        "plane and the others are at their median. Coverage is the share of 20 \u00d7 20 cells that hold a "
-        "state; roughness is how often the best action differs between neighbours of a 50 \u00d7 50 grid (continuous "
-        "actions: their mean distance, as a share of the action's range).",
-        "",
-        *table(
-            [
-                "environment",
-                "expert's return",
-                *next(iter(map(summary, report["environments"].values()))),
-            ],
-            rows,
+        Claim(
+            "contexts cover more of the plane than the expert's states, mean over environments",
+            mean(BANDIT_COVERAGE, EXPERT_COVERAGE),
+        ),
+        Claim(
+            "the bandit's best actions change less than the expert's, mean over environments",
+            mean(EXPERT_ROUGHNESS, BANDIT_ROUGHNESS),
+            places=3,
         ),
     ]
+
+
+def facts(report: Report) -> dict[str, Any]:
+    """The numbers of every environment."""
+    found = {name: summary(x) for name, x in report["environments"].items()}
+    wider = sum(x[BANDIT_COVERAGE] > x[EXPERT_COVERAGE] for x in found.values())
+    smoother = sum(x[BANDIT_ROUGHNESS] < x[EXPERT_ROUGHNESS] for x in found.values())
+    return {"found": found, "states": STATES, "many": MANY, "wider": wider, "smoother": smoother}
 
 
 def draw(report: Mapping[str, Any]) -> Figure:
     """A column an environment: the expert above, the bandit below."""
 
-    with plotting.figure_style():
-        figure = Figure(figsize=(3.0 * len(report["environments"]), 6.2))
-        panels: Any = figure.subplots(2, len(report["environments"]), squeeze=False)
-        for column, (name, entry) in enumerate(report["environments"].items()):
-            limits: Any = tuple(map(tuple, entry["limits"]))
-            plane = Plane(tuple(entry["labels"]), limits, lambda x: x, lambda x: x)
-            for axes, states, actions, whose in (
-                (panels[0, column], "visited", "expert_actions", "expert"),
-                (panels[1, column], "contexts", "bandit_actions", "bandit"),
-            ):
-                drawn = figures.action_grid(
-                    axes, plane, unpacked(entry[actions]), entry["num_actions"], entry["bounds"]
-                )
-                points = points_of(entry[states], entry["limits"])
-                # A white edge, for black is hard to see on the dark ends of the background.
-                axes.scatter(
-                    *points.T, s=6, color=plotting.BLACK, edgecolors="white", linewidths=0.3
-                )
-                axes.set_title(f"{name}\n{whose}", fontsize=9)
-            bar = figure.colorbar(drawn, ax=panels[1, column], location="bottom", aspect=30)
-            bar.set_label(f"best action: {ACTIONS[name]}", fontsize=8)
-            if entry["num_actions"]:
-                bar.set_ticks(range(entry["num_actions"]))
-        plotting.figure_title(
-            figure,
-            f"{STATES} states of an expert in the environment and of the bandit, over the best actions",
-        )
+    figure = Figure(figsize=(3.0 * len(report["environments"]), 6.2))
+    panels: Any = figure.subplots(2, len(report["environments"]), squeeze=False)
+    for column, (name, entry) in enumerate(report["environments"].items()):
+        limits: Any = tuple(map(tuple, entry["limits"]))
+        plane = Plane(tuple(entry["labels"]), limits, lambda x: x, lambda x: x)
+        for axes, states, actions, whose in (
+            (panels[0, column], "visited", "expert_actions", "expert"),
+            (panels[1, column], "contexts", "bandit_actions", "bandit"),
+        ):
+            drawn = figures.action_grid(
+                axes, plane, unpacked(entry[actions]), entry["num_actions"], entry["bounds"]
+            )
+            points = points_of(entry[states], entry["limits"])
+            # A white edge, for black is hard to see on the dark ends of the background.
+            axes.scatter(*points.T, s=6, color=plotting.BLACK, edgecolors="white", linewidths=0.3)
+            axes.set_title(f"{name}\n{whose}", fontsize=9)
+        bar = figure.colorbar(drawn, ax=panels[1, column], location="bottom", aspect=30)
+        bar.set_label(f"best action: {ACTIONS[name]}", fontsize=8)
+        if entry["num_actions"]:
+            bar.set_ticks(range(entry["num_actions"]))
+    plotting.figure_title(
+        figure,
+        f"{STATES} states of an expert in the environment and of the bandit, over the best actions",
+    )
     return figure
 
 
@@ -259,12 +234,11 @@ EXPERIMENT = Experiment(
     },
     minutes={"quick": "6", "paper": "13"},
     measure=measure,
-    parts=parts,
-    verdict=verdict,
-    body=body,
+    claims=claims,
+    facts=facts,
     draw=draw,
 )
 
 
 if __name__ == "__main__":
-    sys.exit(run(EXPERIMENT))
+    raise SystemExit(EXPERIMENT.main())

@@ -21,7 +21,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from experiments.page import exit_status, read, text
+from experiments.harness import exit_status, read
+from experiments.rendering import text
 from lpo.generalization import compare
 from lpo.learning import command_of, objective_of_run
 from lpo.objectives import load_objective

@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from experiments.page import exit_status
+from experiments.harness import exit_status
 from lpo import drift_figures
 from lpo.drifts import ClosedFormDrift
 from lpo.objectives import load_objective, zoo_names

@@ -7,7 +7,6 @@ shown. The GIFs lie beside the page, Brax's viewer (which loads its script from 
 runs/visualize.
 """
 
-import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -16,9 +15,15 @@ import jax
 import numpy as np
 from matplotlib.figure import Figure
 
-from experiments.brax_curriculum import STANDING
-from experiments.page import CLASSIC_CONTROL, Experiment, Save, packed, table, text, unpacked
-from experiments.page import main as run
+from experiments.claims import Claim
+from experiments.harness import (
+    CLASSIC_CONTROL,
+    Experiment,
+    Report,
+    Save,
+    packed,
+    unpacked,
+)
 from scb import plotting
 from scb.agents.spec import bandit_agent
 from scb.analysis import animation
@@ -28,9 +33,10 @@ from scb.environments.registry import environment_spec
 from scb.environments.zoo import open_bandit
 from scb.errors import UserError
 from scb.keys import root_key, split_key
-from scb.statistics import estimate
+from scb.statistics import Estimate, estimate
 
 HOPPER = "hopper (spring)"
+STANDING = environment_spec("hopper").standing_still("spring") or 0.0
 FRAMES = 6  # of the film strip
 PICTURES = 125  # of a GIF at most: five seconds
 VIEWER = Path("runs/visualize/hopper.html")
@@ -105,91 +111,43 @@ def animate(report: Mapping[str, Any], docs: Path) -> None:
             save_gif(path, name, film(entry)[:PICTURES], entry["every"])
 
 
-def _number(value: float, places: int) -> str:
-    return f"{value:.{places}f}".replace("-", "\u2212")
-
-
-def _good(report: Mapping[str, Any]) -> list[str]:
-    """Where agents earn at most a tenth less than the paper's SAC expert; on Hopper what standing still does."""
-
-    def level(name: str) -> float:
+def claims(report: Report) -> list[Claim]:
+    """Environment by environment: the paper's SAC expert's return or next to it; on Hopper more than standing still."""
+    found = []
+    for name, entry in report["environments"].items():
+        agents = Estimate(**entry["agents"])
         if name == HOPPER:
-            return STANDING
+            found.append(Claim(f"{name}: more than standing still", agents, STANDING, places=0))
+            continue
         expert = environment_spec(name).reference_return()
-        return expert - 0.1 * abs(expert)
-
-    found = report["environments"].items()
-    return [name for name, entry in found if entry["agents"]["value"] >= level(name)]
-
-
-def parts(report: Mapping[str, Any]) -> list[bool]:
-    """Environment by environment: whether agents do well."""
-    good = _good(report)
-    return [name in good for name in report["environments"]]
+        margin = round(0.1 * abs(expert), 1)
+        text = f"{name}: no less than the paper's SAC expert"
+        found.append(
+            Claim(text, agents, expert, margin, "doing well: a tenth of its return", places=0)
+        )
+    return found
 
 
-def verdict(report: Mapping[str, Any]) -> str:
-    """What all agents earn, whether that is an expert's return, and what is seen."""
-    found = report["environments"]
-    good = _good(report)
-    earned = "; ".join(f"{name} {text(entry['agents'])}" for name, entry in found.items())
-    shown = "; ".join(f"{name} {_number(entry['shown'], 0)}" for name, entry in found.items())
-    return (
-        "agents that learned for 10 000 steps in a bandit, without one step of the environment, earn there "
-        f"(interquartile mean): {earned}. That is the return of the paper's SAC expert or at most a tenth less in "
-        f"{', '.join(good) or 'none'}; standing still would earn {STANDING:.0f} of Hopper. The episodes shown, of the "
-        f"best of {report['plan']['agents']} agents: {shown}."
-    )
-
-
-def body(report: Mapping[str, Any]) -> list[str]:
-    """The GIFs and the table."""
-    gifs = [
-        f"![{name}: an agent trained in its bandit](figures/visualize_{name}.gif)"
-        for name in report["environments"]
-        if name != HOPPER
-    ]
-    rows = [
-        [name, text(entry["agents"]), _number(entry["shown"], 1), str(entry["steps"])]
-        for name, entry in report["environments"].items()
-    ]
-    return [
-        " ".join(gifs),
-        "",
-        f"Hopper's episode (on `spring` physics) is in `{VIEWER}` after the command has run: a page with Brax's "
-        "viewer.",
-        "",
-        *table(
-            [
-                "environment",
-                "return of the agents, IQM [95 %]",
-                "return of what is shown",
-                "steps shown",
-            ],
-            rows,
-        ),
-        "",
-        "PPO with the paper's fixed hyperparameters; the agent shown is the best of them by other episodes. Most "
-        "likely actions. Acrobot's last step costs nothing.",
-    ]
+def facts(report: Report) -> dict[str, Any]:
+    """What is shown where."""
+    return {"hopper": HOPPER, "viewer": VIEWER, "standing": STANDING}
 
 
 def draw(report: Mapping[str, Any]) -> Figure:
     """A film strip: a row an environment, from the first step to the last."""
 
     films = {n: e for n, e in report["environments"].items() if "film" in e}
-    with plotting.figure_style():
-        figure = Figure(figsize=(plotting.WIDTH, 1.6 * len(films)))
-        panels: Any = figure.subplots(len(films), FRAMES, squeeze=False)
-        for row, (name, entry) in zip(panels, films.items(), strict=True):
-            observations = film(entry)
-            pictures = np.linspace(0, len(observations) - 1, FRAMES).astype(int)
-            for axes, number in zip(row, pictures, strict=True):
-                picture(axes, name, observations[number])
-                step = min(number * entry["every"], entry["steps"])
-                axes.set_title(f"step {step}", fontsize=8, fontweight="normal")
-            row[0].set_title(f"{name}\nstep 0", fontsize=8)
-        plotting.figure_title(figure, "Agents trained in a bandit, in its environment")
+    figure = Figure(figsize=(plotting.WIDTH, 1.6 * len(films)))
+    panels: Any = figure.subplots(len(films), FRAMES, squeeze=False)
+    for row, (name, entry) in zip(panels, films.items(), strict=True):
+        observations = film(entry)
+        pictures = np.linspace(0, len(observations) - 1, FRAMES).astype(int)
+        for axes, number in zip(row, pictures, strict=True):
+            picture(axes, name, observations[number])
+            step = min(number * entry["every"], entry["steps"])
+            axes.set_title(f"step {step}", fontsize=8, fontweight="normal")
+        row[0].set_title(f"{name}\nstep 0", fontsize=8)
+    plotting.figure_title(figure, "Agents trained in a bandit, in its environment")
     return figure
 
 
@@ -219,13 +177,12 @@ EXPERIMENT = Experiment(
     minutes={"quick": "2", "paper": "3"},
     needs="needs a browser with access to the web for Hopper's page",
     measure=measure,
-    parts=parts,
-    verdict=verdict,
-    body=body,
+    claims=claims,
+    facts=facts,
     draw=draw,
     extras=animate,
 )
 
 
 if __name__ == "__main__":
-    sys.exit(run(EXPERIMENT))
+    raise SystemExit(EXPERIMENT.main())

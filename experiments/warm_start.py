@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from experiments.page import exit_status
+from experiments.harness import exit_status
 from scb import make
 from scb.agents.spec import algorithms_for, bandit_agent
 from scb.artefacts import machine_description, package_versions

@@ -14,7 +14,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from experiments.page import exit_status
+from experiments.harness import exit_status
 from scb.environments.zoo import bandit_metadata, load_bandit, save_bandit
 
 

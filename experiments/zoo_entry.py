@@ -12,7 +12,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from experiments.page import exit_status, run_name
+from experiments.harness import exit_status, run_name
 from lpo.objectives import load_objective, save_objective
 from scb.errors import UserError
 

@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 
-from experiments.page import exit_status, read
+from experiments.harness import exit_status, read
 from experiments.zoo_table_page import (
     ACTIONS,
     BANDITS,

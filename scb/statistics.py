@@ -159,6 +159,8 @@ def stratified_estimate(
     confidence: float = 0.95,
     num_resamples: int = 2000,
     seed: int = 0,
+    statistic: Statistic = iqm,
+    paired: bool = True,
 ) -> Estimate:
     """The mean over groups of their interquartile means, with an interval that resamples within every group.
 
@@ -167,8 +169,9 @@ def stratified_estimate(
 
     Args:
       groups: [N_g] one number per run, for each group.
-      minus: of the same sizes, run by run on the same seeds; the estimate is then that of the difference,
-        paired in the bootstrap.
+      minus: as many groups; the estimate is then that of the difference.
+      statistic: of a group, in place of its interquartile mean.
+      paired: whether `minus` has the same runs on the same seeds, which are then drawn together.
 
     Raises:
       UserError: no groups, or other sizes in `minus`.
@@ -177,27 +180,33 @@ def stratified_estimate(
     second = None if minus is None else [_runs("a group", group) for group in minus]
     if not first:
         raise UserError("there is no group: give at least one.")
-    if second is not None and [x.size for x in first] != [x.size for x in second]:
+    if second is not None and (
+        len(first) != len(second)
+        or (paired and [x.size for x in first] != [x.size for x in second])
+    ):
         raise UserError("the groups to subtract have other sizes: pair run by run.")
     generator = np.random.default_rng(seed)
 
-    def statistic(resampled: bool) -> NDArray[np.floating]:
-        total = np.zeros(num_resamples if resampled else 1)
+    def drawn(size: int, resampled: bool) -> NDArray[np.integer]:
+        shape = (num_resamples, size)
+        return generator.integers(0, size, shape) if resampled else np.arange(size)[None]
+
+    def total(resampled: bool) -> NDArray[np.floating]:
+        found = np.zeros(num_resamples if resampled else 1)
         for i, group in enumerate(first):
-            rows = np.arange(group.size)[None]
-            if resampled:
-                rows = generator.integers(0, group.size, (num_resamples, group.size))
-            total += iqm(group[rows], axis=1)
+            rows = drawn(group.size, resampled)
+            found += statistic(group[rows], axis=1)
             if second is not None:
-                total -= iqm(second[i][rows], axis=1)
-        return total / len(first)
+                other = rows if paired else drawn(second[i].size, resampled)
+                found -= statistic(second[i][other], axis=1)
+        return found / len(first)
 
     size = sum(group.size for group in first)
-    value = float(statistic(False)[0])
-    if min(group.size for group in first) < 2:
+    value = float(total(False)[0])
+    if min(group.size for group in (*first, *(second or ()))) < 2:
         return Estimate(value, None, None, size)
     tail = 50.0 * (1.0 - confidence)
-    low, high = np.percentile(statistic(True), [tail, 100.0 - tail])
+    low, high = np.percentile(total(True), [tail, 100.0 - tail])
     return Estimate(value, float(low), float(high), size)
 
 
@@ -255,6 +264,11 @@ def pooled_estimate(
     tail = 50.0 * (1.0 - confidence)
     low, high = np.percentile(statistic(True), [tail, 100.0 - tail])
     return Estimate(value, float(low), float(high), first.size)
+
+
+def worst_decile(x: ArrayLike, axis: int | None = None) -> NDArray[np.floating]:
+    """The tenth percentile: what nine runs of ten are better than, which an interquartile mean drops."""
+    return np.asarray(np.percentile(_finite("x", x), 10, axis=axis))
 
 
 def normalized_score(

@@ -77,30 +77,35 @@ def test_transitions_alone_do_not_reach_the_goal_of_mountain_car(
     assert len(saved) == 1  # what is there is not searched again
 
 
-def test_the_verdict_follows_the_figures():
-    said = ablations.verdict(report(**{name_of("T", "normal", NONE): -200.0}))
-    assert "with T no agent ever reaches the goal" in said and "not all clearly better" in said
-    assert "TI is clearly better than T, I is not clearly apart from TI" in said
-    assert "clearly better than none: no shape" in said
-    found = ablations.parts(report(**{name_of("T", "normal", NONE): -200.0}))
+@pytest.mark.parametrize("preset", ["quick", "paper"])
+def test_presets_cover_both_environments(preset):
+    assert set(ablations.EXPERIMENT.presets[preset]["environments"]) == set(ablations.ENVIRONMENTS)
+
+
+def outcomes(found):
+    return [x.outcome for x in ablations.EXPERIMENT.judged(found)]
+
+
+def test_claims_follow_the_figures():
+    of_pendulum = ["holds", "holds"] + ["undecided"] * 4
     # TI beats T in both, I is as good as TI, latents are alike; T never reaches the goal; no curriculum helps.
-    assert found == [True, True, False] + [True, True, False, True] + [False] * len(SHAPES)
+    expected = [*of_pendulum, *of_pendulum, "holds"] + ["undecided"] * len(SHAPES)
+    assert outcomes(report(**{name_of("T", "normal", NONE): -200.0})) == expected
+    # Every T failed, which is no less than every search; I is far below TI, and every curriculum above none.
     worse = {name_of("T", "normal", NONE): None, name_of("I", "normal", NONE): -500.0}
-    said = ablations.verdict(report(**worse))
-    assert "T all failed" in said and "I is clearly worse than TI" in said
-    assert f"clearly better than none: {', '.join(SHAPES)}" in said
+    found = outcomes(report(**worse))
+    assert found[:2] == ["undecided", "does not hold"] and found[-len(SHAPES) :] == ["holds"] * 5
+    assert "T all failed" in ablations.EXPERIMENT.block("verdict", report(**worse))
     categorical = {
         name_of("I", latent, curriculum): -190.0
         for latent in ("categorical", "softmax_categorical")
         for curriculum in (NONE, "linear")
     }
-    said = ablations.verdict(report(**categorical))
-    assert "the continuous ones are clearly better" in said and "too few" not in said
+    assert outcomes(report(**categorical))[2:6] == ["holds"] * 4
     # Two searches tell nothing apart.
-    said = ablations.verdict(report(seeds=2, **worse))
-    assert "Pendulum-v1 (too few searches to tell anything clearly apart)" in said
-    assert "I is not clearly apart from TI" in said
-    assert set(ablations.parts(report(seeds=2, **worse))) == {None}
+    assert outcomes(report(seeds=2, **worse)).count("undecided") == 2 * 6 + len(SHAPES)
+    said = ablations.EXPERIMENT.block("verdict", report(seeds=2, **worse))
+    assert "Pendulum-v1 (too few searches to tell anything apart)" in said
 
 
 def test_a_line_says_how_many_of_its_searches_failed():
@@ -108,29 +113,23 @@ def test_a_line_says_how_many_of_its_searches_failed():
     found = report(**{search: -100.0})
     for environment in found["environments"].values():
         environment[search]["3"]["fitness"][-1] = None
-    said = ablations.verdict(found)
-    assert "TI −100 [−100, −100] (1 of 5 failed)" in said
+    assert "TI −100 [−100, −100] (1 of 5 failed)" in ablations.EXPERIMENT.block("verdict", found)
     # The four others are better than all of T's, and yet a failure is worse than any return.
-    assert "TI is not clearly apart from T" in said
-    assert any("(1 of 5 failed)" in line for line in ablations.body(found))
+    assert outcomes(found)[0] == "undecided"
+    assert "(1 of 5 failed)" in ablations.EXPERIMENT.block("body", found)
 
 
 def test_searches_that_never_reach_the_goal_test_no_claim_about_it():
     found = report(**dict.fromkeys(ablations.searches_of("MountainCar-v0"), -200.0))
-    said = ablations.verdict(found)
-    assert "no agent of any search reaches the goal" in said and "as in the paper" not in said
+    assert "no agent of any search reaches the goal" in ablations.EXPERIMENT.block("verdict", found)
+    assert set(outcomes(found)[6:]) == {"not tested at this size"}
 
 
 def test_the_page_and_the_figure_show_every_search():
     found = report()
     rows = sum(len(x) for e in ablations.ENVIRONMENTS for x in ablations.rows(e).values())
-    lines = ablations.body(found)
-    assert sum(line.startswith("| ") for line in lines) == rows + 2
-    assert any("| 3% | 60 |" in line for line in lines)  # 4 of 128 candidates failed
+    body = ablations.EXPERIMENT.block("body", found)
+    assert sum(line.startswith("| ") for line in body.splitlines()) == rows + 2
+    assert "| 3% | 60 |" in body  # 4 of 128 candidates failed
     axes = ablations.draw(found).axes
     assert sum(len(a.lines) for a in axes) == rows
-
-
-@pytest.mark.parametrize("preset", ["quick", "paper"])
-def test_presets_cover_both_environments(preset):
-    assert set(ablations.EXPERIMENT.presets[preset]["environments"]) == set(ablations.ENVIRONMENTS)

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import lpo
 from experiments import alignment
-from experiments.page import exit_status
+from experiments.harness import exit_status
 
 
 def stage(environment, correlations, bandit="Synthetic-Pendulum-v1"):

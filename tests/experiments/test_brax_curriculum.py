@@ -9,8 +9,9 @@ from experiments.brax_curriculum import NONE
 from scb.errors import UserError
 
 
-def report(**finals):
-    plan = {**experiment.EXPERIMENT.presets["quick"], "seeds": {NONE: 2, "linear": 1, "step": 1}}
+def report(searches=1, **finals):
+    plan = {**experiment.EXPERIMENT.presets["quick"], "seeds": {NONE: max(2, searches)}}
+    plan["seeds"] |= {"linear": searches, "step": searches}
     curves = {
         shape: {
             str(seed): {
@@ -39,45 +40,6 @@ def test_a_curriculum_is_the_papers_in_another_shape():
     assert (
         config.mode == "sequential" and config.backend == "generalized" and config.init == "random"
     )
-
-
-def test_the_verdict_follows_the_figures():
-    assert "every curriculum ends above the best" in experiment.verdict(
-        report(linear=300.0, step=250.0)
-    )
-    assert "no curriculum ends above the best" in experiment.verdict(
-        report(linear=100.0, step=150.0)
-    )
-    said = experiment.verdict(report(linear=300.0, step=150.0))
-    assert "linear ends above the best of them, step not" in said
-    assert "205 [200, 210] without" in said and "the best ends at 210" in said
-    assert "None of them earns what standing still does (1000)" in said
-    assert "None of them" not in experiment.verdict(report(none=1000.0))
-    assert experiment.parts(report(linear=300.0, step=150.0)) == [None, None]
-    assert experiment.parts(report(none=1000.0, linear=1500.0)) == [True, False]
-
-
-def test_failed_searches_are_worse_than_any():
-    found = report(linear=300.0, step=250.0)
-    found["curves"]["linear"]["0"]["fitness"][-1] = None
-    said = experiment.verdict(found)
-    assert "step ends above the best of them, linear not" in said and "linear all failed" in said
-    found["curves"]["step"]["0"]["fitness"][-1] = None
-    assert "no curriculum ends above" in experiment.verdict(found)
-    for curve in found["curves"][NONE].values():
-        curve["fitness"][-1] = None
-    assert "all failed without a curriculum" in experiment.verdict(found)
-    assert "Every search without one failed." in experiment.verdict(found)
-
-
-def test_the_page_and_the_figure_show_every_curriculum():
-    found = report()
-    assert sum(line.startswith("| ") for line in experiment.body(found)) == 3 + 2
-    left, right = experiment.draw(found).axes
-    assert len(left.lines) == len(right.lines) == 3
-    lengths = {line.get_label(): line.get_ydata() for line in left.lines}
-    assert lengths["linear"][0] == 100 and lengths["linear"][-1] == 1000
-    np.testing.assert_array_equal(lengths[NONE], 1000)
 
 
 def test_a_search_with_a_curriculum_is_judged_over_whole_episodes(
@@ -132,3 +94,41 @@ def test_every_search_is_measured_once(monkeypatch):
     }
     experiment.measure(plan, found, lambda: None)
     assert len(asked) == 3
+
+
+def outcomes(found):
+    return [x.outcome for x in experiment.EXPERIMENT.judged(found)]
+
+
+def test_claims_follow_the_figures():
+    said = experiment.EXPERIMENT.block("verdict", report(linear=300.0, step=150.0))
+    assert "205 [200, 210] without" in said and "the best ends at 210" in said
+    assert "None of them earns what standing still does (1000)" in said
+    assert set(outcomes(report(linear=300.0, step=150.0))) == {"not tested at this size"}
+    # One search of a shape decides nothing, however far above it ends.
+    assert outcomes(report(none=1000.0, linear=1500.0)) == ["undecided"] * 2
+    several = report(5, none=1000.0, linear=1500.0, step=1010.0)
+    assert outcomes(several) == ["holds", "undecided"]
+    assert "None of them" not in experiment.EXPERIMENT.block("verdict", several)
+
+
+def test_failed_searches_are_worse_than_any():
+    found = report(5, none=1000.0, linear=1500.0, step=1500.0)
+    found["curves"]["linear"]["0"]["fitness"][-1] = None
+    assert outcomes(found) == ["undecided", "holds"]
+    assert "(1 of 5 failed)" in experiment.EXPERIMENT.block("verdict", found)
+    for curve in found["curves"][NONE].values():
+        curve["fitness"][-1] = None
+    said = experiment.EXPERIMENT.block("verdict", found)
+    assert "all failed without a curriculum" in said and "Every search without one failed." in said
+
+
+def test_the_page_and_the_figure_show_every_curriculum():
+    found = report()
+    body = experiment.EXPERIMENT.block("body", found)
+    assert sum(line.startswith("| ") for line in body.splitlines()) == 3 + 2
+    left, right = experiment.draw(found).axes
+    assert len(left.lines) == len(right.lines) == 3
+    lengths = {line.get_label(): line.get_ydata() for line in left.lines}
+    assert lengths["linear"][0] == 100 and lengths["linear"][-1] == 1000
+    np.testing.assert_array_equal(lengths[NONE], 1000)

@@ -38,50 +38,10 @@ def test_steps_to_match_are_of_the_first_evaluation_that_reaches_the_level():
     assert experiment.steps_to_match(found, 8.0) == [20, 10, None]
 
 
-def test_the_verdict_follows_the_figures(report):
-    said = experiment.verdict(report)
-    assert "2 of 2 agents reach the bandit's 200 [200, 200], by 600000 steps in the median" in said
-    assert "(evaluations are 400000 apart), 60 times" in said
-    more = "0 of 2 agents reach the bandit's 200 [200, 200], in the median not within 800000 steps, more than 80"
-    assert more in said
-    assert "two orders of magnitude are not tested" in said
-    assert experiment.parts(report) == [True, True]
-    # Of two agents one gets there: the median is not that one's.
-    report["environments"]["hopper (spring)"]["ppo"]["returns"][0] = [0.0, 0.0, 0.0]
-    assert (
-        "1 of 2 agents reach the bandit's 200 [200, 200], in the median not within"
-        in experiment.verdict(report)
-    )
-
-
-def test_the_uncertainty_of_a_level_is_that_of_its_steps(report):
-    # The interval of two agents is their range, 100 to 300: both agents earn 100 at the first evaluation.
-    in_bandit = curves([0, 10_000], [0.0, 100.0], [0.0, 300.0])
-    report["bandits"]["hopper (spring), ours"]["ppo"] = in_bandit
-    said = experiment.verdict(report)
-    assert "bandit's 200 [100, 300], by 600000 steps" in said
-    assert "60 times the bandit's (40 to the lower end)" in said
-    assert experiment.parts(report) == [False, True]
-
-
-def test_the_page_and_the_figure_show_bandits_environments_and_the_paper(report):
-    lines = experiment.body(report)
-    assert any("| 854 | 2522 |" in line for line in lines)  # the paper's PPO on Hopper
-    assert "Left out" not in lines[0]
-    report["left_out"] = ["walker2d (generalized), published"]
-    assert "that holds them: walker2d (generalized), published." in experiment.body(report)[0]
-    figure = experiment.draw(report)
-    assert len(figure.axes) == 4
-    ppo, sac = figure.axes[:2]
-    # Bandit, environment and the legend's three; with SAC the bandit, and the paper's level in its physics.
-    assert len(ppo.lines) == 5 and len(sac.lines) == 1
-    assert len(figure.axes[3].lines) == 2
-    np.testing.assert_array_equal(ppo.lines[0].get_xdata(), [5000, 10_000])
-
-
 def test_agents_are_followed_in_a_bandit_and_in_an_environment():
     # Pendulum stands in for Brax, whose physics compile for long.
     plan = {
+        "published": None,
         "bandits": [[OURS, "Pendulum-v1", None]],
         "bandit_algorithms": ["ppo"],
         "bandit_agents": 2,
@@ -101,23 +61,10 @@ def test_agents_are_followed_in_a_bandit_and_in_an_environment():
     assert len(saved) == 2
 
 
-def test_without_the_published_bandits_ours_are_measured_alone(monkeypatch, tmp_path):
-    monkeypatch.setenv("SCB_PUBLISHED", str(tmp_path / "nowhere"))
-    plan = {
-        "bandits": [[PUBLISHED, "hopper", "generalized"]],
-        "bandit_algorithms": ["ppo"],
-        "environment_algorithms": ["ppo"],
-    }
-    found = {}
-    experiment.measure(plan, found, lambda: None)
-    assert found["left_out"] == ["hopper (generalized), published"]
-    assert found["bandits"] == found["environments"] == {}
-
-
-def test_published_bandits_that_are_in_the_report_need_no_folder(monkeypatch, tmp_path):
-    monkeypatch.setenv("SCB_PUBLISHED", str(tmp_path / "nowhere"))
+def test_published_bandits_that_are_in_the_report_need_no_folder(monkeypatch):
     published = [PUBLISHED, "Pendulum-v1", None]
     plan = {
+        "published": None,
         "bandits": [published],
         "bandit_algorithms": ["ppo", "sac"],
         "environment_algorithms": ["ppo"],
@@ -132,3 +79,74 @@ def test_published_bandits_that_are_in_the_report_need_no_folder(monkeypatch, tm
     found = {"bandits": {name: {"ppo": whole}}}
     experiment.measure(plan, found, lambda: None)
     assert found["left_out"] == [name] and found["bandits"] == {}
+
+
+def outcomes(found):
+    """Of the claims about steps, then of those about standing still."""
+    judged = [x.outcome for x in experiment.EXPERIMENT.judged(found)]
+    return judged[::2], judged[1::2]
+
+
+def test_claims_follow_the_figures(report):
+    said = experiment.EXPERIMENT.block("verdict", report)
+    assert "2 of 2 agents reach the bandit's 200 [200, 200], by 600000 steps in the median" in said
+    assert "(evaluations are 400000 apart), 60 times" in said
+    more = "0 of 2 agents reach the bandit's 200 [200, 200], in the median not within 800000 steps, more than 80"
+    assert more in said
+    assert "two orders of magnitude are not tested" in said
+    # 40 and 80 times with one agent each: two agents do not decide it. And 200 is less than standing still.
+    assert outcomes(report) == (["undecided", "holds"], ["does not hold"] * 2)
+    # Of two agents one gets there: the median is not that one's.
+    report["environments"]["hopper (spring)"]["ppo"]["returns"][0] = [0.0, 0.0, 0.0]
+    said = experiment.EXPERIMENT.block("verdict", report)
+    assert "1 of 2 agents reach the bandit's 200 [200, 200], in the median not within" in said
+
+
+def test_the_uncertainty_of_a_level_is_that_of_its_steps(report):
+    # The interval of two agents is their range, 100 to 300: both agents earn 100 at the first evaluation.
+    in_bandit = curves([0, 10_000], [0.0, 100.0], [0.0, 300.0])
+    report["bandits"]["hopper (spring), ours"]["ppo"] = in_bandit
+    said = experiment.EXPERIMENT.block("verdict", report)
+    assert "bandit's 200 [100, 300], by 600000 steps" in said
+    assert "60 times the bandit's (40 to the lower end)" in said
+    assert outcomes(report)[0] == ["does not hold", "holds"]
+
+
+def test_the_page_and_the_figure_show_bandits_environments_and_the_paper(report):
+    body = experiment.EXPERIMENT.block("body", report)
+    assert "| 854 | 2522 |" in body and "Left out" not in body  # the paper's PPO on Hopper
+    report["left_out"] = ["walker2d (generalized), published"]
+    told = experiment.EXPERIMENT.block("body", report)
+    assert "that holds them: walker2d (generalized), published." in told
+    figure = experiment.draw(report)
+    assert len(figure.axes) == 4
+    ppo, sac = figure.axes[:2]
+    # Bandit, environment and the legend's three; with SAC the bandit, and the paper's level in its physics.
+    assert len(ppo.lines) == 5 and len(sac.lines) == 1
+    assert len(figure.axes[3].lines) == 2
+    np.testing.assert_array_equal(ppo.lines[0].get_xdata(), [5000, 10_000])
+
+
+def test_published_bandits_count_only_where_their_folder_is_named(monkeypatch, tmp_path):
+    # Such a folder beside the checkout, or in a variable, changes nothing.
+    (tmp_path / "shared" / "published_scbs").mkdir(parents=True)
+    (tmp_path / "checkout").mkdir()
+    monkeypatch.chdir(tmp_path / "checkout")
+    monkeypatch.setenv("SCB_PUBLISHED", str(tmp_path / "shared" / "published_scbs"))
+    plan = {
+        "bandits": [[PUBLISHED, "hopper", "generalized"]],
+        "bandit_algorithms": ["ppo"],
+        "environment_algorithms": ["ppo"],
+        "published": None,
+    }
+    found = {}
+    experiment.measure(plan, found, lambda: None)
+    assert found["left_out"] == ["hopper (generalized), published"]
+    assert found["bandits"] == found["environments"] == {}
+    asked = []
+    monkeypatch.setattr(
+        experiment, "_in_bandit", lambda *x: asked.append(x) or curves([0, 1], [0, 1])
+    )
+    monkeypatch.setattr(experiment, "_in_environment", lambda *_: curves([0, 1], [0, 1]))
+    experiment.measure({**plan, "published": tmp_path}, found, lambda: None)
+    assert found["left_out"] == [] and asked[0][:2] == (PUBLISHED, "hopper")

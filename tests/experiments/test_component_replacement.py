@@ -53,37 +53,6 @@ def test_scores_are_between_the_random_policy_and_each_expert():
     )
 
 
-def test_the_verdict_follows_the_figures():
-    good, bad = [-200.0, -220.0, -180.0, -190.0], [-1000.0, -1020.0, -900.0, -950.0]
-    needed = {(r, s): good if s == SYNTHETIC else bad for r, s in REPLACED}
-    said = experiment.verdict(with_returns(good, needed, needed))
-    assert "clearly less with each of them" in said
-    assert ": not clearly less than the bandit's own reward does" in said
-    assert "cloning is not clearly worse than, and closeness" in said
-    assert experiment.parts(with_returns(good, needed, needed)) == [True] * 3 + [False] + [True] * 2
-    alike = dict.fromkeys(REPLACED, good)
-    assert "clearly less with none" in experiment.verdict(with_returns(good, alike, alike))
-    poor = needed | {(r, SYNTHETIC): bad for r in (ACTION, CLONING, Q)}
-    said = experiment.verdict(with_returns(good, poor, poor))
-    assert "clearly less with the bandit's reward only" in said
-    assert ": clearly less than the bandit's own reward does" in said
-    assert "cloning is worse than, and closeness to the expert's action worse than," in said
-    assert (
-        experiment.parts(with_returns(good, poor, poor)) == [True, False, False, True] + [False] * 2
-    )
-    # One expert of two from whom cloning learns nothing makes it uncertain, not worse.
-    said = experiment.verdict(with_returns(good, needed, poor))
-    assert "cloning is not clearly worse than" in said
-
-
-def test_the_page_and_the_figure_show_every_combination(report):
-    lines = experiment.body(report)
-    assert sum(line.startswith("| ") for line in lines) == len(REWARDS) * len(STATES) + 2
-    (axes,) = experiment.draw(report).axes
-    dots = [line for line in axes.lines if len(line.get_xdata()) == len(report["experts"])]
-    assert len(dots) == len(REWARDS) * len(STATES)
-
-
 def test_a_run_goes_on_with_the_expert_that_it_was_at(monkeypatch, small_agents):
     chosen = ((CLONING, SYNTHETIC), (BANDIT, EXPERT))
     monkeypatch.setattr(experiment, "REPLACED", chosen)
@@ -109,3 +78,29 @@ def test_a_tiny_run_tells_the_bandits_contexts_from_the_experts_states():
     found = {x: iqm(experiment.scores_of(report, *x)) for x in REPLACED}
     assert iqm(report["experts"]["0"]["own"]) > -250.0
     assert iqm(experiment.scores_of(report, BANDIT, SYNTHETIC)) > found[BANDIT, EXPERT] + 0.2
+
+
+def outcomes(found):
+    return [x.outcome for x in experiment.EXPERIMENT.judged(found)]
+
+
+def test_claims_follow_the_figures():
+    good, bad = [-200.0, -220.0, -180.0, -190.0], [-1000.0, -1020.0, -900.0, -950.0]
+    needed = {(r, s): good if s == SYNTHETIC else bad for r, s in REPLACED}
+    found = ["holds"] * 3 + ["undecided"] + ["holds"] * 2
+    assert outcomes(with_returns(good, needed, needed)) == found
+    alike = dict.fromkeys(REPLACED, good)
+    assert outcomes(with_returns(good, alike, alike))[:3] == ["undecided"] * 3
+    poor = needed | {(r, SYNTHETIC): bad for r in (ACTION, CLONING, Q)}
+    found = ["holds", "undecided", "undecided", "holds"] + ["does not hold"] * 2
+    assert outcomes(with_returns(good, poor, poor)) == found
+    # One expert of two from whom cloning learns nothing makes it uncertain: neither worse nor as good.
+    assert outcomes(with_returns(good, needed, poor))[4:] == ["undecided"] * 2
+
+
+def test_the_page_and_the_figure_show_every_combination(report):
+    lines = experiment.EXPERIMENT.block("body", report).splitlines()
+    assert sum(line.startswith("| ") for line in lines) == len(REWARDS) * len(STATES) + 2
+    (axes,) = experiment.draw(report).axes
+    dots = [line for line in axes.lines if len(line.get_xdata()) == len(report["experts"])]
+    assert len(dots) == len(REWARDS) * len(STATES)

@@ -38,28 +38,6 @@ def test_lengths_are_counted_once_each():
     assert counts == {"1": 2, "2": 1, "3 to 5": 1, "6 to 10": 0, "11 to 50": 1, "more": 1}
 
 
-def test_the_verdict_follows_the_figures():
-    said = experiment.verdict(report())
-    assert "MountainCar-v0 90%" in said and "more than 80% in 2 of 2" in said
-    assert "it costs nothing clearly, and is clearly better in MountainCar-v0 and CartPole" in said
-    assert experiment.parts(report()) == [True, True]
-    said = experiment.verdict(report(one=-190.0, single=3))
-    assert experiment.parts(report(one=-190.0, single=3)) == [False, False]
-    # Searches without a limit that get nowhere tell nothing.
-    assert experiment.parts(report(own=-199.0)) == [None, None]
-    assert "in 0 of 2" in said and "Every" not in said
-    assert "trains agents of 0.5 or more of the expert's score in MountainCar-v0 only" in said
-    assert "clearly worse in MountainCar-v0 and CartPole-v1." in said
-
-
-def test_the_page_and_the_figure_show_every_limit():
-    found = report()
-    assert sum(line.startswith("| ") for line in experiment.body(found)) == 2 * (2 + 2)
-    left, right = experiment.draw(found).axes
-    assert len(left.patches) == 2 * len(BINS)
-    assert [t.get_text() for t in right.get_xticklabels()] == TINY["limits"]
-
-
 def test_a_limits_search_is_judged_and_its_episodes_are_counted(
     tmp_path, monkeypatch, small_agents
 ):
@@ -84,3 +62,23 @@ def test_presets_have_the_environments_own_limit_and_a_single_step(preset):
     assert set(plan["sizes"]) == set(experiment.CLASSIC_CONTROL)
     config = experiment.config_of("Pendulum-v1", "10", plan)
     assert config.parameterization == "TI" and config.max_steps == 10
+
+
+def test_one_search_of_each_decides_nothing():
+    said = experiment.EXPERIMENT.block("verdict", report())
+    assert "MountainCar-v0 90%" in said
+    assert [x.outcome for x in experiment.EXPERIMENT.judged(report())] == ["undecided"] * 2
+    said = experiment.EXPERIMENT.block("verdict", report(one=-190.0, single=3))
+    assert "trains agents of 0.5 or more of the expert's score in MountainCar-v0 only" in said
+    # Searches without a limit that get nowhere tell nothing.
+    untold = experiment.EXPERIMENT.judged(report(own=-199.0))
+    assert [x.outcome for x in untold] == ["not tested at this size"] * 2
+
+
+def test_the_page_and_the_figure_show_every_limit():
+    found = report()
+    lines = experiment.EXPERIMENT.block("body", found).splitlines()
+    assert sum(line.startswith("| ") for line in lines) == 2 * (2 + 2)
+    left, right = experiment.draw(found).axes
+    assert len(left.patches) == 2 * len(BINS)
+    assert [t.get_text() for t in right.get_xticklabels()] == TINY["limits"]

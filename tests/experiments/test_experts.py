@@ -5,8 +5,7 @@ from pathlib import Path
 import pytest
 
 from experiments import experts
-from experiments.page import CLASSIC_CONTROL
-from scb.environments.registry import environment_spec
+from experiments.harness import CLASSIC_CONTROL
 
 COMMITTED = Path(__file__).parents[2] / "docs" / "data" / "experts.json"
 
@@ -42,18 +41,24 @@ def test_the_committed_experts_are_near_optimal(report):
     assert all(len(x["returns"]) == 200 for x in report["environments"].values())
 
 
-def test_the_verdict_names_what_is_below_the_paper(report):
+def test_an_expert_is_next_to_the_papers_by_its_whole_interval(report):
     changed = copy.deepcopy(report)
     for name, entry in changed["environments"].items():
-        entry["returns"] = [environment_spec(name).reference_return()] * 10
-    assert "on the paper's level or above it everywhere" in experts.verdict(changed)
+        entry["returns"] = [experts.paper(name).value] * 10
+    assert {x.outcome for x in experts.EXPERIMENT.judged(changed)} == {"holds"}
+    said = experts.EXPERIMENT.block("verdict", changed)
+    assert "next to the paper's, or above, everywhere" in said
+    # Reaching the paper's level with the better end of a wide interval decides nothing.
+    changed["environments"]["Acrobot-v1"]["returns"] = [-76.7] * 5 + [-500.0] * 5
     changed["environments"]["Pendulum-v1"]["returns"] = [-300.0] * 10
-    assert "below the paper's interval in Pendulum-v1, on" in experts.verdict(changed)
-    assert experts.parts(changed) == [True] * 4 + [False]
+    said = experts.EXPERIMENT.block("verdict", changed)
+    assert "not shown to be next to the paper's in Acrobot-v1 and Pendulum-v1." in said
+    found = [x.outcome for x in experts.EXPERIMENT.judged(changed)]
+    assert found == ["undecided"] + ["holds"] * 3 + ["does not hold"]
 
 
 def test_the_page_and_the_figure_show_ours_beside_the_papers(report):
-    lines = experts.body(report)
-    assert any("\u2212117.7 [\u2212119.2, \u2212115.3]" in line for line in lines)
-    figure = experts.draw(report)
+    body = experts.EXPERIMENT.block("body", report)
+    assert "\u2212117.7 [\u2212119.2, \u2212115.3]" in body
+    figure = experts.EXPERIMENT.figures(report)["experts"]
     assert [axes.get_title(loc="left") for axes in figure.axes] == list(CLASSIC_CONTROL)

@@ -101,56 +101,6 @@ def test_every_algorithm_meets_every_network():
     assert len(agents) == 4 * 3 + 2 and f"td3, {SWISH}" in agents
 
 
-def test_the_verdict_follows_the_figures():
-    said = generality.verdict(report(itself=50.0))
-    assert "are more robust to hyperparameters than the environments (difference +0.73" in said
-    assert (
-        "no clear difference (not clearly apart in CartPole-v1)" in said
-        and "none is clearly worse" in said
-    )
-    changed = copy.deepcopy(report())
-    entry = changed["environments"]["CartPole-v1"]
-    for source, value in ((DRAWN, 450.0), (FIXED, 300.0)):
-        for agent in ("ppo", "sac"):
-            entry[source][agent] = [value] * 4
-    entry[ZOO][EVOLVED] = [100.0] * 4
-    said = generality.verdict(changed)
-    assert "it helps (clearly better in CartPole-v1)" in said and "are not more robust" in said
-    # Robust, drawn in the search, then 1 x 512, swish, neuroevolution and the optimal policy.
-    assert generality.parts(changed) == [False, True, True, True, False, True]
-    assert generality.parts(report(itself=50.0)) == [True, None, True, True, True, True]
-    assert f"clearly worse than those that are: {EVOLVED}." in said
-    for agent in ("ppo", "sac"):
-        entry[DRAWN][agent] = [100.0] * 4
-    assert "it harms here (clearly worse in CartPole-v1)" in generality.verdict(changed)
-    changed["generation"]["CartPole-v1"][DRAWN] = 0
-    assert "the common start is still the best in CartPole-v1" in generality.verdict(changed)
-
-
-def test_another_network_is_compared_agent_by_agent():
-    # Each agent earns ten less with it, far less than agents differ from each other.
-    found = report()
-    entry = found["environments"]["CartPole-v1"][ZOO]
-    for algorithm in ("ppo", "sac"):
-        entry[algorithm] = [500.0, 400.0, 300.0, 200.0]
-        entry[f"{algorithm}, {SWISH}"] = [490.0, 390.0, 290.0, 190.0]
-        entry[f"{algorithm}, {WIDE}"] = [500.0, 400.0, 300.0, 200.0]
-    entry[EVOLVED] = [340.0, 440.0, 240.0, 340.0]
-    said = generality.verdict(found)
-    assert f"clearly worse than those that are: {SWISH}." in said
-
-
-def test_the_page_and_the_figure_show_every_kind_of_agent():
-    found = report()
-    lines = generality.body(found)
-    assert sum(line.startswith("| ") for line in lines) == 7 + 2
-    assert any(line.endswith("CartPole-v1 15 and 0.") for line in lines)
-    axes = generality.draw(found).axes[0]
-    shown = (TOGETHER, WIDE, SWISH, EVOLVED, OPTIMAL)
-    ticks = ["PPO", "SAC", *(generality.TICKS[x] for x in shown)]
-    assert [t.get_text() for t in axes.get_xticklabels()] == ticks
-
-
 def test_agents_from_a_bandit_and_from_the_environment(tmp_path, monkeypatch, small_agents):
     monkeypatch.setattr(generality, "SOURCES", (ZOO, ENVIRONMENT))
     kinds = {"ppo", f"ppo, {WIDE}", EVOLVED, OPTIMAL}
@@ -188,3 +138,63 @@ def test_presets_make_configurations(preset):
     plan = generality.EXPERIMENT.presets[preset]
     assert plan["environments"] == list(generality.CLASSIC_CONTROL)
     generality.config_of("Pendulum-v1", DRAWN, plan)
+
+
+def outcomes(found):
+    return [x.outcome for x in generality.EXPERIMENT.judged(found)]
+
+
+def test_claims_follow_the_figures():
+    # Robust by the mean and by the worst; one search each; 1 x 512, swish, neuroevolution and the optimal policy.
+    expected = ["holds", "holds", "undecided", "holds", "holds", "holds", "holds"]
+    assert outcomes(report(itself=50.0)) == expected
+    assert outcomes(report())[:2] == ["undecided"] * 2
+    changed = copy.deepcopy(report())
+    entry = changed["environments"]["CartPole-v1"]
+    for source, value in ((DRAWN, 450.0), (FIXED, 300.0)):
+        for agent in ("ppo", "sac"):
+            entry[source][agent] = [value] * 4
+    entry[ZOO][EVOLVED] = [100.0] * 4
+    # However far apart two searches are, they are two.
+    assert outcomes(changed)[2:] == ["undecided", "holds", "holds", "does not hold", "holds"]
+    changed["generation"]["CartPole-v1"][DRAWN] = 0
+    said = generality.EXPERIMENT.block("verdict", changed)
+    assert "CartPole-v1 +150.0 [150.0, 150.0], where both keep the common start" in said
+
+
+def test_robustness_is_not_scored_by_what_drops_the_worst():
+    # A fifth of the bandit's agents learn nothing: the interquartile mean is that of the others.
+    found = report(itself=400.0)
+    entry = found["environments"]["CartPole-v1"]
+    for agent in ("ppo", "sac"):
+        for source in (ZOO, ENVIRONMENT):
+            for kind in (agent, f"{agent}, {WIDE}", f"{agent}, {SWISH}"):
+                entry[source][kind] = [400.0] * 10
+        entry[ZOO][agent] = [410.0] * 8 + [20.0] * 2
+    scores = generality.facts(found)["scores"]
+    assert scores[ZOO][0].value > scores[ENVIRONMENT][0].value
+    assert scores[ZOO][1].value < scores[ENVIRONMENT][1].value and scores[ZOO][2].value == 0.0
+    assert "holds" not in outcomes(found)[:2]
+
+
+def test_another_network_is_compared_agent_by_agent():
+    # Each agent earns 60 less with it, 0.125 of the way, and far less than agents differ from each other.
+    found = report()
+    entry = found["environments"]["CartPole-v1"][ZOO]
+    for algorithm in ("ppo", "sac"):
+        entry[algorithm] = [500.0, 400.0, 300.0, 200.0]
+        entry[f"{algorithm}, {SWISH}"] = [440.0, 340.0, 240.0, 140.0]
+        entry[f"{algorithm}, {WIDE}"] = [490.0, 390.0, 290.0, 190.0]
+    entry[EVOLVED] = [340.0, 440.0, 240.0, 340.0]
+    assert outcomes(found)[3:6] == ["holds", "does not hold", "undecided"]
+
+
+def test_the_page_and_the_figure_show_every_kind_of_agent():
+    found = report()
+    lines = generality.EXPERIMENT.block("body", found).splitlines()
+    assert sum(line.startswith("| ") for line in lines) == 7 + 2
+    assert any(line.endswith("CartPole-v1 15 and 0.") for line in lines)
+    axes = generality.draw(found).axes[0]
+    shown = (TOGETHER, WIDE, SWISH, EVOLVED, OPTIMAL)
+    ticks = ["PPO", "SAC", *(generality.TICKS[x] for x in shown)]
+    assert [t.get_text() for t in axes.get_xticklabels()] == ticks

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from experiments import interpretability
-from experiments.page import CLASSIC_CONTROL, unpacked
+from experiments.harness import CLASSIC_CONTROL, unpacked
 
 COMMITTED = Path(__file__).parents[2] / "docs" / "data" / "interpretability.json"
 
@@ -37,23 +37,30 @@ def report():
     return json.loads(COMMITTED.read_text())
 
 
-def test_the_verdict_follows_the_figures(report):
+def test_claims_follow_the_figures(report):
     changed = copy.deepcopy(report)
+
+    def share(value):
+        return {"value": value, "low": value - 0.01, "high": value + 0.01, "n": 20}
+
     for name, x in changed["environments"]["Acrobot-v1"]["importance"].items():
-        x["value"] = 0.5 if "velocity" in name else 0.01
+        x |= share(0.5 if "velocity" in name else 0.01)
     for name in ("position (m)", "angle (rad)"):
-        changed["environments"]["CartPole-v1"]["importance"][name]["value"] = 0.02
-    said = interpretability.verdict(changed)
-    assert "(at least 50%): holds" in said and "holds for both" in said
-    assert interpretability.verdict(report) != said
-    assert interpretability.parts(changed) == [True, True, True, False]
+        changed["environments"]["CartPole-v1"]["importance"][name] |= share(0.02)
+    assert "at least 50%" in interpretability.EXPERIMENT.block("verdict", changed)
+    found = [x.outcome for x in interpretability.EXPERIMENT.judged(changed)]
+    assert found == ["holds"] * 4 + ["does not hold"]
+    # A share whose interval reaches over the tenth is undecided, wherever its point is.
+    changed["environments"]["CartPole-v1"]["importance"]["angle (rad)"] |= share(0.095)
+    assert interpretability.EXPERIMENT.judged(changed)[2].outcome == "undecided"
 
 
 def test_the_figure_has_a_map_and_bars_of_each_environment(report):
-    figure = interpretability.draw(report)
+    figure = interpretability.EXPERIMENT.figures(report)["interpretability"]
     titles = [axes.get_title(loc="left") for axes in figure.axes]
     assert set(CLASSIC_CONTROL) <= set(titles)
     rows = sum(len(x["importance"]) for x in report["environments"].values())
     assert sum(len(axes.patches) for axes in figure.axes) >= rows
-    assert len(interpretability.body(report)) > rows
+    lines = interpretability.EXPERIMENT.block("body", report).splitlines()
+    assert sum(line.startswith("| ") for line in lines) == rows + 2
     assert np.isfinite(report["environments"]["Pendulum-v1"]["return"]["value"])

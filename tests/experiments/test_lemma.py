@@ -78,10 +78,14 @@ def test_the_experiment_finds_the_lemma_and_its_gap(tmp_path):
     assert regrets[f"1 where a = a* | {ONE}"]["optimal"] == 1.0
     assert regrets[f"Q* | {ONE}"]["optimal"] < 1.0
     assert regrets[f"immediate reward | {EVERY}"]["optimal"] < 0.6
-    assert lemma.parts(report) == [True] and ", all of 20 policies" in lemma.verdict(report)
+    (judged,) = lemma.EXPERIMENT.judged(report)
+    assert judged.outcome == "holds"
+    assert ", all of 20 policies" in lemma.EXPERIMENT.block("verdict", report)
     regrets[f"Q* | {EVERY}"]["optimal"] = 0.9
-    assert lemma.parts(report) == [False] and ", not all of 20" in lemma.verdict(report)
-    assert any("immediate reward" in line for line in lemma.body(report))
+    (judged,) = lemma.EXPERIMENT.judged(report)
+    assert judged.outcome == "does not hold"
+    assert ", not all of 20" in lemma.EXPERIMENT.block("verdict", report)
+    assert "immediate reward" in lemma.EXPERIMENT.block("body", report)
     assert len(lemma.draw(report).axes[0].patches) == len(regrets)
 
 

@@ -3,6 +3,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from experiments import searches
+from experiments.claims import Claim, judge
 from scb import plotting
 from scb.commands import Discover
 from scb.discovery import DiscoveryConfig
@@ -53,19 +54,6 @@ def test_the_last_judgement_is_over_searches_that_have_one():
     assert none.estimate is None and none.text() == "all failed"
 
 
-def test_only_five_searches_or_more_are_clearly_above_others():
-    def ending(*fitness):
-        return searches.final({str(i): {"fitness": [x]} for i, x in enumerate(fitness)}, np.mean)
-
-    high, low = ending(*range(10, 15)), ending(*range(5))
-    assert high.clearly_above(low) and not low.clearly_above(high)
-    assert not ending(10, 11).clearly_above(ending(0, 1))
-    # A failure is worse than any return.
-    assert not ending(10, 11, 12, 13, None).clearly_above(low)
-    assert low.clearly_above(ending(*[None] * 5))
-    assert not ending(*[None] * 5).clearly_above(low)
-
-
 def test_a_judgement_without_a_number_is_a_gap_and_failures_are_averaged():
     metrics = [
         {"generation": 0, "failed": 2, "mean/fitness": -7.0, "mean/fitness_iqm": -6.0},
@@ -91,3 +79,22 @@ def test_a_line_is_the_mean_over_searches_and_leaves_gaps():
     np.testing.assert_array_equal(axes.lines[0].get_ydata(), [2.0, np.nan, 3.0])
     plotting.search_curve(axes, [], "none", plotting.BLUE)
     assert len(axes.lines) == 1
+
+
+def test_only_five_searches_or_more_are_told_apart():
+    def ending(*fitness):
+        return {str(i): {"fitness": [x]} for i, x in enumerate(fitness)}
+
+    def outcome(one, other):
+        return judge([Claim("one ends higher", searches.difference(one, other, np.mean))])[
+            0
+        ].outcome
+
+    high, low = ending(*range(10, 15)), ending(*range(5))
+    assert outcome(high, low) == "holds" and outcome(low, high) == "does not hold"
+    assert outcome(high, ending(*range(9, 16))) == "undecided"
+    assert outcome(ending(10, 11), ending(0, 1)) == "undecided"
+    assert outcome(ending(10), ending(*range(5))) == "undecided"
+    # A failure is worse than any return.
+    assert outcome(ending(10, 11, 12, 13, 14, None), low) == "undecided"
+    assert outcome(ending(*[None] * 5), low) == "undecided"

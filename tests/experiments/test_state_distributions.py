@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from experiments import state_distributions as experiment
-from experiments.page import packed, unpacked
+from experiments.harness import packed, unpacked
 
 LIMITS = [[0.0, 1.0], [0.0, 1.0]]
 
@@ -53,25 +53,6 @@ def test_points_are_stored_to_a_thousandth_of_the_plane():
     np.testing.assert_allclose(again[:, 0], points[:, 0], atol=0.0021)
 
 
-def test_the_verdict_follows_the_figures(report):
-    said = experiment.verdict(report)
-    assert "in 1 of 2 environments (MountainCar-v0 100% against 0%" in said
-    assert "in 1 of 2 (MountainCar-v0 0.0% against 100.0%, Pendulum-v1 50.0% against 0.0%)" in said
-    assert "off the plane" not in said
-    # Wider in the first; smoother in one, which is not several.
-    assert experiment.parts(report) == [True, False, False]
-    # Twice as far out as the plane reaches.
-    entry = report["environments"]["MountainCar-v0"]
-    entry["contexts"] = experiment.stored_points(np.full((4000, 2), 2.0), LIMITS)
-    assert "with 100% of its contexts off the plane" in experiment.verdict(report)
-
-
-def test_the_page_and_the_figure_show_both_distributions(report):
-    assert sum(line.startswith("| ") for line in experiment.body(report)) == 2 + 2
-    titles = [axes.get_title(loc="left") for axes in experiment.draw(report).axes]
-    assert {"MountainCar-v0\nexpert", "Pendulum-v1\nbandit"} <= set(titles)
-
-
 def test_states_and_best_actions_of_one_environment(small_agents):
     plan = {
         "environments": ["MountainCar-v0"],
@@ -94,3 +75,27 @@ def test_states_and_best_actions_of_one_environment(small_agents):
     assert set(np.unique(unpacked(examined["expert_actions"]))) <= {0.0, 1.0, 2.0}
     experiment.measure(plan, found, lambda: saved.append(1))
     assert saved == [1]
+
+
+def test_claims_are_over_environments(report):
+    said = experiment.EXPERIMENT.block("verdict", report)
+    assert "in 1 of 2 environments (MountainCar-v0 100% against 0%" in said
+    assert "in 1 of 2 (MountainCar-v0 0.0% against 100.0%, Pendulum-v1 50.0% against 0.0%)" in said
+    assert "off the plane" not in said
+    # Wider and smoother in one of two environments: undecided, however many states there are.
+    assert [x.outcome for x in experiment.EXPERIMENT.judged(report)] == ["undecided"] * 2
+    report["environments"]["Pendulum-v1"] = report["environments"]["MountainCar-v0"]
+    assert [x.outcome for x in experiment.EXPERIMENT.judged(report)] == ["holds"] * 2
+    # Twice as far out as the plane reaches.
+    entry = report["environments"]["MountainCar-v0"]
+    entry["contexts"] = experiment.stored_points(np.full((4000, 2), 2.0), LIMITS)
+    said = experiment.EXPERIMENT.block("verdict", report)
+    assert "with 100% of its contexts off the plane" in said
+
+
+def test_the_page_and_the_figure_show_both_distributions(report):
+    lines = experiment.EXPERIMENT.block("body", report).splitlines()
+    assert sum(line.startswith("| ") for line in lines) == 2 + 2
+    figure = experiment.EXPERIMENT.figures(report)["state_distributions"]
+    titles = [axes.get_title(loc="left") for axes in figure.axes]
+    assert {"MountainCar-v0\nexpert", "Pendulum-v1\nbandit"} <= set(titles)

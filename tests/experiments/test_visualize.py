@@ -6,7 +6,7 @@ import pytest
 from PIL import Image
 
 from experiments import visualize
-from experiments.page import CLASSIC_CONTROL
+from experiments.harness import CLASSIC_CONTROL
 
 COMMITTED = Path(__file__).parents[2] / "docs" / "data" / "visualize.json"
 
@@ -31,14 +31,6 @@ def test_gifs_are_made_from_the_report(report, tmp_path):
         assert gif.n_frames == 5
 
 
-def test_the_page_says_what_the_shown_episodes_earn(report):
-    said = visualize.verdict(report)
-    told = dict(zip(report["environments"], visualize.parts(report), strict=True))
-    assert told["CartPole-v1"] and not told[visualize.HOPPER]
-    assert "CartPole-v1 500" in said and "Pendulum-v1 −" in said
-    assert sum(line.startswith("| ") for line in visualize.body(report)) == 8
-
-
 def test_an_agent_is_trained_in_its_bandit_and_shown(monkeypatch):
     monkeypatch.setattr(visualize, "CLASSIC_CONTROL", ("CartPole-v1",))
     # As if the run had been interrupted with Hopper done, whose page is there.
@@ -51,3 +43,15 @@ def test_an_agent_is_trained_in_its_bandit_and_shown(monkeypatch):
     # Every fiftieth observation of 500, and the last.
     assert visualize.film(entry).shape == (11, 4)
     assert np.abs(visualize.film(entry)[0]).max() <= 0.05
+
+
+def test_the_page_says_what_the_shown_episodes_earn(report):
+    said = visualize.EXPERIMENT.block("verdict", report)
+    told = [x.outcome for x in visualize.EXPERIMENT.judged(report)]
+    outcome = dict(zip(report["environments"], told, strict=True))
+    assert outcome["CartPole-v1"] == "holds" and outcome[visualize.HOPPER] == "does not hold"
+    # −83 is above the tenth below the expert's −76.7, its interval's end is not.
+    assert outcome["Acrobot-v1"] == "undecided"
+    assert "CartPole-v1 500" in said and "Pendulum-v1 −" in said
+    lines = visualize.EXPERIMENT.block("body", report).splitlines()
+    assert sum(line.startswith("| ") for line in lines) == 8

@@ -1,16 +1,30 @@
 import json
 from dataclasses import replace
+from pathlib import Path
 
+import jinja2
 import pytest
 from matplotlib.figure import Figure
 
 from experiments import __main__ as everything
-from experiments import page
-from experiments.page import Experiment, table, text
+from experiments import harness, rendering
+from experiments.claims import Claim
+from experiments.harness import Experiment
+from experiments.rendering import text
 from scb.statistics import Estimate
 
+PAGE = """{% extends "page.md.j2" %}
+{% block verdict %}{{ measured }} measured.{% endblock %}
+{% block body %}{{ report.parts | join(" ") }}{% endblock %}"""
 
-def counting(parts=("a", "b"), fail_at=None, claimed=(True, True)) -> Experiment:
+
+@pytest.fixture(autouse=True)
+def template(monkeypatch):
+    loaders = [jinja2.DictLoader({"counting.md.j2": PAGE}), rendering.ENVIRONMENT.loader]
+    monkeypatch.setattr(rendering.ENVIRONMENT, "loader", jinja2.ChoiceLoader(loaders))
+
+
+def counting(parts=("a", "b"), fail_at=None) -> Experiment:
     """An experiment that writes down how often each of its parts was measured."""
 
     def measure(plan, report, save):
@@ -31,9 +45,7 @@ def counting(parts=("a", "b"), fail_at=None, claimed=(True, True)) -> Experiment
         presets={"quick": {"value": 1}, "paper": {"value": 2}},
         minutes={"quick": "0", "paper": "0"},
         measure=measure,
-        parts=lambda report: claimed,
-        verdict=lambda report: f"{report['measured']} measured.",
-        body=lambda report: table(["part"], [[x] for x in report["parts"]]),
+        claims=lambda report: [Claim("every part is there", len(report["parts"]) == 2)],
         draw=lambda report: Figure(figsize=(2, 2)),
     )
 
@@ -41,8 +53,8 @@ def counting(parts=("a", "b"), fail_at=None, claimed=(True, True)) -> Experiment
 def test_an_interrupted_experiment_measures_only_what_is_missing(tmp_path):
     flags = ["--out", str(tmp_path / "c.json"), "--docs", str(tmp_path / "docs")]
     with pytest.raises(KeyboardInterrupt):
-        page.main(counting(fail_at="b"), flags)
-    assert page.main(counting(), flags) == 0
+        counting(fail_at="b").main(flags)
+    assert counting().main(flags) == 0
     report = json.loads((tmp_path / "c.json").read_text())
     assert report["parts"] == {"a": 1, "b": 1} and report["measured"] == 2
     written = (tmp_path / "docs" / "counting.md").read_text()
@@ -55,25 +67,25 @@ def test_an_interrupted_experiment_measures_only_what_is_missing(tmp_path):
 def test_a_report_stays_with_the_machine_that_measured_it(tmp_path):
     out = tmp_path / "c.json"
     flags = ["--out", str(out), "--docs", str(tmp_path)]
-    assert page.main(counting(), flags) == 0
+    assert counting().main(flags) == 0
     here = json.loads(out.read_text())
     other = {"processor": "another processor", "cores": 96, "accelerator": "a GPU"}
     elsewhere = {**here, "machine": other, "versions": {"jax": "0.0"}}
     out.write_text(json.dumps(elsewhere))
-    assert page.main(counting(), flags) == 0
+    assert counting().main(flags) == 0
     assert json.loads(out.read_text()) == elsewhere
     assert "96 cores, another processor" in (tmp_path / "counting.md").read_text()
     # What is measured here is this machine's.
     del elsewhere["parts"]["b"]
     out.write_text(json.dumps(elsewhere))
-    assert page.main(counting(), flags) == 0
+    assert counting().main(flags) == 0
     assert json.loads(out.read_text())["machine"] == here["machine"]
 
 
 def test_another_preset_does_not_continue_a_report(tmp_path, capsys):
     flags = ["--out", str(tmp_path / "c.json"), "--docs", str(tmp_path)]
-    assert page.main(counting(), flags) == 0
-    assert page.main(counting(), [*flags, "--preset", "paper"]) == 2
+    assert counting().main(flags) == 0
+    assert counting().main([*flags, "--preset", "paper"]) == 2
     assert "choose another --out" in capsys.readouterr().err
     assert json.loads((tmp_path / "c.json").read_text())["preset"] == "quick"
 
@@ -83,16 +95,16 @@ def test_the_report_of_another_experiment_is_left_alone(tmp_path, capsys):
     for content in ('{"entries": []}', '{"experiment": "lemma", "complete": true}'):
         out.write_text(content)
         for flags in ([], ["--only-render"]):
-            assert page.main(counting(), [*flags, "--out", str(out)]) == 2
+            assert counting().main([*flags, "--out", str(out)]) == 2
             assert "is no report of counting: choose another --out" in capsys.readouterr().err
         assert out.read_text() == content
 
 
 def test_the_page_of_a_report_elsewhere_is_written_beside_it(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert page.main(counting(), ["--out", "mine/c.json"]) == 0
+    assert counting().main(["--out", "mine/c.json"]) == 0
     assert (tmp_path / "mine" / "counting.md").exists() and not (tmp_path / "docs").exists()
-    assert page.main(counting(), []) == 0
+    assert counting().main([]) == 0
     assert (tmp_path / "docs" / "counting.md").exists()
 
 
@@ -102,7 +114,7 @@ def test_folders_that_cannot_be_made_are_told_before_measuring(tmp_path, capsys,
     inside = tmp_path / "file" / "inside"
     flags = ["--out", str(tmp_path / "c.json"), "--docs", str(tmp_path)]
     flags[flags.index(flag) + 1] = str(inside / "c.json" if flag == "--out" else inside)
-    assert page.main(counting(fail_at="a"), flags) == 2
+    assert counting(fail_at="a").main(flags) == 2
     assert f"choose another {flag}, a folder that you may write to" in capsys.readouterr().err
 
 
@@ -118,22 +130,8 @@ def test_rendering_without_a_report_says_so(tmp_path, capsys, content):
     out = tmp_path / "c.json"
     if content is not None:
         out.write_text(content)
-    assert page.main(counting(), ["--only-render", "--out", str(out), "--docs", str(tmp_path)]) == 2
+    assert counting().main(["--only-render", "--out", str(out), "--docs", str(tmp_path)]) == 2
     assert "is no report of this command" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    ("claimed", "outcome"),
-    [
-        ([True, True], "holds"),
-        ([True, False], "holds in part"),
-        ([True, None], "holds in part"),
-        ([False, None], "does not hold"),
-        ([None, None], "not tested at this size"),
-    ],
-)
-def test_a_claim_is_the_sum_of_its_parts(claimed, outcome):
-    assert counting(claimed=claimed).outcome({}) == outcome
 
 
 def test_estimates_have_real_minus_signs():
@@ -142,19 +140,30 @@ def test_estimates_have_real_minus_signs():
 
 
 def test_every_experiment_says_what_it_is_and_takes():
-    for name, experiment in everything.found().items():
-        assert experiment.name == name
+    for experiment in everything.of_the_paper():
         assert set(experiment.presets) == set(experiment.minutes) == {"quick", "paper"}
         assert experiment.claim.endswith(".")
+    # By name, or as the module of that name.
+    folder = Path(everything.__file__).parent
+    assert all((folder / f"{name}.py").exists() for name in everything.found())
 
 
 def test_the_list_names_every_command(capsys):
     assert everything.main(["--list"]) == 0
     printed = capsys.readouterr().out
-    for name in everything.modules():
+    for name in everything.found():
         assert f"  {name}: " in printed
     assert "quick 1 min" in printed
     assert "rejax_peer" not in printed
+
+
+def test_one_experiment_is_run_by_its_name(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(everything, "found", lambda: {"counting": counting()})
+    flags = ["--out", str(tmp_path / "c.json"), "--docs", str(tmp_path)]
+    assert everything.main(["counting", *flags, "--preset", "paper"]) == 0
+    assert json.loads((tmp_path / "c.json").read_text())["preset"] == "paper"
+    assert everything.main(["countin"]) == 2
+    assert "no experiment 'countin': choose from counting" in capsys.readouterr().err
 
 
 def test_all_experiments_in_one_go_leave_one_page(tmp_path, monkeypatch):
@@ -185,45 +194,47 @@ def test_the_quick_presets_in_one_go_keep_a_report_of_the_papers_size(
 def test_a_report_that_is_not_complete_makes_no_page(tmp_path, capsys):
     flags = ["--out", str(tmp_path / "counting.json"), "--docs", str(tmp_path / "docs")]
     with pytest.raises(KeyboardInterrupt):
-        page.main(counting(fail_at="b"), flags)
-    assert page.main(counting(), [*flags, "--only-render"]) == 2
+        counting(fail_at="b").main(flags)
+    assert counting().main([*flags, "--only-render"]) == 2
     assert (
         "not complete: run python -m experiments.counting --preset quick" in capsys.readouterr().err
     )
     (tmp_path / "empty.json").write_text("{}")
     empty = ["--out", str(tmp_path / "empty.json"), "--docs", str(tmp_path), "--only-render"]
-    assert page.main(counting(), empty) == 2
+    assert counting().main(empty) == 2
     assert "not complete" in capsys.readouterr().err
     assert "Measured in part only" in everything.overview([counting()], tmp_path)
-    assert page.main(counting(), flags) == 0
+    assert counting().main(flags) == 0
     assert "2 measured." in everything.overview([counting()], tmp_path)
 
 
 def test_a_report_of_another_plan_is_not_continued(tmp_path, capsys):
     flags = ["--out", str(tmp_path / "c.json"), "--docs", str(tmp_path)]
-    assert page.main(counting(), flags) == 0
+    assert counting().main(flags) == 0
     presets = {"quick": {"value": 3}, "paper": {"value": 2}}
-    assert page.main(replace(counting(), presets=presets), flags) == 2
+    assert replace(counting(), presets=presets).main(flags) == 2
     assert "when the preset quick was another one" in capsys.readouterr().err
 
 
 def test_returns_that_are_no_number_count_as_a_random_policy():
-    assert page.finite([1.234, float("nan"), float("inf")], -7.0) == ([1.23, -7.0, -7.0], 2)
-    assert page.span([3, 3]) == "3" and page.span([30, 60, 30]) == "30 to 60"
+    assert harness.finite([1.234, float("nan"), float("inf")], -7.0) == ([1.23, -7.0, -7.0], 2)
+    assert rendering.span([3, 3]) == "3" and rendering.span([30, 60, 30]) == "30 to 60"
 
 
-MEASURED = [name for name in everything.found() if (page.DATA / f"{name}.json").exists()]
+MEASURED = [x.name for x in everything.of_the_paper() if (harness.DATA / f"{x.name}.json").exists()]
 
 
 @pytest.mark.parametrize("name", MEASURED)
 def test_the_committed_page_is_that_of_the_committed_report(name):
     experiment = everything.found()[name]
-    report = page.read(page.DATA / f"{name}.json")
+    report = harness.read(harness.DATA / f"{name}.json")
     plan = json.loads(json.dumps(experiment.presets[report["preset"]]))
-    assert page.complete(report) and report.get("plan", plan) == plan
-    assert (page.DOCS / f"{name}.md").read_text() == page.page(experiment, report)
+    assert harness.complete(report) and report.get("plan", plan) == plan
+    assert (harness.DOCS / f"{name}.md").read_text() == experiment.page(report)
 
 
 def test_the_committed_overview_is_that_of_the_committed_reports():
-    experiments = list(everything.found().values())
-    assert (page.DOCS / "experiments.md").read_text() == everything.overview(experiments, page.DATA)
+    experiments = everything.of_the_paper()
+    assert (harness.DOCS / "experiments.md").read_text() == everything.overview(
+        experiments, harness.DATA
+    )

@@ -1,0 +1,106 @@
+"""What becomes of a claim, judged in one place: superior to something, or not inferior by more than a margin.
+
+An interval decides, never the failure to find a difference: a claim holds where the whole interval lies above
+what is asked, does not hold where it lies below, and is undecided in between. That something is as good as
+another is a claim too, and needs a margin and its reason. Where there is no interval, as with one seed
+or one search, nothing is decided.
+"""
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from scb.statistics import Estimate
+
+HOLDS, IN_PART, FAILS, UNDECIDED, UNTESTED = OUTCOMES = (
+    "holds",
+    "holds in part",
+    "does not hold",
+    "undecided",
+    "not tested at this size",
+)
+CONFIDENCE = 0.95  # of all intervals of a page together
+
+
+@dataclass(frozen=True)
+class Claim:
+    """A part of what the paper says, and what it is judged by.
+
+    Attributes:
+      text: what is claimed.
+      evidence: (confidence=...) -> estimate, whose interval is then corrected for the number of comparisons; an
+        estimate as a report stores it, which can't be; whether it is so, where that is counted and not
+        estimated; None where the report can't tell.
+      above: what the estimate must be superior to.
+      margin: by how much it may be inferior.
+      reason: why that margin is none that matters.
+      places: of the estimate where it is written.
+    """
+
+    text: str
+    evidence: Callable[..., Estimate] | Estimate | bool | None
+    above: float = 0.0
+    margin: float = 0.0
+    reason: str = ""
+    places: int = 2
+
+    def __post_init__(self) -> None:
+        if self.margin < 0 or bool(self.margin) != bool(self.reason):
+            raise ValueError(f"a margin is positive and has a reason: {self}.")
+
+    @property
+    def least(self) -> float:
+        """What the interval must lie above."""
+        return self.above - self.margin
+
+
+@dataclass(frozen=True)
+class Judged:
+    """A claim, what was measured for it, and what becomes of it: one of `OUTCOMES`."""
+
+    claim: Claim
+    estimate: Estimate | None
+    outcome: str
+
+    @property
+    def stored(self) -> bool:
+        """Whether its interval is a report's, which can't be corrected."""
+        return isinstance(self.claim.evidence, Estimate) and self.claim.evidence.low is not None
+
+
+def judge(claims: Sequence[Claim]) -> list[Judged]:
+    """Every claim's outcome; intervals that can be are Bonferroni's, so that all hold together with 95 %."""
+    return [_judge(claim, confidence(claims)) for claim in claims]
+
+
+def confidence(claims: Sequence[Claim]) -> float:
+    """Of the interval of each claim."""
+    return 1.0 - (1.0 - CONFIDENCE) / max(1, sum(callable(c.evidence) for c in claims))
+
+
+def _judge(claim: Claim, confidence: float) -> Judged:
+    found = claim.evidence
+    if found is None:
+        return Judged(claim, None, UNTESTED)
+    if isinstance(found, bool):
+        return Judged(claim, None, HOLDS if found else FAILS)
+    if callable(found):
+        found = found(confidence=confidence)
+    if found.low is None or found.high is None:
+        return Judged(claim, found, UNDECIDED)
+    if found.low > claim.least:
+        return Judged(claim, found, HOLDS)
+    return Judged(claim, found, FAILS if found.high < claim.least else UNDECIDED)
+
+
+def outcome(judged: Sequence[Judged]) -> str:
+    """What becomes of all of them together."""
+    number = Counter(x.outcome for x in judged)
+    if number[HOLDS]:
+        return HOLDS if number[HOLDS] == len(judged) else IN_PART
+    return next((x for x in (FAILS, UNDECIDED) if number[x]), UNTESTED)
+
+
+# A margin of normalised scores.
+TENTH = 0.1
+OF_THE_WAY = "a tenth of the way from random actions to the expert: half of what algorithms differ by in the paper"

@@ -1,0 +1,264 @@
+"""What all experiments run on: flags, a report that is continued, claims that are judged, a page from a template.
+
+An experiment is a module with an `EXPERIMENT`. Its report is a JSON object that says what was measured,
+with which preset and versions, and how long it took; page and figure are made from it alone, by
+templates/NAME.md.j2. What a report holds already is not measured again, so that the same command
+continues an interrupted one.
+"""
+
+import importlib
+import json
+import sys
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, make_dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import tyro
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from experiments import claims, rendering
+from experiments.claims import Claim, Judged
+from scb import plotting
+from scb.artefacts import machine_description, package_versions
+from scb.cli import configure_jax
+from scb.environments.registry import families
+from scb.errors import UserError
+from scb.runs import make_folder, write_json
+
+CLASSIC_CONTROL = tuple(sorted(families()["classic"].suite))
+DATA = Path("docs/data")
+DOCS = Path("docs")
+Save = Callable[[], None]
+Report = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Preset:
+    """What an experiment is run with where it has presets."""
+
+    preset: Literal["quick", "paper"] = "quick"
+    """quick has fewer runs or steps than the paper"""
+
+
+@dataclass(frozen=True)
+class Files:
+    """Where an experiment reads and writes."""
+
+    out: Path | None = None
+    """the report; docs/data/NAME.json"""
+    docs: Path | None = None
+    """for the page and the figure; docs, or the folder of --out"""
+    only_render: bool = False
+    """measure nothing"""
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """A figure or table of the paper, or a study of this project's own.
+
+    Attributes:
+      name: of the module, of the template and of the files that it writes.
+      title: of its page.
+      measure: (plan, report, save) fills the report in, and saves after every part. The plan is the
+        chosen preset's; without presets the options as they were given.
+      draw: report -> its figure, or {file name: figure} of several; None for none.
+      paper: which figure or table of Liesen et al. (2024) it is; empty for none.
+      claim: what the paper says, in a sentence.
+      claims: report -> the parts of that.
+      presets: {"quick": {...}, "paper": {...}}; what they hold is the experiment's own.
+      minutes: {preset: roughly how long it takes on two cores}.
+      needs: what it needs beyond the library or keeps beside its report, in words; empty for nothing.
+      facts: report -> what its template shows beside the report itself.
+      extras: (report, docs) writes what the page shows beside the figure; None for nothing.
+      options: a data class whose fields are its flags.
+      keys: what a report holds at least.
+      out: the report's place, where it is not docs/data/NAME.json.
+    """
+
+    name: str
+    title: str
+    measure: Callable[[Any, dict[str, Any], Save], None]
+    draw: Callable[[Report], Figure | dict[str, Figure]] | None = None
+    paper: str = ""
+    claim: str = ""
+    claims: Callable[[Report], Sequence[Claim]] = lambda report: ()
+    presets: Mapping[str, Mapping[str, Any]] | None = None
+    minutes: Mapping[str, str] | None = None
+    needs: str = ""
+    facts: Callable[[Report], Mapping[str, Any]] = lambda report: {}
+    extras: Callable[[Report, Path], None] | None = None
+    options: type = Preset
+    keys: Sequence[str] = ()
+    out: Path | None = None
+
+    def judged(self, report: Report) -> list[Judged]:
+        """What becomes of each part of the claim."""
+        return claims.judge(self.claims(report))
+
+    def context(self, report: Report) -> dict[str, Any]:
+        """What its template is rendered with."""
+        judged = self.judged(report)
+        own = {
+            "experiment": self,
+            "judged": judged,
+            "level": claims.confidence(self.claims(report)),
+            "stored": any(x.stored for x in judged),
+            "outcome": claims.outcome(judged),
+        }
+        return {**report, **own, "report": report, **self.facts(report)}
+
+    def page(self, report: Report) -> str:
+        """The page in Markdown."""
+        return rendering.template(self.name).render(self.context(report))
+
+    def block(self, part: str, report: Report) -> str:
+        """A part of the page: its verdict, its body."""
+        return rendering.block(self.name, part, self.context(report))
+
+    def figures(self, report: Report) -> dict[str, Figure]:
+        """{file name: figure}."""
+        with plotting.figure_style():
+            drawn = {} if self.draw is None else self.draw(report)
+        return drawn if isinstance(drawn, dict) else {self.name: drawn}
+
+    def main(self, argv: Sequence[str] | None = None) -> int:
+        """The command line.
+
+        Returns:
+          The exit status: 2 where the user asked for what cannot be, with one sentence on stderr.
+        """
+        parts = [("files", Files, Files()), ("options", self.options, self.options())]
+        arguments: Any = tyro.cli(
+            make_dataclass("Flags", parts),
+            config=(tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff),
+            args=argv,
+            prog=f"python -m experiments.{self.name}",
+            description=self.description(),
+        )
+        configure_jax()
+        return exit_status(self.name, lambda: self.run(arguments.options, arguments.files))
+
+    def description(self) -> str:
+        """What --help says: of the paper's claim, or the module's docstring."""
+        if self.paper:
+            return f"{self.title}. The paper ({self.paper}): {self.claim}"
+        return importlib.import_module(f"experiments.{self.name}").__doc__ or ""
+
+    def run(self, options: Any, files: Files) -> int:
+        """Measures what is missing, and writes page and figure."""
+        out = files.out or self.out or DATA / f"{self.name}.json"
+        # What is measured elsewhere leaves the documentation's page as it is.
+        docs = files.docs or (DOCS if files.out is None else out.parent)
+        make_folder(docs, "--docs")
+        report = read(out, missing_is_new=not files.only_render, keys=self.keys)
+        if report and report.get("experiment", None if self.presets else self.name) != self.name:
+            raise UserError(f"{out} is no report of {self.name}: choose another --out.")
+        if not files.only_render:
+            make_folder(out.parent)
+            self._measure(options, report, out)
+        self.render(report, docs)
+        return 0
+
+    def _measure(self, options: Any, report: dict[str, Any], out: Path) -> None:
+        plan: dict[str, Any] = {}
+        fixed: dict[str, Any] = {}
+        if self.presets:
+            preset = options.preset
+            if report.get("preset", preset) != preset:
+                raise UserError(
+                    f"{out} holds the preset {report['preset']}: choose another --out for the preset {preset}; "
+                    "its page is then written beside it."
+                )
+            plan = json.loads(json.dumps(dict(self.presets[preset])))
+            if report.get("plan", plan) != plan:
+                raise UserError(
+                    f"{out} was measured when the preset {preset} was another one: choose another --out."
+                )
+            fixed = {"preset": preset, "plan": plan, "complete": False}
+        before, start = report.get("seconds", 0.0), time.monotonic()
+        # What measures nothing leaves the report to the machine that made it.
+        here = {"versions": package_versions(), "machine": machine_description()}
+        report |= {"experiment": self.name, **fixed}
+
+        def save() -> None:
+            report.update(here, seconds=round(before + time.monotonic() - start, 1))
+            write_json(out, report)
+
+        further = {k: v for k, v in asdict(options).items() if k != "preset"}
+        self.measure({**plan, **further} if self.presets else options, report, save)
+        if self.presets:
+            report["complete"] = True
+        write_json(out, report)
+
+    def render(self, report: Report, docs: Path) -> None:
+        """Writes docs/NAME.md and docs/figures/NAME.png.
+
+        Raises:
+          UserError: the report is not complete.
+        """
+        if self.presets and not complete(report):
+            raise UserError(
+                f"the report of {self.name} is not complete: run python -m experiments.{self.name} "
+                f"--preset {report.get('preset', 'quick')}, which goes on where it was."
+            )
+        if rendering.has_template(self.name):
+            (docs / f"{self.name}.md").write_text(self.page(report))
+        for name, figure in self.figures(report).items():
+            plotting.save(figure, docs / "figures" / f"{name}.png")
+        if self.extras is not None:
+            self.extras(report, docs)
+
+
+def exit_status(name: str, command: Callable[[], int]) -> int:
+    """What a command returns; 2 where it raises a UserError, whose sentence goes to stderr behind the name."""
+    try:
+        return command()
+    except UserError as error:
+        print(f"{name}: {error}", file=sys.stderr)
+        return 2
+
+
+def complete(report: Report) -> bool:
+    """Whether everything that the report is about was measured."""
+    return bool(report.get("complete"))
+
+
+def read(path: Path, missing_is_new: bool = False, keys: Iterable[str] = ()) -> dict[str, Any]:
+    """A report from its file, with these keys at least; a UserError where there is none."""
+    if missing_is_new and not path.exists():
+        return {}
+    try:
+        report = dict(json.loads(path.read_text()))
+        if lacking := [key for key in keys if key not in report]:
+            raise ValueError(f"it lacks {', '.join(lacking)}")
+    except (OSError, TypeError, ValueError) as error:
+        raise UserError(
+            f"{path} is no report of this command ({error}): measure first, or choose another --out."
+        ) from error
+    return report
+
+
+def packed(rows: Any) -> list[str]:
+    """[N, M] numbers as a line of JSON a row; one number a line would make a report unreadable."""
+    return [" ".join(f"{x:.4g}" for x in row) for row in rows]
+
+
+def unpacked(lines: Sequence[str]) -> NDArray[np.floating]:
+    """What `packed` packed, to four digits."""
+    return np.array([[float(x) for x in line.split()] for line in lines])
+
+
+def finite(returns: Any, instead: float) -> tuple[list[float], int]:
+    """([N] returns to two digits, how many were no number): those count as `instead`, the return of random actions."""
+    values = np.asarray(returns, np.float64)
+    bad = ~np.isfinite(values)
+    return np.round(np.where(bad, instead, values), 2).tolist(), int(bad.sum())
+
+
+def run_name(file: Path) -> str:
+    """What to call an objective's file: every run's is objective.npz, and its folder tells runs apart."""
+    return file.parent.name if file.stem == "objective" else file.stem

@@ -1,0 +1,90 @@
+"""How pages are made of templates: Jinja's environment and the filters that write numbers."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import jinja2
+
+from experiments.claims import UNDECIDED, UNTESTED
+from scb.statistics import Estimate, estimate, iqm
+
+TEMPLATES = Path(__file__).with_name("templates")
+
+
+def number(value: float, places: int = 0, sign: bool = False) -> str:
+    """With a real minus sign."""
+    return f"{value:{'+' if sign else ''}z.{places}f}".replace("-", "\N{MINUS SIGN}")
+
+
+def text(value: Estimate | Mapping[str, Any] | Any, places: int = 0, sign: bool = False) -> str:
+    """An estimate with its interval; [N] runs are estimated."""
+    if not isinstance(value, Mapping | Estimate):
+        value = estimate(value)
+    values: Any = value if isinstance(value, Mapping) else value.as_dict()
+    found = number(values["value"], places, sign)
+    if values["low"] is not None:
+        found += f" [{number(values['low'], places)}, {number(values['high'], places)}]"
+    return found
+
+
+def percent(share: float, places: int = 0) -> str:
+    """Such as 12%."""
+    return f"{share:.{places}%}"
+
+
+def listed(parts: Iterable[str]) -> str:
+    """Such as "a, b and c"."""
+    *first, last = parts
+    return f"{', '.join(first)} and {last}" if first else last
+
+
+def span(numbers: Iterable[int]) -> str:
+    """Such as "30 to 60", or "30" where all are alike."""
+    low, high = min(found := list(numbers)), max(found)
+    return str(low) if low == high else f"{low} to {high}"
+
+
+def said(outcome: str) -> str:
+    """With its verb, as in "it holds", "it is not tested at this size"."""
+    return f"{'is ' if outcome in (UNDECIDED, UNTESTED) else ''}*{outcome}*"
+
+
+def algorithms(names: Sequence[str], otherwise: str = "all of the paper's algorithms") -> str:
+    """Such as "PPO, SAC"; a plan's empty list stands for all."""
+    return ", ".join(name.upper() for name in names) or otherwise
+
+
+ENVIRONMENT = jinja2.Environment(
+    loader=jinja2.FileSystemLoader(TEMPLATES),
+    undefined=jinja2.StrictUndefined,
+    trim_blocks=True,
+    lstrip_blocks=True,
+    keep_trailing_newline=True,
+)
+ENVIRONMENT.filters |= {
+    "algorithms": algorithms,
+    "iqm": lambda x: float(iqm(x)),
+    "listed": listed,
+    "number": number,
+    "percent": percent,
+    "said": said,
+    "span": span,
+    "text": text,
+}
+
+
+def has_template(name: str) -> bool:
+    """Whether an experiment makes a page."""
+    return f"{name}.md.j2" in ENVIRONMENT.list_templates()
+
+
+def template(name: str) -> jinja2.Template:
+    """templates/NAME.md.j2."""
+    return ENVIRONMENT.get_template(f"{name}.md.j2")
+
+
+def block(name: str, part: str, context: Mapping[str, Any]) -> str:
+    """One block of a page's template."""
+    found = template(name)
+    return "".join(found.blocks[part](found.new_context(dict(context)))).strip()
