@@ -26,7 +26,7 @@ from experiments.harness import exit_status
 from lpo import drift_figures
 from lpo.drifts import ClosedFormDrift
 from lpo.objectives import load_objective, zoo_names
-from lpo.understanding import REGIONS, analyze
+from lpo.update_regions import REGIONS, analyze
 from scb import plotting
 from scb.artefacts import package_versions
 from scb.cli import configure_jax

@@ -1,10 +1,8 @@
 """Figures of drifts: what they charge, and what they do to the update, over ratio and advantage."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from matplotlib import colormaps
 from matplotlib.artist import Artist
@@ -17,7 +15,7 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator, NullLocator
 from numpy.typing import NDArray
 
-from lpo.understanding import CLIP, REGIONS, analyze
+from lpo.update_regions import CLIP, REGIONS, analyze, surface
 from scb.errors import UserError
 from scb.plotting import (
     GREEN,
@@ -37,7 +35,7 @@ if TYPE_CHECKING:
 
 RATIOS = (0.4, 1.8)
 ADVANTAGES = (-3.0, 3.0)
-# Of `lpo.understanding.REGIONS`. What stops or turns an update is dark, what leaves it alone is pale.
+# Of `lpo.update_regions.REGIONS`. What stops or turns an update is dark, what leaves it alone is pale.
 _REGION_COLORS = {
     "rolls back": VERMILLION,
     "flat": GREY,
@@ -67,9 +65,9 @@ def drift_heatmaps(objectives: "Sequence[Objective]", progress: float = 0.5) -> 
         raise UserError("there are no objectives to draw: give at least one.")
     ratios = np.linspace(*RATIOS, 281)
     advantages = np.linspace(*ADVANTAGES, 241)
-    surfaces = [drift_surface(o, ratios, advantages, progress) for o in objectives]
+    surfaces = [surface(o, np.log(ratios), advantages, progress) for o in objectives]
     drifts = [drift for drift, _ in surfaces]
-    gradients = [gradient for _, gradient in surfaces]
+    gradients = [gradient / ratios for _, gradient in surfaces]
     with figure_style():
         figure = Figure(figsize=(WIDTH, 6.4))
         grid = figure.subplots(2, len(objectives), sharex=True, sharey=True, squeeze=False)
@@ -155,38 +153,6 @@ def drift_heatmaps(objectives: "Sequence[Objective]", progress: float = 0.5) -> 
     return figure
 
 
-def drift_surface(
-    objective: "Objective",
-    ratios: NDArray[np.floating],
-    advantages: NDArray[np.floating],
-    progress: float = 0.5,
-) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
-    """Drift and gradient of the whole objective on a grid.
-
-    Args:
-      ratios: [R], > 0.
-      advantages: [A].
-      progress: fraction of training done.
-
-    Returns:
-      [A, R] drift f, and [A, R] d/dr (r A - f).
-    """
-
-    def drift(ratio: jax.Array, advantage: jax.Array) -> jax.Array:
-        fraction = jnp.full((1,), progress, jnp.float32)
-        return objective.drift(
-            objective.parameters, jnp.log(ratio)[None], advantage[None], fraction
-        )[0]
-
-    def over_grid(function: Callable[..., Any]) -> Callable[..., Any]:
-        return jax.jit(jax.vmap(jax.vmap(function, in_axes=(0, None)), in_axes=(None, 0)))
-
-    value, slope = over_grid(jax.value_and_grad(drift))(
-        jnp.asarray(ratios, jnp.float32), jnp.asarray(advantages, jnp.float32)
-    )
-    return np.asarray(value), np.asarray(advantages)[:, None] - np.asarray(slope)
-
-
 def drift_and_gradient(
     objectives: "Sequence[Objective]", progress: Sequence[float] = (0.0, 0.5, 1.0)
 ) -> Figure:
@@ -194,7 +160,7 @@ def drift_and_gradient(
 
     A row an objective; one that changes over the training has a row for each of its fractions.
     Columns: the drift f, the gradient d/d(log r) (r A - f), and the regions of
-    `lpo.understanding.REGIONS`. The panels of a column share one scale.
+    `lpo.update_regions.REGIONS`. The panels of a column share one scale.
 
     Args:
       objectives: from top to bottom.

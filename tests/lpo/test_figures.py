@@ -15,6 +15,7 @@ from matplotlib.collections import FillBetweenPolyCollection, QuadMesh
 from lpo import drift_figures, figures
 from lpo.generalization import LearningCurves
 from lpo.objectives import Objective, load_objective
+from lpo.update_regions import surface
 from scb import plotting
 from scb.errors import UserError
 from scb.statistics import estimate, iqm
@@ -144,12 +145,11 @@ def test_objectives_are_told_apart_without_colour():
 
 def test_ppo_is_free_inside_the_clip_and_linear_outside():
     # f = (r - 1.2) A above the clip for A > 0, (r - 0.8) A below it for A < 0.
-    drift, gradient = drift_figures.drift_surface(
-        load_objective("ppo"), np.array([0.5, 0.9, 1.0, 1.1, 1.5]), np.array([-2.0, 2.0])
-    )
+    ratios = np.array([0.5, 0.9, 1.0, 1.1, 1.5])
+    drift, gradient = surface(load_objective("ppo"), np.log(ratios), np.array([-2.0, 2.0]), 0.5)
     np.testing.assert_allclose(drift, [[0.6, 0, 0, 0, 0], [0, 0, 0, 0, 0.6]], atol=1e-6)
     # The whole objective's gradient is A where the drift is flat, and stops where it is not.
-    np.testing.assert_allclose(gradient, [[0, -2, -2, -2, -2], [2, 2, 2, 2, 0]], atol=1e-5)
+    np.testing.assert_allclose(gradient / ratios, [[0, -2, -2, -2, -2], [2, 2, 2, 2, 0]], atol=1e-5)
 
 
 def test_the_heat_map_of_ppo_is_zero_inside_the_clip():
@@ -181,10 +181,8 @@ def test_one_extreme_corner_does_not_make_the_others_look_flat():
 @pytest.mark.parametrize(("name", "turns_back"), [("ppo", False), ("dpo", True)])
 def test_only_an_objective_that_moves_the_policy_back_is_hatched(name, turns_back):
     # DPO, A = -3, r = 0.4: d/dr (r A - f) = A (1 - (1 - sech^2(A log r / 0.6)) / r) = 4.5 > 0.
-    _, gradient = drift_figures.drift_surface(
-        load_objective(name), np.array([0.4]), np.array([-3.0])
-    )
-    assert (gradient[0, 0] > 1.0) == turns_back
+    _, gradient = surface(load_objective(name), np.log([0.4]), np.array([-3.0]), 0.5)
+    assert (gradient[0, 0] / 0.4 > 1.0) == turns_back
     [legend] = drift_figures.drift_heatmaps([load_objective(name)]).legends
     said = [text.get_text() for text in legend.get_texts()]
     assert ("update moves the policy back" in said) == turns_back

@@ -14,7 +14,7 @@ from experiments.understanding import words
 from lpo import drift_figures
 from lpo.drifts import LearnedDrift
 from lpo.objectives import Objective, load_objective
-from lpo.understanding import REGIONS, Analysis, analyze, classify, midpoints, surface
+from lpo.update_regions import REGIONS, Analysis, analyze, classify, midpoints, surface
 from scb.errors import UserError
 
 # Ratios on either side of both ends of PPO's clip, and an advantage of either sign.
