@@ -57,7 +57,8 @@ _EXPERTS: dict[str, dict[str, float]] = {
     "halfcheetah": {"ppo": 3487.1, "sac": 7735.5, "ddpg": 3263.3, "td3": 13213.5},
     "humanoidstandup": {"ppo": 17243.5, "sac": 23808.1, "ddpg": 24944.8, "td3": 28376.2},
 }
-# 1000 steps that each pay brax's healthy reward, whatever the physics.
+# 1000 steps that each pay brax's healthy reward, whatever the physics. Zero actions come near it for hopper
+# and ant; a limp walker2d or humanoid falls.
 _STANDING = {"ant": 1000.0, "hopper": 1000.0, "humanoid": 5000.0, "walker2d": 1000.0}
 
 logger = logging.getLogger(__name__)

@@ -12,6 +12,7 @@ import pytest
 
 from scb.environments import brax as adapter
 from scb.environments.brax import BACKENDS, BRAX_NAMES, BraxEnvironment
+from scb.environments.registry import environment_spec
 from scb.errors import UserError
 
 # The smallest of brax's environments on its fastest backend: a second or two to compile.
@@ -295,6 +296,17 @@ def test_swimmer_can_be_stepped_though_its_fluid_model_calls_a_clip_that_jax_dro
 
 
 @pytest.mark.slow
+@pytest.mark.slow
+def test_standing_still_pays_the_healthy_reward_for_a_whole_episode():
+    known = {name: environment_spec(name) for name in BRAX_NAMES}
+    for name, spec in known.items():
+        if spec.standing_still("spring") is not None:
+            env, params = spec.make("spring")
+            paid = env.brax_env._healthy_reward * params.max_steps_in_episode
+            assert spec.standing_still("spring") == spec.standing_still() == paid, name
+    assert sum(spec.standing_still() is not None for spec in known.values()) == 4
+
+
 @pytest.mark.parametrize("name", BRAX_NAMES)
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_every_environment_steps_on_every_backend(name, backend):
