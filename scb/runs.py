@@ -83,7 +83,7 @@ class Run:
         if resume:
             stored = read_config(folder)
             stored, asked = ({**c, "command": None} for c in (stored, config))
-            difference = _first_difference(stored, asked)
+            difference = first_difference(stored, asked)
             if difference:
                 raise UserError(
                     f"cannot resume {folder}: its config differs at {difference}; resume with the config it was "
@@ -281,10 +281,11 @@ def _plain(value: Any) -> float | int | None:
     return int(number) if isinstance(value, int | np.integer) else number
 
 
-def _first_difference(stored: Any, given: Any, path: str = "") -> str:
+def first_difference(stored: Any, given: Any, path: str = "") -> str:
+    """Where two trees of JSON differ first, such as "a.b (1 there, 2 now)"; empty where they don't."""
     if isinstance(stored, dict) and isinstance(given, dict):
         for key in sorted(stored.keys() | given.keys()):
-            difference = _first_difference(stored.get(key), given.get(key), f"{path}.{key}")
+            difference = first_difference(stored.get(key), given.get(key), f"{path}.{key}")
             if difference:
                 return difference
         return ""

@@ -1,0 +1,520 @@
+"""One measurement: agents train somewhere, are judged somewhere, and what they earn are tidy rows.
+
+`train_and_judge` is the traced core, of one agent: pure, so that searches call it inside their own
+`vmap`. `measure` maps it over agents and devices and keeps a row for every agent and point of its
+training, agent by agent, so that a measurement that was killed goes on where it stopped.
+
+A file of rows is JSON Lines: `pandas.read_json("rows.jsonl", lines=True)`. Under which configuration a
+row was measured is in the .json beside it, by the digest in its column `configuration`.
+"""
+
+import hashlib
+import json
+import os
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, fields, is_dataclass, replace
+from functools import lru_cache
+from operator import itemgetter
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from gymnax.environments import environment
+from jax.typing import ArrayLike
+
+from scb.agents.agent import Agent
+from scb.agents.spec import AgentSpec
+from scb.artefacts import package_versions
+from scb.environments.registry import environment_spec
+from scb.errors import UserError
+from scb.evaluation import Episodes
+from scb.evolution import map_population
+from scb.keys import root_key, split_key
+from scb.runs import first_difference, write_json
+
+Row = dict[str, Any]
+MODE, SAMPLED = "mode", "sampled"
+
+
+# -- one agent ------------------------------------------------------------------------------------
+
+
+class Judge(NamedTuple):
+    """What a trained agent is judged by.
+
+    Attributes:
+      env, params: where.
+      episodes: how many; static.
+      mode: the most likely actions instead of sampled ones; static.
+      limit: steps after which an episode is cut; traced. None: the environment's own.
+    """
+
+    env: environment.Environment[Any, Any]
+    params: Any
+    episodes: int
+    mode: bool = False
+    limit: ArrayLike | None = None
+
+    def __call__(self, agent: Agent, state: Any, key: jax.Array) -> Episodes:
+        """[E] episodes of an agent."""
+        return agent.evaluate(
+            state, key, self.episodes, self.env, self.params, self.mode, self.limit
+        )
+
+
+def train_and_judge(
+    agent: Agent,
+    hyperparameters: Any,
+    key: jax.Array,
+    params: Any,
+    judges: Mapping[str, Judge],
+    every: int | None = None,
+    iterations: jax.Array | None = None,
+) -> tuple[Any, dict[str, Episodes]]:
+    """One agent's training, and what it earns. Traced: to be jitted and vmapped by the caller.
+
+    Args:
+      key: decides everything. All judges meet one key, so that they see the same start states.
+      params: of the environment that the agent trains in.
+      judges: by name.
+      every: iterations between judgements along the training, the first of them before it; must divide
+        the configuration's. None: judged at the end alone.
+      iterations: a traced number of iterations instead of the configuration's; without `every`.
+
+    Returns:
+      The trained agent's state, and {judge: episodes}, of shape [points, E] with `every`, else [E].
+    """
+
+    def judged(state: Any, key: jax.Array) -> dict[str, Episodes]:
+        return {name: judge(agent, state, key) for name, judge in judges.items()}
+
+    if every is not None:
+        return agent.train_with_evaluations(key, hyperparameters, params, judged, every)
+    key_train, key_judge = split_key(key)
+    if iterations is None:
+        state = agent.train(key_train, hyperparameters, params)
+    else:
+        state = agent.init(key_train, hyperparameters, params)
+        state = agent.train_iterations(state, hyperparameters, params, iterations)
+    return state, judged(state, key_judge)
+
+
+def spaced(iterations: int, points: int) -> tuple[int, int]:
+    """(iterations between about `points` judgements, iterations of the training).
+
+    The judgements divide the training evenly. Where no divisor gives between half and twice as many as
+    asked (a prime number of iterations), it is rounded up to a multiple of the points.
+    """
+    points = min(points, iterations)
+    divisors = (n for n in range(1, iterations + 1) if iterations % n == 0)
+    every = min(divisors, key=lambda n: abs(iterations / n - points))
+    if not points / 2 <= iterations / every <= points * 2:
+        every = -(-iterations // points)
+        iterations = every * points
+    return every, iterations
+
+
+# -- many agents ----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Place:
+    """Where agents train or are judged: an environment under the name that rows give it."""
+
+    name: str
+    env: environment.Environment[Any, Any]
+    params: Any
+    backend: str | None = None
+
+    @classmethod
+    def named(cls, name: str, backend: str | None = None) -> "Place":
+        """An environment or bandit of the registry, with this physics."""
+        spec = environment_spec(name)
+        return cls(spec.name, *spec.make(backend), spec.physics(backend))
+
+
+class Objective(Protocol):
+    """What may take the place of an agent's own: a drift and its parameters, under a name."""
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def drift(self) -> Any: ...
+    @property
+    def parameters(self) -> Any: ...
+
+
+@dataclass(frozen=True, eq=False)
+class Agents:
+    """Who is trained.
+
+    Attributes:
+      names: (seed, number among the seed's agents) of each.
+      keys: [N] of each.
+      hyperparameters: of each, every leaf [N].
+      drawn: the hyperparameters that differ among them, which become columns.
+    """
+
+    names: Sequence[tuple[int, int]]
+    keys: jax.Array
+    hyperparameters: Any
+    drawn: tuple[str, ...] = ()
+
+    @classmethod
+    def seeded(cls, spec: AgentSpec, seeds: Sequence[int]) -> "Agents":
+        """One agent a seed, with the specification's own hyperparameters."""
+        check_seeds(seeds)
+        keys = jax.vmap(root_key)(np.asarray(seeds, np.uint32))
+        hyperparameters = jax.tree.map(
+            lambda x: jnp.full((len(seeds), *np.shape(x)), x), spec.hyperparameters
+        )
+        return cls([(seed, 0) for seed in seeds], keys, hyperparameters)
+
+    @classmethod
+    def drawn_from(cls, spec: AgentSpec, seed: int, number: int) -> "Agents":
+        """Several agents of one seed, which share the values of the specification's lists out."""
+        check_seeds([seed])
+        key_draw, key_agents = split_key(root_key(seed))
+        return cls(
+            [(seed, i) for i in range(number)],
+            split_key(key_agents, number),
+            spec.sample(key_draw, number),
+            tuple(sorted(spec.lists)),
+        )
+
+
+def check_seeds(seeds: Sequence[int]) -> None:
+    """Raises a UserError where there are no seeds, or one is not a number of 32 bits."""
+    if not seeds:
+        raise UserError("no seeds: give at least one.")
+    for seed in seeds:
+        if not 0 <= seed < 2**32:
+            raise UserError(f"a seed is {seed}: each must be 0 or larger, and below 2^32.")
+
+
+def measure(
+    spec: AgentSpec,
+    train_in: Place,
+    judge_in: Place | None = None,
+    agents: Agents | Sequence[int] = (0,),
+    *,
+    objectives: Sequence[Objective] = (),
+    points: int | None = None,
+    episodes: int = 20,
+    actions: Sequence[str] = (MODE,),
+    rows: "Rows | None" = None,
+    side_by_side: int | None = None,
+    tell: Callable[[str], None] = lambda line: None,
+) -> list[Row]:
+    """Trains agents and judges them; what the rows hold already is not measured again.
+
+    Args:
+      spec: the agents' algorithm, configuration and hyperparameters.
+      train_in, judge_in: where; judged where they train if left out.
+      agents: or seeds, of one agent each.
+      objectives: each trains all agents, on the same seeds; none for the algorithm's own.
+      points: about how many judgements along the training, the untrained agent's not counted, for which
+        the training may be rounded up (`spaced`). None: at the end alone.
+      episodes: of each judgement.
+      actions: "mode", the most likely ones, or "sampled", or both of the same agents.
+      rows: where results are kept and found; None for memory.
+      side_by_side: agents that train at a time, and are kept together. All of them where left out; with
+        physics on a CPU as many as devices, so that long trainings are kept as they come.
+      tell: takes a line when some agents are done.
+
+    Returns:
+      A row for every objective, agent, point and kind of actions, in this order, with the columns
+      environment, backend, trained_in, algorithm, objective, seed, agent, step, actions, return, length (means
+      of the episodes), those of `agents.drawn`, and configuration.
+
+    Raises:
+      UserError: the rows hold such agents measured under another configuration.
+    """
+    numbers = {"points": points, "episodes": episodes, "side_by_side": side_by_side}
+    for what, value in numbers.items():
+        if value is not None and value < 1:
+            raise UserError(f"{what} is {value}: it must be at least 1.")
+    judge_in, rows = judge_in or train_in, Rows() if rows is None else rows
+    agents = agents if isinstance(agents, Agents) else Agents.seeded(spec, agents)
+    every, iterations = None, spec.config.num_iterations
+    if points is not None:
+        every, iterations = spaced(iterations, points)
+        if iterations != spec.config.num_iterations:
+            longer = replace(spec.config, total_steps=spec.config.steps_after(iterations))
+            spec = replace(spec, config=longer)
+    judged_at = [iterations] if every is None else range(0, iterations + 1, every)
+    steps = [spec.config.steps_after(n) for n in judged_at]
+    params = (spec.training_params(train_in.params), judge_in.params)
+    if side_by_side is None and train_in.backend is not None and jax.default_backend() == "cpu":
+        side_by_side = jax.device_count()
+    columns = {
+        "environment": judge_in.name,
+        "backend": judge_in.backend,
+        "trained_in": train_in.name,
+        "algorithm": spec.algorithm,
+    }
+    configuration = {
+        "agent": {n: getattr(spec, n) for n in ("config", "hyperparameters", "lists")},
+        "trained_in": params[0],
+        "points": points,
+        "episodes": episodes,
+        "actions": list(actions),
+        "versions": package_versions(),
+    }
+
+    found: dict[str | None, list[Row]] = {}
+    for family in families(objectives):
+        cells = [
+            rows.cell(
+                columns | {"objective": objective and objective.name},
+                configuration
+                | {"objective": objective and (objective.drift, objective.parameters)},
+                len(steps) * len(actions),
+            )
+            for objective in family
+        ]
+        first = family[0]
+        agent = spec.agent(train_in.env, first and first.drift)
+        wanted = [(cell, i) for cell in range(len(cells)) for i in range(len(agents.names))]
+        size = min(side_by_side or len(wanted), len(wanted))
+        for start in range(0, len(wanted), size):
+            batch = wanted[start : start + size]
+            lacking = [x for x in batch if agents.names[x[1]] not in cells[x[0]].done]
+            if not lacking:
+                continue
+            # With the neighbours that it always has: an agent's last digits depend on its place.
+            padded = [batch[i % len(batch)] for i in range(size)]
+            which = np.array([i for _, i in padded])
+            hyperparameters = jax.tree.map(itemgetter(which), agents.hyperparameters)
+            if first is not None:
+                drifts = [family[cell].parameters for cell, _ in padded]  # type: ignore[union-attr]
+                stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *drifts)
+                hyperparameters = replace(hyperparameters, drift=stacked)
+            program, arrays = _program_of(
+                agent, params, judge_in.env, episodes, tuple(actions), every, size
+            )
+            earned = program(hyperparameters, agents.keys[which], *arrays)
+            for cell, i in lacking:
+                position = batch.index((cell, i))
+                drawn = {n: float(getattr(agents.hyperparameters, n)[i]) for n in agents.drawn}
+                cells[cell].add(
+                    agents.names[i],
+                    [
+                        {
+                            "step": step,
+                            "actions": kind,
+                            "return": _plain(np.ravel(earned[kind][0][position])[point]),
+                            "length": _plain(np.ravel(earned[kind][1][position])[point]),
+                            **drawn,
+                        }
+                        for point, step in enumerate(steps)
+                        for kind in actions
+                    ],
+                )
+            tell(f"{judge_in.name}: {sum(len(c.done) for c in cells)} of {len(wanted)} agents")
+        for objective, kept in zip(family, cells, strict=True):
+            name = None if objective is None else objective.name
+            found[name] = [row for one in agents.names for row in kept.done[one]]
+    order = [objective.name for objective in objectives] if objectives else [None]
+    return [row for name in order for row in found[name]]
+
+
+def families(objectives: Sequence[Objective]) -> list[list[Objective | None]]:
+    """Objectives that differ in their drifts' parameters alone stand together: one program trains them all.
+
+    Without any there is one family, of the algorithm's own.
+    """
+    found: list[list[Objective | None]] = []
+    for objective in objectives:
+        family = next((f for f in found if f[0] and f[0].drift == objective.drift), None)
+        if family is None:
+            found.append([objective])
+        else:
+            family.append(objective)
+    return found or [[None]]
+
+
+def _program_of(
+    agent: Agent, params: Any, judge_env: Any, *static: Any
+) -> tuple[Callable[..., Any], list[Any]]:
+    """The program that trains and judges, and the arrays in the parameters, which it takes after the agents.
+
+    Arrays (a bandit's weights) are arguments, so that bandits which differ in them share a program.
+    """
+    leaves, structure = jax.tree.flatten(params)
+    arrays = [x if isinstance(x, jax.Array | np.ndarray) else None for x in leaves]
+    numbers = tuple(x if a is None else None for x, a in zip(leaves, arrays, strict=True))
+    made_of = tuple(getattr(agent, field.name) for field in fields(agent))
+    program = _program(type(agent), made_of, structure, numbers, judge_env, *static)
+    return program, [x for x in arrays if x is not None]
+
+
+@lru_cache(maxsize=8)  # each holds memory maps, of which a process has some ten thousand
+def _program(
+    kind: type[Agent],
+    made_of: tuple[Any, ...],
+    structure: Any,
+    numbers: tuple[Any, ...],
+    judge_env: environment.Environment[Any, Any],
+    episodes: int,
+    actions: tuple[str, ...],
+    every: int | None,
+    size: int,
+) -> Callable[..., Any]:
+    agent = kind(*made_of)
+
+    def one(hyperparameters: Any, key: jax.Array, *arrays: Any) -> dict[str, Any]:
+        given = iter(arrays)
+        leaves = [next(given) if x is None else x for x in numbers]
+        training_params, judge_params = jax.tree.unflatten(structure, leaves)
+        judges = {name: Judge(judge_env, judge_params, episodes, name == MODE) for name in actions}
+        _, earned = train_and_judge(agent, hyperparameters, key, training_params, judges, every)
+        return {k: (x.returns.mean(-1), x.lengths.mean(-1)) for k, x in earned.items()}
+
+    return map_population(one, size, (0, 0, *(None for x in numbers if x is None)))
+
+
+# -- rows -----------------------------------------------------------------------------------------
+
+
+_AGENT = ("environment", "backend", "trained_in", "algorithm", "objective", "seed", "agent")
+
+
+class Rows:
+    """Tidy rows, in memory or in a file that grows an agent at a time.
+
+    Args:
+      path: of a .jsonl file, new or with rows to go on from; the half line that a kill left at its end
+        is dropped. None: memory alone.
+
+    Raises:
+      UserError: the file cannot be read, or holds something else.
+    """
+
+    def __init__(self, path: str | Path | None = None) -> None:
+        self.path = None if path is None else Path(path)
+        self.rows: list[Row] = []
+        self._configurations: dict[str, Any] = {}
+        if self.path is None or not self.path.exists():
+            return
+        try:
+            self._configurations = json.loads(self._described.read_text())
+            lines = self.path.read_text().split("\n")
+            self.rows = [json.loads(line) for line in lines[:-1]]
+            complete = all(row.keys() >= {*_AGENT, "configuration"} for row in self.rows)
+        except (OSError, ValueError, AttributeError) as error:
+            raise UserError(
+                f"{self.path} cannot be read ({error}): choose another file."
+            ) from error
+        if not complete:
+            raise UserError(f"{self.path} holds no rows of a measurement: choose another file.")
+        if lines[-1]:
+            self._write()
+
+    @property
+    def _described(self) -> Path:
+        assert self.path is not None
+        return self.path.with_suffix(".json")
+
+    def cell(self, columns: Mapping[str, Any], configuration: Any, number: int) -> "Cell":
+        """What is there of agents with these columns, each of `number` rows; a part of an agent is dropped."""
+        described = json.loads(json.dumps(configuration, default=_description, sort_keys=True))
+        digest = hashlib.sha256(json.dumps(described, sort_keys=True).encode()).hexdigest()[:12]
+        there = [row for row in self.rows if all(row[n] == x for n, x in columns.items())]
+        for row in there:
+            if row["configuration"] != digest:
+                other = self._configurations.get(row["configuration"])
+                raise UserError(
+                    f"{self.path or 'the rows'} were measured under another configuration: it differs at "
+                    f"{first_difference(other, described)}; choose another file, or measure as then."
+                )
+        if self.path is not None and digest not in self._configurations:
+            self._configurations[digest] = described
+            write_json(self._described, self._configurations)
+        done: dict[tuple[int, int], list[Row]] = {}
+        for row in there:
+            done.setdefault((row["seed"], row["agent"]), []).append(row)
+        if parts := [name for name, of_it in done.items() if len(of_it) != number]:
+            dropped = {id(row) for name in parts for row in done.pop(name)}
+            self.rows = [row for row in self.rows if id(row) not in dropped]
+            self._write()
+        return Cell(self, {**columns}, digest, done)
+
+    def add(self, rows: Sequence[Row]) -> None:
+        """Appends an agent's rows."""
+        if self.path is not None:
+            with self.path.open("a") as file:
+                file.write("".join(_line(row) for row in rows))
+        self.rows += rows
+
+    def _write(self) -> None:
+        if self.path is None:
+            return
+        temporary = self.path.with_suffix(".tmp")
+        temporary.write_text("".join(map(_line, self.rows)))
+        os.replace(temporary, self.path)
+
+
+@dataclass(frozen=True)
+class Cell:
+    """The agents of one environment, algorithm and objective, and their rows: {(seed, number): rows}."""
+
+    rows: Rows
+    columns: Row
+    digest: str
+    done: dict[tuple[int, int], list[Row]]
+
+    def add(self, agent: tuple[int, int], results: Sequence[Row]) -> None:
+        """Keeps an agent's results."""
+        seed, number = agent
+        self.done[agent] = [
+            {**self.columns, "seed": seed, "agent": number, **row, "configuration": self.digest}
+            for row in results
+        ]
+        self.rows.add(self.done[agent])
+
+
+def pivot(rows: Iterable[Row], *axes: str, value: str = "return") -> np.ndarray:
+    """One column of the rows as an array with an axis for each of these columns, such as objective, seed, step.
+
+    Along an axis labels stand as they first appear. What is no number is NaN.
+
+    Raises:
+      ValueError: two rows for one place, or none.
+    """
+    rows = list(rows)
+    labels = [list(dict.fromkeys(row[axis] for row in rows)) for axis in axes]
+    positions = [{label: i for i, label in enumerate(of_it)} for of_it in labels]
+    filled = np.zeros([len(of_it) for of_it in labels], int)
+    array = np.full(filled.shape, np.nan)
+    for row in rows:
+        place = tuple(at[row[axis]] for at, axis in zip(positions, axes, strict=True))
+        filled[place] += 1
+        array[place] = np.nan if row[value] is None else row[value]
+    if not (filled == 1).all():
+        raise ValueError(f"the rows are not one for every combination of {', '.join(axes)}.")
+    return array
+
+
+def _line(row: Row) -> str:
+    return json.dumps(row, allow_nan=False) + "\n"
+
+
+def _plain(number: Any) -> float | None:
+    return float(number) if np.isfinite(number) else None  # JSON has no NaN
+
+
+def _description(value: Any) -> Any:
+    """Of what JSON doesn't know: large arrays by their digest."""
+    if is_dataclass(value) and not isinstance(value, type):
+        return {field.name: getattr(value, field.name) for field in fields(value)}
+    if isinstance(value, Mapping):
+        return dict(value)
+    array = np.asarray(value)
+    if array.dtype == object:
+        return repr(value)
+    if array.size > 8:
+        return {"shape": array.shape, "sha256": hashlib.sha256(array.tobytes()).hexdigest()}
+    return array.tolist()

@@ -1,0 +1,300 @@
+"""Training and judging, once: numbers as before, rows that survive a kill, arrays out of them."""
+
+import json
+import random
+from typing import NamedTuple
+
+import jax
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from scb import measurement
+from scb.agents.ppo import PPOConfig, PPOHyperparameters, clipped_surrogate_drift
+from scb.agents.spec import AgentSpec
+from scb.errors import UserError
+from scb.measurement import Agents, Judge, Place, Rows, measure, pivot, spaced, train_and_judge
+
+# Seven batches of eight contexts, which have no divisor near three points: nine are trained.
+CONFIG = PPOConfig(
+    num_envs=8, num_steps=1, num_epochs=2, num_minibatches=2, total_steps=56, hidden_sizes=(4,)
+)
+SPEC = AgentSpec("ppo", CONFIG, PPOHyperparameters(learning_rate=0.03))
+SEEDS = (3, 4, 5)
+
+
+class Clip(NamedTuple):
+    """PPO's clip as an objective."""
+
+    name: str
+    parameters: float
+    drift: object = clipped_surrogate_drift
+
+
+CLIPS = (Clip("ppo", 0.2), Clip("wide", 0.3))
+
+
+@pytest.fixture(scope="module")
+def bandit() -> Place:
+    return Place.named("Synthetic-Pendulum-v1")
+
+
+@pytest.fixture(scope="module")
+def measured(bandit):
+    """(path, the measurement into it): six agents of four points; bytes are not to be changed."""
+
+    def again(path, agents=SEEDS, spec=SPEC, objectives=CLIPS, **changes):
+        arguments = {"objectives": objectives, "points": 3, "episodes": 5, **changes}
+        return measure(spec, bandit, agents=agents, rows=Rows(path), **arguments)
+
+    return again
+
+
+@pytest.fixture(scope="module")
+def file(measured, tmp_path_factory):
+    path = tmp_path_factory.mktemp("measured") / "rows.jsonl"
+    rows = measured(path)
+    return path, rows
+
+
+@pytest.fixture
+def copy(file, tmp_path):
+    path, _ = file
+    for suffix in (".jsonl", ".json"):
+        (tmp_path / f"rows{suffix}").write_bytes(path.with_suffix(suffix).read_bytes())
+    return tmp_path / "rows.jsonl"
+
+
+def test_agents_earn_what_they_earned_before_there_was_one_measurement(file):
+    # Recorded from `learning_curves` as it was, on these seeds.
+    _, rows = file
+    before = [
+        [
+            [1.9580097, 1.2264253, -0.9998045, 2.1975716],
+            [-0.5916117, -0.076801, -3.010956, -0.4676509],
+            [-5.3140559, 0.5298367, 2.0485418, 3.4786708],
+        ],
+        [
+            [1.9580097, 1.2264253, -0.9954948, 2.2488105],
+            [-0.5916117, -0.105544, -3.4801071, -0.4867207],
+            [-5.3140559, 0.5298367, 2.0754659, 3.4736264],
+        ],
+    ]
+    np.testing.assert_allclose(pivot(rows, "objective", "seed", "step"), before, rtol=1e-3)
+    assert list(dict.fromkeys(row["step"] for row in rows)) == [0, 24, 48, 72]
+
+
+def test_a_row_says_who_was_measured_where_and_how(file):
+    _, rows = file
+    assert len(rows) == 2 * 3 * 4
+    row = dict(rows[-1])
+    assert abs(row.pop("return") - 3.4736) < 0.01
+    assert len(row.pop("configuration")) == 12
+    assert row == {
+        "environment": "Synthetic-Pendulum-v1",
+        "backend": None,
+        "trained_in": "Synthetic-Pendulum-v1",
+        "algorithm": "ppo",
+        "objective": "wide",
+        "seed": 5,
+        "agent": 0,
+        "step": 72,
+        "actions": "mode",
+        "length": 1.0,
+    }
+
+
+def test_pandas_opens_the_rows_in_a_line(file):
+    pandas = pytest.importorskip("pandas")
+    path, rows = file
+    table = pandas.read_json(path, lines=True)
+    assert len(table) == len(rows)
+    means = table.groupby(["objective", "step"])["return"].mean()
+    np.testing.assert_allclose(
+        means["wide"], pivot(rows, "objective", "seed", "step")[1].mean(axis=0)
+    )
+
+
+# -- a kill -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_killed_measurement_goes_on_to_the_same_bytes(file, copy, measured, seed):
+    path, rows = file
+    whole = path.read_bytes()
+    # Anywhere: in the middle of a line, of an agent, or before the first.
+    copy.write_bytes(whole[: random.Random(seed).randrange(len(whole))])
+    assert measured(copy) == rows
+    assert copy.read_bytes() == whole
+
+
+def test_what_is_there_is_not_measured_again(file, copy, measured, monkeypatch):
+    monkeypatch.delattr(measurement, "_program_of")
+    assert measured(copy) == file[1]
+    # Of fewer agents, or one objective, it is a part.
+    assert measured(copy, SEEDS[1:], objectives=CLIPS[1:]) == [
+        row for row in file[1] if row["objective"] == "wide" and row["seed"] > 3
+    ]
+
+
+def test_long_trainings_are_kept_as_they_come(copy, measured, file):
+    copy.unlink()
+
+    def kill(line):
+        raise KeyboardInterrupt(line)
+
+    # In the order of the objectives: three agents of "ppo" and one of "wide" in two pairs.
+    with pytest.raises(KeyboardInterrupt, match="Synthetic-Pendulum-v1: 2 of 6 agents"):
+        measured(copy, side_by_side=2, tell=kill)
+    assert len(copy.read_text().splitlines()) == 2 * 4
+    np.testing.assert_allclose(
+        pivot(measured(copy, side_by_side=2), "objective", "seed", "step"),
+        pivot(file[1], "objective", "seed", "step"),
+        rtol=1e-3,
+    )
+
+
+@pytest.mark.parametrize(
+    ("changes", "difference"),
+    [
+        ({"episodes": 6}, "episodes (5 there, 6 now)"),
+        (
+            {"spec": AgentSpec("ppo", CONFIG, PPOHyperparameters(learning_rate=0.02))},
+            "agent.hyperparameters.learning_rate (0.03 there, 0.02 now)",
+        ),
+        ({"objectives": (Clip("ppo", 0.1),)}, "objective"),
+    ],
+)
+def test_rows_of_another_configuration_are_refused(copy, measured, changes, difference):
+    before = copy.read_bytes()
+    with pytest.raises(UserError) as error:
+        measured(copy, **changes)
+    assert f"it differs at {difference}" in str(error.value)
+    assert copy.read_bytes() == before
+
+
+@pytest.mark.parametrize("content", ["[1]\n", "no rows\n", '{"a": 1}\n'])
+def test_a_file_of_something_else_is_refused_and_stays(copy, content):
+    copy.write_text(content)
+    with pytest.raises(UserError, match="choose another file"):
+        Rows(copy)
+    assert copy.read_text() == content
+
+
+# -- agents -----------------------------------------------------------------------------------------
+
+
+def test_agents_of_one_seed_share_out_what_is_drawn_and_their_rows_say_it(bandit):
+    # As `lpo` judges a bandit: recorded from `judge` as it was.
+    spec = AgentSpec(
+        "ppo", CONFIG, PPOHyperparameters(), {"learning_rate": (0.001, 0.01)}
+    ).with_values(total_steps=24)
+    cartpole = Place.named("CartPole-v1")
+    rows = measure(
+        spec,
+        Place.named("Synthetic-CartPole-v1"),
+        cartpole,
+        Agents.drawn_from(spec, seed=7, number=4),
+        episodes=3,
+        actions=("sampled", "mode"),
+    )
+    assert pivot(rows, "actions", "agent").round(2).tolist() == [
+        [52.33, 17.33, 33.67, 33.0],
+        [107.0, 9.67, 207.0, 51.33],
+    ]
+    # CartPole pays 1 a step.
+    assert all(row["return"] == row["length"] for row in rows)
+    rates = sorted(row["learning_rate"] for row in rows if row["actions"] == "mode")
+    np.testing.assert_allclose(rates, [0.001, 0.001, 0.01, 0.01])
+
+
+def test_a_traced_number_of_iterations_trains_as_long(bandit):
+    agent = SPEC.agent(bandit.env)
+    judge = Judge(bandit.env, bandit.params, episodes=2)
+
+    @jax.jit
+    def train(iterations):
+        state, earned = train_and_judge(
+            agent,
+            SPEC.hyperparameters,
+            jax.random.key(0),
+            bandit.params,
+            {"a": judge, "b": judge},
+            iterations=iterations,
+        )
+        return state.iteration, earned
+
+    iteration, earned = train(4)
+    assert iteration == 4
+    # One key for all judges.
+    np.testing.assert_array_equal(earned["a"].returns, earned["b"].returns)
+    assert earned["a"].returns.shape == (2,)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"agents": []}, "no seeds: give at least one."),
+        ({"agents": [0, -1]}, "a seed is -1: each must be 0 or larger, and below 2^32."),
+        ({"agents": [2**32]}, "a seed is 4294967296"),
+        ({"points": 0}, "points is 0: it must be at least 1."),
+        ({"episodes": 0}, "episodes is 0: it must be at least 1."),
+        ({"side_by_side": 0}, "side_by_side is 0: it must be at least 1."),
+    ],
+)
+def test_what_cannot_be_measured_is_refused(measured, tmp_path, changes, message):
+    with pytest.raises(UserError) as error:
+        measured(tmp_path / "rows.jsonl", **changes)
+    assert message in str(error.value)
+
+
+# -- arrays -----------------------------------------------------------------------------------------
+
+
+def test_rows_become_arrays_in_the_order_of_the_rows():
+    rows = [{"a": a, "b": b, "return": 10 * a + b} for a in (2, 1) for b in (0, 5)]
+    assert pivot(rows, "a", "b").tolist() == [[20, 25], [10, 15]]
+    assert pivot(rows, "b", "a").tolist() == [[20, 10], [25, 15]]
+    assert np.isnan(pivot([{"a": 0, "return": None}], "a")).all()
+    with pytest.raises(ValueError, match="not one for every combination of a, b"):
+        pivot(rows[:3], "a", "b")
+    with pytest.raises(ValueError, match="not one for every combination of a"):
+        pivot(rows, "a")
+
+
+# -- points -----------------------------------------------------------------------------------------
+
+
+@given(iterations=st.integers(1, 500), points=st.integers(1, 50))
+def test_points_lie_at_equal_distances_and_are_about_as_many_as_asked(iterations, points):
+    every, trained = spaced(iterations, points)
+    assert trained % every == 0 and trained >= iterations
+    asked = min(points, iterations)
+    assert asked / 2 <= trained / every <= 2 * asked
+
+
+@pytest.mark.parametrize(
+    ("iterations", "points", "expected"),
+    [
+        (15, 15, (1, 15)),
+        (150, 15, (10, 150)),
+        # 16 gives 16, 8, 4, 2 or 1 points; 16 is nearest to 15.
+        (16, 15, (1, 16)),
+        # 7 gives 7 or 1, both too far from 3: three iterations a point.
+        (7, 3, (3, 9)),
+        (97, 15, (7, 105)),
+        (5120, 15, (320, 5120)),
+    ],
+)
+def test_points_of_some_trainings(iterations, points, expected):
+    assert spaced(iterations, points) == expected
+
+
+def test_a_configuration_can_be_read(file):
+    path, rows = file
+    configurations = json.loads(path.with_suffix(".json").read_text())
+    assert set(configurations) == {row["configuration"] for row in rows}
+    for configuration in configurations.values():
+        assert configuration["episodes"] == 5
+        assert configuration["agent"]["config"]["total_steps"] == 72
