@@ -26,7 +26,7 @@ from matplotlib.ticker import EngFormatter, LogLocator, NullFormatter, StrMethod
 
 from experiments.harness import exit_status, read
 from experiments.rendering import text
-from lpo.generalization import compare
+from lpo.comparison import compare
 from lpo.learning import objective_of_run
 from lpo.objectives import Objective, load_objective
 from scb import plotting

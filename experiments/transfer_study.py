@@ -23,7 +23,7 @@ from matplotlib.ticker import MaxNLocator
 
 from experiments.harness import exit_status, read
 from experiments.rendering import text
-from lpo.generalization import compare
+from lpo.comparison import compare
 from lpo.learning import command_of, objective_of_run
 from lpo.objectives import load_objective
 from scb import plotting

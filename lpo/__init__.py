@@ -12,7 +12,7 @@ _HOME = {
     for module, names in {
         "certificate": ("Certificate", "certify"),
         "drifts": ("ClipDrift", "DPODrift", "Drift", "LearnedDrift", "NoDrift"),
-        "generalization": ("compare", "learning_curves"),
+        "comparison": ("compare", "learning_curves"),
         "meta_training": ("MetaTrainingConfig", "meta_train"),
         "objectives": ("Objective", "load_objective", "save_objective"),
         "portable": ("drift_function", "numpy_drift", "torch_drift", "torch_loss"),

@@ -15,15 +15,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from lpo.comparison import check_names, compare
 from lpo.drifts import ClipDrift, DPODrift, Drift, NoDrift
 from lpo.fitness import FITNESSES, LABELS
-from lpo.generalization import (
-    check_names,
-    check_seeds,
-    compare,
-    families,
-    over_objectives,
-)
 from lpo.meta_training import MetaTrainingConfig, TaskTraining, task_agent
 from lpo.objectives import Objective, closed_form
 from scb.agents.ppo import PPOHyperparameters
@@ -33,6 +27,7 @@ from scb.environments.registry import environment_spec, make
 from scb.errors import UserError
 from scb.evolution import map_population
 from scb.keys import root_key, split_key
+from scb.measurement import check_seeds, families
 from scb.runs import Stopwatch
 from scb.statistics import iqm, spearman
 
@@ -165,7 +160,7 @@ def _family_fitness(regime: Regime, family: Sequence[Objective], seeds: Sequence
     """[objectives, S, F] fitnesses of objectives that share a drift."""
     task = regime.task(family[0])
     program = _program(regime.static(), family[0].drift, len(family) * len(seeds))
-    return over_objectives(
+    return _over_objectives(
         lambda parameters, every_seed: program(
             parameters,
             every_seed,
@@ -176,6 +171,26 @@ def _family_fitness(regime: Regime, family: Sequence[Objective], seeds: Sequence
         family,
         seeds,
     )
+
+
+def _over_objectives(
+    mapped: Callable[[Any, np.ndarray], Any], objectives: Sequence[Objective], seeds: Sequence[int]
+) -> Any:
+    """Calls a function for every objective of a family with every seed, all at once.
+
+    Args:
+      mapped: ([N] drift parameters, [N] seeds) -> pytree of [N, ...], such as `map_population` makes.
+
+    Returns:
+      The pytree, every leaf [objectives, seeds, ...].
+    """
+    parameters = jax.tree.map(
+        lambda *leaves: jnp.repeat(jnp.stack(leaves), len(seeds), axis=0),
+        *(objective.parameters for objective in objectives),
+    )
+    results = mapped(parameters, np.tile(np.asarray(seeds, np.uint32), len(objectives)))
+    shape = (len(objectives), len(seeds))
+    return jax.tree.map(lambda x: np.reshape(x, (*shape, *x.shape[1:])), results)
 
 
 @lru_cache(maxsize=64)

@@ -1,10 +1,11 @@
 """What the subcommands of `lpo` do. Their docstrings are the command line's help."""
 
+import inspect
 import itertools
 import json
 import shlex
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,15 +17,9 @@ from rich.table import Table
 from lpo import figures, learning
 from lpo.alignment import Regime, correlation_text, known_drifts, measure_alignment
 from lpo.certificate import certify
+from lpo.comparison import Comparison, check_names, compare
 from lpo.distill import DistillConfig, distill
 from lpo.fitness import LABELS
-from lpo.generalization import (
-    Comparison,
-    LearningCurves,
-    check_names,
-    compare,
-    learning_curves,
-)
 from lpo.objectives import Objective, load_objective, save_objective
 from lpo.pipeline import PRESETS as RUN_PRESETS
 from lpo.pipeline import check_settings, run_pipeline
@@ -36,7 +31,8 @@ from scb.artefacts import machine_description, package_versions
 from scb.console import console
 from scb.environments.registry import environment_spec
 from scb.errors import UserError, at_least
-from scb.runs import Run, make_folder, write_json
+from scb.measurement import Rows
+from scb.runs import Run, make_folder, read_config, write_json
 from scb.statistics import estimate
 
 
@@ -205,6 +201,7 @@ def train(
     backend: str | None = None,
     sampled_actions: bool = False,
     out: Path | None = None,
+    resume: Path | None = None,
 ) -> None:
     """Train PPO with an objective in an environment, and print how well it ends.
 
@@ -218,25 +215,30 @@ def train(
       seed: the first of their seeds.
       backend: Brax physics: generalized, positional or spring.
       sampled_actions: evaluate sampled actions rather than the most likely ones.
-      out: folder for comparison.json and curves.png; must be new or empty.
+      out: folder for rows.jsonl, comparison.json and curves.png; must be new or empty.
+      resume: a folder that an interrupted command wrote; its settings apply, and a flag that
+        contradicts them is an error.
     """
-    if out is not None:
-        _make_folder(out)
-    curves = learning_curves(
-        environment,
-        load_objective(objective),
-        seed_list(seeds, seed),
-        spec=environment_agent("ppo", environment)
-        .with_steps(steps)
-        .with_values(policy_output_scale=policy_output_scale),
-        backend=backend,
-        mode_actions=not sampled_actions,
+    settings = _settings(
+        train,
+        {
+            "command": "train",
+            "environment": environment,
+            "objective": objective,
+            "steps": steps,
+            "policy_output_scale": policy_output_scale,
+            "seeds": seeds,
+            "seed": seed,
+            "backend": backend,
+            "sampled_actions": sampled_actions,
+        },
+        resume,
     )
+    comparison = _compare(settings, [load_objective(settings["objective"])], out, resume)
+    (curves,) = comparison.curves
     for point, returns in zip(curves.steps, curves.returns.T, strict=True):
         print(f"{point:>9} steps: return {np.mean(returns):.1f}")
     print(f"final return, IQM: {estimate(curves.final)}")
-    if out is not None:
-        _write_comparison(out, Comparison([curves]))
 
 
 def evaluate(
@@ -250,8 +252,12 @@ def evaluate(
     backend: str | None = None,
     sampled_actions: bool = False,
     out: Path | None = None,
+    resume: Path | None = None,
 ) -> None:
     """Compare objectives: train PPO with each on the same seeds, and print final scores with intervals.
+
+    With --out every agent's returns are kept in rows.jsonl as they come, for --resume and for
+    other statistics: pandas.read_json("rows.jsonl", lines=True).
 
     Args:
       environment: where to train; Pendulum-v1 where neither this nor a suite is given.
@@ -266,73 +272,134 @@ def evaluate(
       seed: the first of their seeds.
       backend: Brax physics: generalized, positional or spring.
       sampled_actions: evaluate sampled actions rather than the most likely ones.
-      out: folder for comparison.json and curves.png; must be new or empty.
+      out: folder for rows.jsonl, comparison.json and curves.png; must be new or empty.
+      resume: a folder that an interrupted command wrote; its settings apply, and a flag that
+        contradicts them is an error.
     """
-    if not objectives:
-        raise UserError("no objectives: give at least one, such as --objectives ppo dpo.")
-    loaded = _named_apart(objectives)
-    if suite is not None:
-        if environment is not None:
-            raise UserError(
-                f"the environment {environment} and the suite {suite} are both given: leave one out."
-            )
-        settings = {
+    if suite is not None and out is not None and (out / "config.json").exists():
+        out, resume = None, out
+    settings = _settings(
+        evaluate,
+        {
+            "command": "evaluate",
+            "environment": environment,
             "suite": suite,
-            "objectives": [objective.name for objective in loaded],
-            "seeds": seed_list(seeds, seed),
+            "objectives": objectives,
             "steps": steps,
             "policy_output_scale": policy_output_scale,
+            "seeds": seeds,
+            "seed": seed,
             "backend": backend,
             "sampled_actions": sampled_actions,
-        }
-        _evaluate_suite(loaded, settings, out)
-        return
-    environment = environment or "Pendulum-v1"
-    if out is not None:
-        _make_folder(out)
-    comparison = compare(
-        environment,
-        loaded,
-        seed_list(seeds, seed),
-        spec=environment_agent("ppo", environment)
-        .with_steps(steps)
-        .with_values(policy_output_scale=policy_output_scale),
-        backend=backend,
-        mode_actions=not sampled_actions,
+        },
+        resume,
     )
+    if not settings["objectives"]:
+        raise UserError("no objectives: give at least one, such as --objectives ppo dpo.")
+    loaded = _named_apart(settings["objectives"])
+    if settings["suite"] is not None:
+        if settings["environment"] is not None:
+            raise UserError(
+                f"the environment {settings['environment']} and the suite {settings['suite']} are both given: leave "
+                "one out."
+            )
+        _evaluate_suite(settings, loaded, out, resume)
+        return
+    comparison = _compare(settings, loaded, out, resume)
     table = Table(
-        "objective", "final IQM [95 %]", "area under the curve", f"difference to {objectives[0]}"
+        "objective",
+        "final IQM [95 %]",
+        "area under the curve",
+        f"difference to {settings['objectives'][0]}",
     )
     for row in comparison.table():
         difference = "" if row["difference"] is None else str(row["difference"])
         table.add_row(row["objective"], str(row["final"]), str(row["area"]), difference)
     console().print(table)
-    if out is not None:
-        _write_comparison(out, comparison)
+
+
+def _settings(
+    command: Callable[..., None], given: Mapping[str, Any], resume: Path | None
+) -> dict[str, Any]:
+    """A command's flags; with `resume` those that the folder was started with, but for what is given now."""
+    given = json.loads(json.dumps(given))
+    if resume is None:
+        return dict(given)
+    default = {n: x.default for n, x in inspect.signature(command).parameters.items()}
+    default = json.loads(json.dumps(default, default=str))
+    changed = {name: x for name, x in given.items() if x != default.get(name)}
+    stored = read_config(resume)
+    if stored.get("command") != given["command"]:
+        raise UserError(
+            f"cannot resume {resume} with lpo {given['command']}: it is a folder of lpo {stored.get('command')}."
+        )
+    return {**stored, **changed}
+
+
+def _opened(
+    settings: Mapping[str, Any], out: Path | None, resume: Path | None
+) -> tuple[Path | None, Rows]:
+    """The folder of a command's results, and the rows in it; without a folder in memory."""
+    if out is None and resume is None:
+        return None, Rows()
+    folder = Run.open(resume or out or "", settings, resume=resume is not None).folder
+    return folder, Rows(folder / "rows.jsonl")
+
+
+def _compare(
+    settings: Mapping[str, Any],
+    objectives: Sequence[Objective],
+    out: Path | None,
+    resume: Path | None,
+) -> Comparison:
+    """Trains with the objectives, and leaves rows, comparison.json and curves.png where a folder is named."""
+    environment = settings["environment"] or "Pendulum-v1"
+    spec = (
+        environment_agent("ppo", environment)
+        .with_steps(settings["steps"])
+        .with_values(policy_output_scale=settings["policy_output_scale"])
+    )
+    seeds = seed_list(settings["seeds"], settings["seed"])
+    folder, rows = _opened(settings, out, resume)
+    comparison = compare(
+        environment,
+        objectives,
+        seeds,
+        spec=spec,
+        backend=settings["backend"],
+        mode_actions=not settings["sampled_actions"],
+        rows=rows,
+        tell=_tell,
+    )
+    if folder is not None:
+        write_json(
+            folder / "comparison.json", {**comparison.as_dict(), "versions": package_versions()}
+        )
+        plotting.save(figures.learning_curves(comparison.curves), folder / "curves.png")
+    return comparison
+
+
+def _tell(line: str) -> None:
+    print(line, file=sys.stderr, flush=True)
 
 
 def _evaluate_suite(
-    objectives: Sequence[Objective], settings: Mapping[str, Any], out: Path | None
+    settings: Mapping[str, Any],
+    objectives: Sequence[Objective],
+    out: Path | None,
+    resume: Path | None,
 ) -> None:
-    name = settings["suite"]
-    environments = suite_environments(name)
-    done: dict[str, Comparison] = {}
-    if out is not None:
-        done = _stored_comparisons(out, settings, environments)
-
-    def keep(environment: str, comparison: Comparison) -> None:
-        if out is not None:
-            write_json(out / "comparisons" / f"{environment}.json", comparison.as_dict())
-
+    name, seeds = settings["suite"], seed_list(settings["seeds"], settings["seed"])
+    suite_environments(name)
+    folder, rows = _opened(settings, out, resume)
     printer = console()
     scores, comparisons = run_suite(
         name,
         objectives,
-        settings["seeds"],
+        seeds,
         settings["backend"],
         tell=printer.print,
-        done=done,
-        keep=keep,
+        rows=rows,
         steps=settings["steps"],
         policy_output_scale=settings["policy_output_scale"],
         mode_actions=not settings["sampled_actions"],
@@ -354,42 +421,14 @@ def _evaluate_suite(
     printer.print(aggregate)
     if scores.left_out:
         printer.print(f"left out, nobody beat random actions: {', '.join(scores.left_out)}")
-    if out is not None:
-        write_json(
-            out / "suite.json",
-            {**settings, **scores.as_dict(), "versions": package_versions()},
-        )
-        plotting.save(figures.suite_scores(scores), out / "suite.png")
-
-
-def _stored_comparisons(
-    out: Path, settings: Mapping[str, Any], environments: Sequence[str]
-) -> dict[str, Comparison]:
-    """What a folder holds of a suite with these settings; a new folder holds nothing."""
-    path = out / "settings.json"
-    if not path.exists():
-        _make_folder(out)
-        write_json(path, settings)
-        (out / "comparisons").mkdir()
-        return {}
-    try:
-        stored = json.loads(path.read_text())
-    except (OSError, ValueError) as error:
-        raise UserError(f"{path} cannot be read ({error}): choose another --out.") from error
-    if stored != settings:
-        names = [
-            k for k in settings if not isinstance(stored, dict) or stored.get(k) != settings[k]
-        ]
-        raise UserError(
-            f"{out} holds a suite run with other {', '.join(names)}: choose another --out, or the same settings."
-        )
-    found = {}
-    for name in environments:
-        file = out / "comparisons" / f"{name}.json"
-        if file.exists():
-            curves = json.loads(file.read_text())["curves"]
-            found[name] = Comparison([LearningCurves.from_dict(curve) for curve in curves])
-    return found
+    if folder is not None:
+        for environment, comparison in comparisons.items():
+            path = folder / "comparisons" / f"{environment}.json"
+            path.parent.mkdir(exist_ok=True)
+            write_json(path, comparison.as_dict())
+        content = {**settings, "seeds": seeds, **scores.as_dict(), "versions": package_versions()}
+        write_json(folder / "suite.json", content)
+        plotting.save(figures.suite_scores(scores), folder / "suite.png")
 
 
 def align(
@@ -556,8 +595,3 @@ def _make_folder(out: Path) -> None:
     make_folder(out)
     if any(out.iterdir()):
         raise UserError(f"{out} already exists and is not empty: choose another --out.")
-
-
-def _write_comparison(out: Path, comparison: Comparison) -> None:
-    write_json(out / "comparison.json", {**comparison.as_dict(), "versions": package_versions()})
-    plotting.save(figures.learning_curves(comparison.curves), out / "curves.png")

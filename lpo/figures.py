@@ -36,7 +36,7 @@ from scb.plotting import (
 from scb.statistics import estimate, iqm
 
 if TYPE_CHECKING:
-    from lpo.generalization import LearningCurves
+    from lpo.comparison import LearningCurves
     from lpo.suite import SuiteScores
 
 _LOOKS: dict[str, Look] = {

@@ -14,12 +14,7 @@ from rich.console import Console
 
 from lpo import drift_figures, figures, report
 from lpo.certificate import certify
-from lpo.generalization import (
-    Comparison,
-    LearningCurves,
-    check_names,
-    learning_curves,
-)
+from lpo.comparison import Comparison, check_names, compare
 from lpo.meta_training import VALIDATION_AGENTS, MetaTraining, MetaTrainingConfig, chosen_mean
 from lpo.objectives import Objective, load_objective, save_objective
 from scb import plotting
@@ -28,6 +23,7 @@ from scb.artefacts import machine_description, package_versions
 from scb.environments.registry import environment_spec, make
 from scb.environments.zoo import bandit_metadata
 from scb.evolution import EvolutionConfig, Outcome, evolve
+from scb.measurement import Rows
 from scb.runs import Run, Stopwatch, write_json
 from scb.seeds import VALIDATING, reporting
 from scb.statistics import estimate
@@ -106,12 +102,22 @@ def run_pipeline(run: Run, settings: Mapping[str, Any], command: str) -> Path:
     objectives = _with_references(objective)
 
     comparisons: dict[str, Comparison] = {}
+    rows = Rows(folder / "rows.jsonl")
     for evaluation in settings["evaluations"]:
         console.print(
             f"[2/3] training PPO with {len(objectives)} objectives on {evaluation['environment']}"
         )
-        comparisons[evaluation["environment"]] = _compare(
-            folder, objectives, evaluation, settings["seed"]
+        name = evaluation["environment"]
+        comparisons[name] = compare(
+            name,
+            objectives,
+            reporting_seeds(settings["seed"], evaluation["seeds"]),
+            environment_agent("ppo", name).with_steps(evaluation["steps"]),
+            evaluation["backend"],
+            evaluation.get("points", 15),
+            evaluation.get("episodes", 20),
+            rows=rows,
+            tell=console.print,
         )
 
     console.print("[3/3] figures and report")
@@ -249,33 +255,6 @@ def meta_training_artefact(
 
 def _plain(config: Any) -> Any:
     return json.loads(json.dumps(asdict(config)))
-
-
-def _compare(
-    folder: Path, objectives: list[Objective], evaluation: Mapping[str, Any], seed: int
-) -> Comparison:
-    seeds = reporting_seeds(seed, evaluation["seeds"])
-    (folder / "curves").mkdir(exist_ok=True)
-    curves = []
-    for objective in objectives:
-        path = folder / "curves" / f"{evaluation['environment']}_{objective.name}.json"
-        if path.exists():
-            curves.append(LearningCurves.from_dict(json.loads(path.read_text())))
-            continue
-        result = learning_curves(
-            evaluation["environment"],
-            objective,
-            seeds,
-            spec=environment_agent("ppo", evaluation["environment"]).with_steps(
-                evaluation["steps"]
-            ),
-            backend=evaluation["backend"],
-            points=evaluation.get("points", 15),
-            episodes=evaluation.get("episodes", 20),
-        )
-        write_json(path, result.as_dict())
-        curves.append(result)
-    return Comparison(curves)
 
 
 def _figures(

@@ -19,7 +19,7 @@ from lpo.figures import ratio_text, thousands
 from scb.errors import UserError
 
 if TYPE_CHECKING:
-    from lpo.generalization import Comparison
+    from lpo.comparison import Comparison
 
 SCHEMA_VERSION = 1
 

@@ -11,11 +11,12 @@ from typing import Any
 
 import numpy as np
 
-from lpo.generalization import Comparison, check_names, compare
+from lpo.comparison import Comparison, check_names, compare
 from lpo.objectives import Objective
 from scb.agents.spec import environment_agent
 from scb.environments.registry import environment_spec, families
 from scb.errors import UserError, unknown_name
+from scb.measurement import Rows
 from scb.statistics import Estimate, iqm, normalized_score
 
 # Resampling is over seeds within environments, on [objectives, environments, seeds].
@@ -178,8 +179,7 @@ def run_suite(
     seeds: Sequence[int],
     backend: str | None = None,
     tell: Callable[[str], None] = print,
-    done: Mapping[str, Comparison] | None = None,
-    keep: Callable[[str, Comparison], None] = lambda name, comparison: None,
+    rows: Rows | None = None,
     steps: int | None = None,
     policy_output_scale: float | None = None,
     points: int = 5,
@@ -193,12 +193,11 @@ def run_suite(
       seeds: of the agents, the same everywhere.
       backend: Brax physics, for the suite's Brax environments.
       tell: takes a line when an environment is done.
-      done: comparisons that are there already and are not run again.
-      keep: is given every new comparison as it comes.
+      rows: where results are kept, and found; what is there is not measured again.
       steps, policy_output_scale: of every training; each environment's own setting where None.
       points: about how many evaluations along a training. Only the last one is scored, and with
         episodes of a thousand steps fifteen take longer than the training itself.
-      arguments: further ones of `learning_curves`.
+      arguments: further ones of `compare`.
     """
     check_names(objectives)
     comparisons: dict[str, Comparison] = {}
@@ -207,9 +206,6 @@ def run_suite(
         spec = environment_spec(environment_name)
         physics = spec.physics(backend)
         random[environment_name] = spec.random_return(physics)
-        if done is not None and environment_name in done:
-            comparisons[environment_name] = done[environment_name]
-            continue
         comparison = compare(
             environment_name,
             objectives,
@@ -219,10 +215,10 @@ def run_suite(
             .with_values(policy_output_scale=policy_output_scale),
             backend=physics,
             points=points,
+            rows=rows,
             **arguments,
         )
         comparisons[environment_name] = comparison
-        keep(environment_name, comparison)
         finals = ", ".join(f"{c.objective} {float(iqm(c.final)):.1f}" for c in comparison.curves)
         tell(f"{environment_name} (random {random[environment_name]:.1f}): {finals}")
     return suite_scores(comparisons, random), comparisons

@@ -16,7 +16,7 @@ from dataclasses import dataclass, fields, is_dataclass, replace
 from functools import lru_cache
 from operator import itemgetter
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -146,6 +146,9 @@ class Objective(Protocol):
     def parameters(self) -> Any: ...
 
 
+AnyObjective = TypeVar("AnyObjective", bound=Objective)
+
+
 @dataclass(frozen=True, eq=False)
 class Agents:
     """Who is trained.
@@ -265,7 +268,8 @@ def measure(
     }
 
     found: dict[str | None, list[Row]] = {}
-    for family in families(objectives):
+    groups: Sequence[Sequence[Objective | None]] = families(objectives) or [[None]]
+    for family in groups:
         cells = [
             rows.cell(
                 columns | {"objective": objective and objective.name},
@@ -321,19 +325,16 @@ def measure(
     return [row for name in order for row in found[name]]
 
 
-def families(objectives: Sequence[Objective]) -> list[list[Objective | None]]:
-    """Objectives that differ in their drifts' parameters alone stand together: one program trains them all.
-
-    Without any there is one family, of the algorithm's own.
-    """
-    found: list[list[Objective | None]] = []
+def families(objectives: Sequence[AnyObjective]) -> list[list[AnyObjective]]:
+    """Objectives that differ in their drifts' parameters alone stand together: one program trains them all."""
+    found: list[list[AnyObjective]] = []
     for objective in objectives:
-        family = next((f for f in found if f[0] and f[0].drift == objective.drift), None)
+        family = next((f for f in found if f[0].drift == objective.drift), None)
         if family is None:
             found.append([objective])
         else:
             family.append(objective)
-    return found or [[None]]
+    return found
 
 
 def _program_of(

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from experiments import lpo_on_bandits as module
-from lpo.generalization import Comparison, LearningCurves
+from lpo.comparison import Comparison, LearningCurves
 from lpo.objectives import load_objective
 from scb import plotting
 from scb.errors import UserError
@@ -131,7 +131,7 @@ def tiny(monkeypatch):
         )
 
     monkeypatch.setattr("lpo.learning.objective_of_run", objective_of_run)
-    monkeypatch.setattr("lpo.generalization.compare", compare)
+    monkeypatch.setattr("lpo.comparison.compare", compare)
     plan = {
         "searches": {source: {"seeds": 1, "settings": {"of": source}} for source in module.SOURCES},
         "agents": 2,

@@ -17,11 +17,13 @@ from gymnax.environments import spaces
 import lpo
 import scb.cli
 from lpo import cli, commands, learning
+from lpo.comparison import Comparison, LearningCurves
 from lpo.drifts import ClosedFormDrift, NoDrift
 from lpo.fitness import LABELS
-from lpo.generalization import LearningCurves
 from lpo.meta_training import MetaTrainingConfig
 from lpo.objectives import Objective, closed_form, load_objective
+from scb.agents.ppo import PPOHyperparameters
+from scb.agents.spec import AgentSpec
 from scb.environments.synthetic import BanditConfig, SyntheticBandit
 from scb.environments.zoo import save_bandit
 from scb.errors import UserError
@@ -208,7 +210,7 @@ def no_training(monkeypatch):
 
     monkeypatch.setattr(learning, "evolve", refuse)
     monkeypatch.setattr(commands, "run_pipeline", refuse)
-    monkeypatch.setattr("lpo.generalization.PPO", refuse)
+    monkeypatch.setattr("scb.measurement._program_of", refuse)
 
 
 @pytest.mark.parametrize("command", WRITING)
@@ -466,23 +468,69 @@ def test_certify_exits_with_one_where_a_drift_holds_policies_still(monkeypatch, 
     assert "is a drift whatever its weights, but one that MAY HOLD" in capsys.readouterr().out
 
 
-def measured(environment, objective, seeds, mode_actions=True, **_) -> LearningCurves:
+def compared(environment, objectives, seeds, mode_actions=True, **_) -> Comparison:
     """Curves as a training would measure them: the return ends at -100 times the name's length."""
-    end = -100.0 * len(objective.name)
-    returns = np.tile([-1500.0, end], (len(seeds), 1))
     steps = np.array([0, 1000])
-    return LearningCurves(
-        environment, None, objective.name, steps, returns, list(seeds), 20, mode_actions
+    return Comparison(
+        [
+            LearningCurves(
+                environment,
+                None,
+                objective.name,
+                steps,
+                np.tile([-1500.0, -100.0 * len(objective.name)], (len(seeds), 1)),
+                list(seeds),
+                20,
+                mode_actions,
+            )
+            for objective in objectives
+        ]
     )
 
 
 @pytest.fixture
 def trained(monkeypatch) -> None:
-    def family(environment, objectives, seeds, **arguments) -> list[LearningCurves]:
-        return [measured(environment, objective, seeds, **arguments) for objective in objectives]
+    monkeypatch.setattr(commands, "compare", compared)
 
-    monkeypatch.setattr("lpo.generalization._family_curves", family)
-    monkeypatch.setattr(commands, "learning_curves", measured)
+
+@pytest.fixture
+def interrupted_evaluation(working_folder, tiny_agent, monkeypatch):
+    """A folder in which `lpo evaluate` wrote half of its agents, and what it would have written."""
+    monkeypatch.undo()  # it trains
+    monkeypatch.chdir(working_folder)
+    spec = AgentSpec("ppo", tiny_agent, PPOHyperparameters())
+    monkeypatch.setattr(commands, "environment_agent", lambda *_: spec)
+    arguments = ["--environment=Synthetic-Pendulum-v1", "--objectives", "none", "dpo"]
+    assert cli.main(["evaluate", *arguments, "--seeds=2", "--seed=7", "--out=o"]) == 0
+    rows, comparison = working_folder / "o" / "rows.jsonl", working_folder / "o" / "comparison.json"
+    whole = rows.read_bytes(), comparison.read_bytes()
+    rows.write_bytes(whole[0][: len(whole[0]) // 2 + 9])
+    comparison.unlink()
+    return whole
+
+
+def test_a_killed_evaluation_resumes_to_the_same_bytes(interrupted_evaluation, working_folder):
+    assert cli.main(["evaluate", "--seeds", "2", "--resume", "o"]) == 0
+    folder = working_folder / "o"
+    written = [(folder / name).read_bytes() for name in ("rows.jsonl", "comparison.json")]
+    assert written == list(interrupted_evaluation)
+    assert [row["seed"] for row in map(json.loads, written[0].splitlines())][::4] == [7, 8, 7, 8]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (
+            ["evaluate", "--seeds=3"],
+            "cannot resume o: its config differs at seeds (2 there, 3 now)",
+        ),
+        (["train"], "cannot resume o with lpo train: it is a folder of lpo evaluate."),
+    ],
+)
+def test_a_resumed_evaluation_keeps_its_settings(
+    interrupted_evaluation, refused, arguments, message
+):
+    assert message in refused(*arguments, "--resume", "o")
 
 
 def test_train_prints_the_curve_and_stores_it(trained, working_folder, capsys):

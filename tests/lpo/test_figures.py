@@ -13,7 +13,7 @@ from matplotlib import pyplot
 from matplotlib.collections import FillBetweenPolyCollection, QuadMesh
 
 from lpo import drift_figures, figures
-from lpo.generalization import LearningCurves
+from lpo.comparison import LearningCurves
 from lpo.objectives import Objective, load_objective
 from lpo.update_regions import surface
 from scb import plotting

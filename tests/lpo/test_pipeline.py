@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 
 from lpo import cli, pipeline
+from lpo.comparison import Comparison, LearningCurves
 from lpo.objectives import load_objective
 from scb.agents.ppo import PPOConfig, PPOHyperparameters
 from scb.agents.spec import AgentSpec
+from scb.measurement import pivot
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -44,6 +46,7 @@ def small(tiny_agent, tiny_drift):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(pipeline, "pipeline_config", config)
         patch.setattr(pipeline, "environment_agent", spec)
+        patch.setitem(pipeline.PRESETS["tiny"]["evaluations"][0], "steps", 32)
         yield
 
 
@@ -65,7 +68,7 @@ def results(folder: Path) -> dict:
     return json.loads((folder / "results.json").read_text())
 
 
-CURVES = [f"curves/Pendulum-v1_{name}.json" for name in ("ppo", "dpo", "lpo")]
+ROWS = ["rows.jsonl", "rows.json"]
 LAST_STAGE = [
     "figures/Pendulum-v1.png",
     "figures/drift_heatmaps.png",
@@ -81,13 +84,15 @@ def test_a_run_leaves_what_each_stage_made(folder):
         name for name in contents(folder) if not name.startswith(("checkpoints", "tensorboard"))
     }
     evolution = ["config.json", "metrics.jsonl", "timing.jsonl", "lpo.json", "lpo.npz"]
-    assert made == {*evolution, *CURVES, *LAST_STAGE}
+    assert made == {*evolution, *ROWS, *LAST_STAGE}
 
 
-def test_results_are_the_stored_curves(folder):
+def test_results_are_the_stored_rows(folder):
     comparison = results(folder)["comparisons"]["Pendulum-v1"]
-    stored = [json.loads((folder / name).read_text()) for name in CURVES]
-    assert comparison["curves"] == stored
+    stored = comparison["curves"]
+    rows = [json.loads(line) for line in (folder / "rows.jsonl").read_text().splitlines()]
+    assert pivot(rows, "objective", "seed", "step").tolist() == [c["returns"] for c in stored]
+    assert [curve["objective"] for curve in stored] == ["ppo", "dpo", "lpo"]
     assert comparison["reference"] == "ppo"
     for curve in stored:
         # Preset tiny judges two seeds, from 10 000 + 1000 x seed on; 2 batches of 2 x 8 steps, each
@@ -148,7 +153,7 @@ def test_resuming_redoes_the_missing_stage_and_no_other(folder, monkeypatch):
         raise AssertionError("this stage was done already")
 
     monkeypatch.setattr(pipeline, "evolve", refuse)
-    monkeypatch.setattr(pipeline, "learning_curves", refuse)
+    monkeypatch.setattr("scb.measurement._program_of", refuse)
     assert cli.main(["run", "--resume", str(folder)]) == 0
 
     after = contents(folder)
@@ -162,22 +167,14 @@ def test_resuming_redoes_the_missing_stage_and_no_other(folder, monkeypatch):
     assert results(folder) | clocked == results_before | clocked
 
 
-def test_resuming_trains_the_missing_curve_to_the_same_bytes(folder, monkeypatch):
+def test_resuming_trains_the_missing_agents_to_the_same_bytes(folder):
     before = contents(folder)
-    (folder / CURVES[0]).unlink()
-    trained = []
-
-    def record(environment, objective, *arguments, **named):
-        trained.append((environment, objective.name))
-        return learning_curves(environment, objective, *arguments, **named)
-
-    learning_curves = pipeline.learning_curves
-    monkeypatch.setattr(pipeline, "learning_curves", record)
+    rows = before["rows.jsonl"][0]
+    (folder / "rows.jsonl").write_bytes(rows[: len(rows) // 2])
     assert cli.main(["run", "--resume", str(folder)]) == 0
-    assert trained == [("Pendulum-v1", "ppo")]
     after = contents(folder)
-    assert after[CURVES[0]][0] == before[CURVES[0]][0]
-    for name in ("lpo.npz", "lpo.json", "metrics.jsonl", *CURVES[1:]):
+    assert after["rows.jsonl"][0] == rows
+    for name in ("lpo.npz", "lpo.json", "metrics.jsonl"):
         assert after[name] == before[name], name
 
 
@@ -196,7 +193,7 @@ def test_a_given_objective_is_judged_and_not_learned(tmp_path, objective_file, m
         raise AssertionError("there is nothing to learn")
 
     monkeypatch.setattr(pipeline, "evolve", refuse)
-    monkeypatch.setattr(pipeline, "learning_curves", fake_curves)
+    monkeypatch.setattr(pipeline, "compare", fake_comparison)
     out = tmp_path / "run"
     arguments = ["--preset", "tiny", "--objective", str(objective_file), "--out", str(out)]
     assert cli.main(["run", *arguments]) == 0
@@ -208,11 +205,14 @@ def test_a_given_objective_is_judged_and_not_learned(tmp_path, objective_file, m
     assert not (out / "figures" / "meta_training.png").exists()
 
 
-def fake_curves(environment, objective, seeds, **_):
-    returns = np.tile([-1500.0, -900.0, -200.0], (len(seeds), 1)) + len(objective.name)
+def fake_comparison(environment, objectives, seeds, *_, **named):
+    returns = np.tile([-1500.0, -900.0, -200.0], (len(seeds), 1))
     steps = np.array([0, 16, 32])
-    return pipeline.LearningCurves(
-        environment, None, objective.name, steps, returns, list(seeds), 20, True
+    return Comparison(
+        [
+            LearningCurves(environment, None, o.name, steps, returns, list(seeds), 20, True)
+            for o in objectives
+        ]
     )
 
 

@@ -12,7 +12,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from lpo import report
-from lpo.generalization import Comparison, LearningCurves
+from lpo.comparison import Comparison, LearningCurves
 from scb import plotting
 from scb.errors import UserError
 

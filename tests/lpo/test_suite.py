@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 
 from lpo import commands, figures, suite
-from lpo.generalization import Comparison, LearningCurves, learning_curves
+from lpo.comparison import Comparison, LearningCurves, learning_curves
 from lpo.objectives import load_objective
 from lpo.suite import RESAMPLES, SuiteScores, run_suite, suite_scores, suites
 from scb import plotting
-from scb.agents.spec import environment_agent
+from scb.agents.ppo import PPOHyperparameters
+from scb.agents.spec import AgentSpec, environment_agent
 from scb.environments.registry import environment_names
 from scb.environments.spec import EnvironmentSpec
 from scb.errors import UserError
@@ -154,24 +155,28 @@ def test_a_new_family_has_its_suite(corridors, trained, monkeypatch):
     assert set(scores.environments) <= set(suites()["all"])
 
 
-@pytest.mark.slow
-def test_a_suite_is_kept_as_it_comes_and_completed(trained, tmp_path, capsys):
+def test_a_killed_suite_is_completed_to_the_same_scores(tmp_path, tiny_agent, monkeypatch, capsys):
+    spec = AgentSpec("ppo", tiny_agent, PPOHyperparameters())
+    monkeypatch.setattr(suite, "environment_agent", lambda *_: spec)
+    monkeypatch.setattr(EnvironmentSpec, "random_return", lambda *arguments: -1000.0)
+    bandits = {"classic": ("Synthetic-CartPole-v1", "Synthetic-Pendulum-v1")}
+    monkeypatch.setattr(suite, "suites", lambda: bandits)
     out = tmp_path / "suite"
-    arguments = {"suite": "classic", "objectives": ("ppo", "dpo"), "seeds": 3, "out": out}
+    arguments = {"suite": "classic", "objectives": ("ppo",), "seeds": 2, "out": out}
     commands.evaluate(**arguments)
-    assert [name for name, _ in trained] == ["CartPole-v1", "Pendulum-v1"]
     assert "normalised score" in capsys.readouterr().out
     first = json.loads((out / "suite.json").read_text())
-    assert first["objectives"] == ["ppo", "dpo"]
+    assert (first["objectives"], first["seeds"]) == (["ppo"], [1000, 1001])
     assert (out / "suite.png").stat().st_size > 5000
 
-    (out / "comparisons" / "Pendulum-v1.json").unlink()
-    trained.clear()
+    rows = (out / "rows.jsonl").read_bytes()
+    (out / "rows.jsonl").write_bytes(rows[: len(rows) * 2 // 3])
+    (out / "suite.json").unlink()
     commands.evaluate(**arguments)
-    assert [name for name, _ in trained] == ["Pendulum-v1"]
+    assert (out / "rows.jsonl").read_bytes() == rows
     assert json.loads((out / "suite.json").read_text()) == first
 
-    with pytest.raises(UserError, match="holds a suite run with other seeds"):
+    with pytest.raises(UserError, match=r"its config differs at seeds \(2 there, 4 now\)"):
         commands.evaluate(**{**arguments, "seeds": 4})
 
 

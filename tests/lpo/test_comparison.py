@@ -7,19 +7,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
-from lpo import generalization
-from lpo.generalization import (
+from lpo.comparison import (
     Comparison,
     LearningCurves,
     compare,
-    evaluation_interval,
     learning_curves,
 )
 from lpo.objectives import Objective, load_objective
-from scb.agents.ppo import PPOConfig, PPOHyperparameters
+from scb.agents.ppo import PPOHyperparameters
 from scb.agents.spec import AgentSpec
 from scb.errors import UserError
 
@@ -75,32 +71,6 @@ def test_dictionaries_are_json_and_hold_what_was_measured():
     assert curve["returns"] == [[0.0, 2.0, 4.0], [1.0, 1.0, 7.0]]
     assert (curve["steps"], curve["seeds"], curve["episodes"]) == ([0, 10, 20], [0, 1], 5)
     assert (curve["final_iqm"]["value"], curve["area_iqm"]["value"]) == (5.5, 3.5)
-
-
-@given(
-    num_iterations=st.integers(1, 500),
-    points=st.integers(1, 50),
-)
-def test_evaluation_interval_divides_the_training(num_iterations, points):
-    every = evaluation_interval(num_iterations, points)
-    assert 1 <= every <= num_iterations
-    assert num_iterations % every == 0
-
-
-@pytest.mark.parametrize(
-    ("num_iterations", "points", "every"),
-    [
-        (15, 15, 1),
-        # 150 / 10 = 15 evaluations.
-        (150, 15, 10),
-        # 16 gives 16, 8, 4, 2 or 1 evaluations; 16 is nearest to 15.
-        (16, 15, 1),
-        # 7 gives 7 or 1; 1 is nearer to 3.
-        (7, 3, 7),
-    ],
-)
-def test_evaluation_interval_gives_about_as_many_points_as_asked(num_iterations, points, every):
-    assert evaluation_interval(num_iterations, points) == every
 
 
 # -- trained ------------------------------------------------------------------------------------
@@ -173,14 +143,6 @@ def test_the_same_seeds_and_objective_give_the_same_curves(trained, arguments, o
     np.testing.assert_array_equal(again.returns, trained["ppo"].returns)
 
 
-@pytest.mark.parametrize(
-    ("iterations", "points", "trained"), [(15, 10, 15), (100, 15, 100), (97, 15, 105)]
-)
-def test_a_training_is_as_long_as_its_setting_where_divisors_allow(iterations, points, trained):
-    config = PPOConfig(num_envs=1, num_steps=8, total_steps=8 * iterations, num_minibatches=1)
-    assert generalization._rounded_to_points(config, points).num_iterations == trained
-
-
 def test_training_is_rounded_up_to_a_multiple_of_the_points(trained):
     # 7 batches of 8 have no divisor near 3 points: 9 batches are trained, 3 for each point.
     curve = trained["ppo"]
@@ -196,11 +158,6 @@ def test_training_is_rounded_up_to_a_multiple_of_the_points(trained):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"seeds": []}, "no seeds: give at least one."),
-        ({"seeds": [0, -1]}, "a seed is -1: each must be 0 or larger, and below 2^32."),
-        ({"seeds": [2**32]}, "a seed is 4294967296"),
-        ({"points": 0}, "points is 0: it must be at least 1."),
-        ({"episodes": 0}, "episodes is 0: it must be at least 1."),
         ({"environment": "CartPoel-v1"}, "unknown environment 'CartPoel-v1': did you mean CartPo"),
         ({"environment": "Pendulum-v1", "backend": "spring"}, "does not take {'backend'"),
     ],

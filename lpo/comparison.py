@@ -1,0 +1,190 @@
+"""Does an objective carry over? Train PPO with several objectives on the same seeds and compare.
+
+Every objective meets the same seeds: the same initial networks, start states and evaluation
+episodes, so that differences are paired. Final scores are interquartile means with bootstrap
+intervals.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from lpo.objectives import Objective
+from scb.agents.spec import AgentSpec, environment_agent
+from scb.errors import UserError
+from scb.measurement import MODE, SAMPLED, Place, Rows, measure, pivot
+from scb.statistics import Estimate, estimate, paired_difference
+
+
+@dataclass(frozen=True)
+class LearningCurves:
+    """Returns of agents over their training.
+
+    Attributes:
+      environment, backend: where; the backend is None outside Brax.
+      objective: with which.
+      steps: [P] environment steps at each evaluation, the first 0.
+      returns: [S, P] mean return of `episodes` episodes, per seed.
+      mode_actions: whether evaluation took the most likely actions or sampled ones.
+      policy_output_scale: factor on the policy's last layer at initialisation.
+    """
+
+    environment: str
+    backend: str | None
+    objective: str
+    steps: np.ndarray
+    returns: np.ndarray
+    seeds: list[int]
+    episodes: int
+    mode_actions: bool
+    policy_output_scale: float = 1.0
+
+    @property
+    def final(self) -> np.ndarray:
+        """[S] return at the end of training."""
+        return self.returns[:, -1]
+
+    @property
+    def area(self) -> np.ndarray:
+        """[S] mean return over the training, the untrained agent left out."""
+        return self.returns[:, 1:].mean(axis=1)
+
+    @classmethod
+    def from_dict(cls, stored: Mapping[str, Any]) -> "LearningCurves":
+        """What `as_dict` wrote."""
+        names = ("environment", "backend", "objective", "seeds", "episodes", "mode_actions")
+        return cls(
+            steps=np.asarray(stored["steps"]),
+            returns=np.asarray(stored["returns"]),
+            **{name: stored[name] for name in names},
+            policy_output_scale=stored.get("policy_output_scale", 1.0),
+        )
+
+    def as_dict(self) -> dict[str, Any]:
+        return {
+            "environment": self.environment,
+            "backend": self.backend,
+            "objective": self.objective,
+            "steps": self.steps.tolist(),
+            "returns": self.returns.tolist(),
+            "seeds": self.seeds,
+            "episodes": self.episodes,
+            "mode_actions": self.mode_actions,
+            "policy_output_scale": self.policy_output_scale,
+            "final_iqm": estimate(self.final).as_dict(),
+            "area_iqm": estimate(self.area).as_dict(),
+        }
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Learning curves of several objectives on one environment, the first of them the reference."""
+
+    curves: list[LearningCurves]
+
+    def differences(self) -> dict[str, Estimate]:
+        """{objective: paired difference of final IQM to the reference}, positive where it is better."""
+        reference = self.curves[0]
+        return {c.objective: paired_difference(c.final, reference.final) for c in self.curves[1:]}
+
+    def table(self) -> list[dict[str, Any]]:
+        """One row an objective: final and area IQM with intervals, difference to the reference."""
+        differences = self.differences()
+        return [
+            {
+                "objective": c.objective,
+                "final": estimate(c.final),
+                "area": estimate(c.area),
+                "difference": differences.get(c.objective),
+            }
+            for c in self.curves
+        ]
+
+    def as_dict(self) -> dict[str, Any]:
+        return {
+            "curves": [c.as_dict() for c in self.curves],
+            "reference": self.curves[0].objective,
+            "paired_differences": {k: v.as_dict() for k, v in self.differences().items()},
+        }
+
+
+def check_names(objectives: Sequence[Objective]) -> None:
+    """Raises a UserError where two objectives bear one name."""
+    names = [objective.name for objective in objectives]
+    repeated = sorted({name for name in names if names.count(name) > 1})
+    if repeated:
+        raise UserError(
+            f"objective {repeated[0]!r} is there twice: give each once, and each a name of its own."
+        )
+
+
+def compare(
+    environment: str,
+    objectives: Sequence[Objective],
+    seeds: Sequence[int],
+    spec: AgentSpec | None = None,
+    backend: str | None = None,
+    points: int = 15,
+    episodes: int = 20,
+    mode_actions: bool = True,
+    rows: Rows | None = None,
+    tell: Callable[[str], None] = lambda line: None,
+) -> Comparison:
+    """Trains one PPO agent a seed with each objective, evaluating along the way.
+
+    Args:
+      environment: a name that `scb.make` takes.
+      objectives: what replaces PPO's surrogate; the first is what the others are compared with.
+      seeds: one agent each; the same seeds pair agents of different objectives.
+      spec: PPO's; the environment's own where None.
+      backend: Brax physics ("generalized", "positional", "spring"); only for Brax environments.
+      points: about how many evaluations along the training, the untrained agent not counted.
+      episodes: of each evaluation.
+      mode_actions: evaluate the most likely actions rather than sampled ones.
+      rows, tell: as `scb.measurement.measure` takes them; rows that are there are not measured again.
+
+    Raises:
+      UserError: two objectives bear one name, by which their results are told apart.
+    """
+    check_names(objectives)
+    spec = spec or environment_agent("ppo", environment)
+    place = Place.named(environment, backend)
+    found = measure(
+        spec,
+        place,
+        agents=seeds,
+        objectives=objectives,
+        points=points,
+        episodes=episodes,
+        actions=(MODE if mode_actions else SAMPLED,),
+        rows=rows,
+        tell=tell,
+    )
+    steps = np.asarray(list(dict.fromkeys(row["step"] for row in found)))
+    returns = pivot(found, "objective", "seed", "step")
+    return Comparison(
+        [
+            LearningCurves(
+                environment,
+                place.backend,
+                objective.name,
+                steps,
+                of_it,
+                list(seeds),
+                episodes,
+                mode_actions,
+                float(spec.hyperparameters.policy_output_scale),
+            )
+            for objective, of_it in zip(objectives, returns, strict=True)
+        ]
+    )
+
+
+def learning_curves(
+    environment: str, objective: Objective, seeds: Sequence[int], **arguments: Any
+) -> LearningCurves:
+    """`compare` with a single objective."""
+    (curves,) = compare(environment, [objective], seeds, **arguments).curves
+    return curves
