@@ -51,12 +51,7 @@ class Drift(ABC):
 
     @abstractmethod
     def __call__(
-        self,
-        parameters: Any,
-        log_ratio: Array,
-        advantage: Array,
-        progress: Array,
-        xp: Any = jnp,
+        self, parameters: Any, log_ratio: Array, advantage: Array, progress: Array, xp: Any = jnp
     ) -> Array:
         """The penalty.
 
@@ -141,12 +136,7 @@ class CorrectedDrift(Drift):
         """[B] what is added to the base; arguments as for `__call__`."""
 
     def __call__(
-        self,
-        parameters: Any,
-        log_ratio: Array,
-        advantage: Array,
-        progress: Array,
-        xp: Any = jnp,
+        self, parameters: Any, log_ratio: Array, advantage: Array, progress: Array, xp: Any = jnp
     ) -> Array:
         chex.assert_equal_shape([log_ratio, advantage, progress])
         penalty = self.correction(parameters, log_ratio, advantage, progress, xp)

@@ -28,12 +28,7 @@ class ClipDrift(Drift):
         return jnp.float32(self.clip)
 
     def __call__(
-        self,
-        parameters: Any,
-        log_ratio: Array,
-        advantage: Array,
-        progress: Array,
-        xp: Any = jnp,
+        self, parameters: Any, log_ratio: Array, advantage: Array, progress: Array, xp: Any = jnp
     ) -> Array:
         return clipped_surrogate_drift(parameters, log_ratio, advantage, progress, xp)
 
@@ -57,12 +52,7 @@ class DPODrift(Drift):
         return {"alpha": jnp.float32(self.alpha), "beta": jnp.float32(self.beta)}
 
     def __call__(
-        self,
-        parameters: Any,
-        log_ratio: Array,
-        advantage: Array,
-        progress: Array,
-        xp: Any = jnp,
+        self, parameters: Any, log_ratio: Array, advantage: Array, progress: Array, xp: Any = jnp
     ) -> Array:
         chex.assert_equal_shape([log_ratio, advantage, progress])
         alpha, beta = parameters["alpha"], parameters["beta"]
@@ -83,12 +73,7 @@ class NoDrift(Drift):
         return jnp.zeros(())
 
     def __call__(
-        self,
-        parameters: Any,
-        log_ratio: Array,
-        advantage: Array,
-        progress: Array,
-        xp: Any = jnp,
+        self, parameters: Any, log_ratio: Array, advantage: Array, progress: Array, xp: Any = jnp
     ) -> Array:
         chex.assert_equal_shape([log_ratio, advantage, progress])
         # Not zeros_like, which PyTorch refuses to differentiate.

@@ -78,12 +78,7 @@ class MirrorDrift(Drift):
         }
 
     def __call__(
-        self,
-        parameters: Any,
-        log_ratio: Array,
-        advantage: Array,
-        progress: Array,
-        xp: Any = jnp,
+        self, parameters: Any, log_ratio: Array, advantage: Array, progress: Array, xp: Any = jnp
     ) -> Array:
         chex.assert_equal_shape([log_ratio, advantage, progress])
         away = xp.expm1(log_ratio)  # r - 1
