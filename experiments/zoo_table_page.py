@@ -11,6 +11,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
 from scb import plotting
+from scb.agents.spec import ALGORITHMS
 from scb.environments.registry import environment_spec
 from scb.errors import UserError
 from scb.statistics import Estimate
@@ -30,7 +31,6 @@ ENVIRONMENTS = (
     "halfcheetah",
     "humanoidstandup",
 )
-ALGORITHMS = ("ppo", "sac", "dqn", "ddpg", "td3")
 
 # The return that a bandit of this project is meant to train agents to.
 TARGETS = {
@@ -77,12 +77,18 @@ def environment_rank(name: str) -> tuple[int, str]:
     return (ENVIRONMENTS.index(name) if name in ENVIRONMENTS else len(ENVIRONMENTS), name)
 
 
+def algorithm_rank(name: str) -> tuple[int, str]:
+    """In the registry's order, and what it doesn't hold (any more) after that."""
+    names = list(ALGORITHMS)
+    return (names.index(name) if name in names else len(names), name)
+
+
 def place(entry: Mapping[str, Any]) -> tuple[Any, ...]:
     return (
         environment_rank(entry["environment"]),
         entry["backend"] or "",
         BANDITS.index(entry["bandit"]),
-        ALGORITHMS.index(entry["algorithm"]),
+        algorithm_rank(entry["algorithm"]),
     )
 
 

@@ -220,7 +220,7 @@ def train(
 
     Args:
       bandit: a zoo name such as Synthetic-Pendulum-v1, or path.npz (a synthetic MDP's too).
-      algorithm: ppo, sac, dqn, ddqn, ddpg or td3.
+      algorithm: such as ppo, sac, dqn, ddqn, ddpg or td3.
       evaluation_environment: where to evaluate; the bandit's own where left out.
       backend: Brax's physics: generalized, positional or spring.
       agents: how many to train, with the paper's 10 000 steps each.

@@ -7,17 +7,60 @@ the caller.
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import optax
 from gymnax.environments import environment, spaces
 from jax.typing import ArrayLike
 
-from scb.errors import UserError
+from scb.agents import networks
+from scb.agents.normalization import normalize
+from scb.errors import UserError, unknown_name
 from scb.evaluation import Episodes, evaluate
 from scb.keys import split_key
+
+
+@dataclass(frozen=True)
+class AgentConfig(ABC):
+    """What decides shapes and program: a change recompiles. Defaults are the paper's inner loop.
+
+    Attributes:
+      num_envs: environments that step side by side.
+      total_steps: environment steps of the whole training, rounded up to whole iterations.
+      hidden_sizes, activation: of all networks, which share nothing.
+      normalize_observations: by running mean and variance, frozen with the agent for evaluation.
+    """
+
+    num_envs: int = 1
+    total_steps: int = 10_000
+    hidden_sizes: tuple[int, ...] = (64, 64)
+    activation: str = "tanh"
+    normalize_observations: bool = False
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, int) and not isinstance(value, bool) and value < 1:
+                raise UserError(f"{field.name} is {value}: it must be at least 1.")
+        if self.activation not in networks.ACTIVATIONS:
+            raise unknown_name("activation", self.activation, networks.ACTIVATIONS)
+
+    @property
+    @abstractmethod
+    def num_iterations(self) -> int:
+        """Of a training: as often is a batch of experience collected, and learned from."""
+
+    @abstractmethod
+    def steps_after(self, num_iterations: int) -> int:
+        """Environment steps after so many iterations."""
+
+    @property
+    def num_environment_steps(self) -> int:
+        """Steps that a training takes: `total_steps` rounded up."""
+        return self.steps_after(self.num_iterations)
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,7 +73,7 @@ class Agent(ABC):
     """
 
     env: environment.Environment[Any, Any]
-    config: Any
+    config: AgentConfig
 
     @property
     def one_step(self) -> bool:
@@ -139,16 +182,31 @@ class Agent(ABC):
         env_params: Any = None,
         mode: bool = False,
         horizon: ArrayLike | None = None,
+        training_params: Any = None,
     ) -> Episodes:
-        """Episodes of the frozen agent, in its own environment or in another of the same shapes."""
+        """Episodes of the frozen agent, in its own environment or in another of the same shapes.
+
+        Args:
+          env, env_params: where the episodes are; None for the agent's environment and for the
+            environment's default parameters.
+          training_params: of the agent's own environment, where `env` is another: they decide the
+            bounds that its actions are scaled to. None for the default ones.
+        """
         env = self.env if env is None else env
         env_params = env.default_params if env_params is None else env_params
+        own_params = env_params if env is self.env else training_params
 
         def policy(observation: jax.Array, key: jax.Array) -> jax.Array:
-            action = self.choose(state, jnp.ravel(observation), key, env_params, mode)
+            action = self.choose(state, jnp.ravel(observation), key, own_params, mode)
             return clip_to_space(action, env.action_space(env_params))
 
         return evaluate(env, env_params, policy, key, num_episodes, horizon)
+
+    def _inputs(self, state: Any, observation: jax.Array) -> jax.Array:
+        """[..., O] what the networks are given of an observation."""
+        if self.config.normalize_observations:
+            return normalize(state.statistics, observation)
+        return observation
 
     def observation_size(self, env_params: Any) -> int:
         """Of the flattened observation."""
@@ -163,6 +221,14 @@ def clip_to_space(action: jax.Array, space: spaces.Box | spaces.Discrete) -> jax
     if isinstance(space, spaces.Discrete):
         return action
     return jnp.clip(jnp.reshape(action, space.shape), space.low, space.high)
+
+
+def clipped_adam(hyperparameters: Any, eps: float = 1e-8) -> optax.GradientTransformation:
+    """Adam with `learning_rate`, of gradients clipped to the global norm `max_grad_norm`."""
+    return optax.chain(
+        optax.clip_by_global_norm(hyperparameters.max_grad_norm),
+        optax.adam(hyperparameters.learning_rate, eps=eps),
+    )
 
 
 def flat_bounds(space: spaces.Box) -> tuple[jax.Array, jax.Array]:
@@ -194,6 +260,6 @@ class Algorithm:
 
     name: str
     agent: type[Agent]
-    config: Callable[[], Any]
+    config: Callable[[], AgentConfig]
     hyperparameters: Callable[[], Any]
     actions: tuple[str, ...] = ("discrete", "continuous")

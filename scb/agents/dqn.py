@@ -11,7 +11,7 @@ from flax import struct
 from jax.typing import ArrayLike
 
 from scb.agents import networks
-from scb.agents.agent import Algorithm
+from scb.agents.agent import Algorithm, clipped_adam
 from scb.agents.off_policy import (
     OffPolicyAgent,
     OffPolicyConfig,
@@ -20,7 +20,6 @@ from scb.agents.off_policy import (
     require_discrete,
     target_values,
 )
-from scb.errors import UserError
 from scb.keys import split_key
 
 
@@ -34,13 +33,6 @@ class DQNConfig(OffPolicyConfig):
 
     num_envs: int = 10
     target_update_every: int = 50
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.target_update_every < 1:
-            raise UserError(
-                f"target_update_every is {self.target_update_every}: it must be at least 1."
-            )
 
 
 @struct.dataclass
@@ -86,7 +78,7 @@ class DQN(OffPolicyAgent):
     ) -> DQNLearner:
         observation = jnp.zeros(self.observation_size(env_params))
         params = self._network(env_params).init(key, observation)
-        optimizer = _optimizer(hyperparameters).init(params)
+        optimizer = clipped_adam(hyperparameters).init(params)
         return DQNLearner(params, None if self.one_step else params, optimizer)
 
     def explore(
@@ -145,7 +137,7 @@ class DQN(OffPolicyAgent):
 
         gradient = jax.grad(loss)(learner.params)
         params, optimizer = gradient_update(
-            _optimizer(hyperparameters), gradient, learner.optimizer, learner.params
+            clipped_adam(hyperparameters), gradient, learner.optimizer, learner.params
         )
         return DQNLearner(params, learner.target, optimizer)
 
@@ -156,13 +148,6 @@ class DQN(OffPolicyAgent):
         copy = (iteration + 1) % every == 0
         target = jax.tree.map(lambda t, p: jnp.where(copy, p, t), learner.target, learner.params)
         return DQNLearner(learner.params, target, learner.optimizer)
-
-
-def _optimizer(hyperparameters: DQNHyperparameters) -> optax.GradientTransformation:
-    return optax.chain(
-        optax.clip_by_global_norm(hyperparameters.max_grad_norm),
-        optax.adam(hyperparameters.learning_rate),
-    )
 
 
 DQN_ALGORITHM = Algorithm("dqn", DQN, DQNConfig, DQNHyperparameters, actions=("discrete",))

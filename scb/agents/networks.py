@@ -28,6 +28,17 @@ class MLP(nn.Module):
         return nn.Dense(self.output_size)(inputs)
 
 
+def stacked(network: type[nn.Module], number: int) -> Any:
+    """Several networks of one kind that share nothing, as one whose variables and outputs have a first axis of them."""
+    return nn.vmap(
+        network,
+        variable_axes={"params": 0},
+        split_rngs={"params": True},
+        in_axes=None,
+        axis_size=number,
+    )
+
+
 def scale_output(variables: Any, scale: ArrayLike) -> Any:
     """A policy's initial variables with the weights of its MLP's last layer multiplied by `scale`.
 

@@ -15,16 +15,16 @@ import optax
 from flax import struct
 from gymnax.environments import spaces
 
-from scb.agents import networks, replay
-from scb.agents.agent import Agent, clip_to_space
-from scb.agents.normalization import RunningStatistics, normalize, update_statistics
-from scb.errors import UserError, unknown_name
+from scb.agents import replay
+from scb.agents.agent import Agent, AgentConfig, clip_to_space
+from scb.agents.normalization import RunningStatistics, update_statistics
+from scb.errors import UserError
 from scb.keys import key_at, split_key
 
 
 @dataclass(frozen=True)
-class OffPolicyConfig:
-    """What decides shapes and program: a change recompiles.
+class OffPolicyConfig(AgentConfig):
+    """Defaults are the paper's inner loop.
 
     Attributes:
       num_envs: environments that step side by side between gradient steps.
@@ -35,35 +35,17 @@ class OffPolicyConfig:
         one-step environments.
       batch_size, gradient_steps: transitions of a gradient step, and gradient steps after each step
         of the environments.
-      total_steps: environment steps of the whole training, the prefill included, rounded up.
-      hidden_sizes, activation: of all networks.
-      normalize_observations: by running mean and variance, frozen with the agent for evaluation.
+      total_steps: as for all agents, the prefill included.
     """
 
-    num_envs: int = 1
     buffer_size: int = 2000
     prefill: int = 1000
     prefill_hold: int = 1
     batch_size: int = 100
     gradient_steps: int = 1
-    total_steps: int = 10_000
-    hidden_sizes: tuple[int, ...] = (64, 64)
-    activation: str = "tanh"
-    normalize_observations: bool = False
 
     def __post_init__(self) -> None:
-        for field in (
-            "num_envs",
-            "buffer_size",
-            "prefill",
-            "prefill_hold",
-            "batch_size",
-            "gradient_steps",
-            "total_steps",
-        ):
-            value = getattr(self, field)
-            if value < 1:
-                raise UserError(f"{field} is {value}: it must be at least 1.")
+        super().__post_init__()
         if self.prefill % self.num_envs:
             raise UserError(
                 f"prefill is {self.prefill}, which {self.num_envs} environments side by side cannot "
@@ -77,21 +59,13 @@ class OffPolicyConfig:
             raise UserError(
                 f"prefill is {self.prefill}, which leaves nothing of {self.total_steps} steps to learn in."
             )
-        if self.activation not in networks.ACTIVATIONS:
-            raise unknown_name("activation", self.activation, networks.ACTIVATIONS)
 
     @property
     def num_iterations(self) -> int:
         return -(-(self.total_steps - self.prefill) // self.num_envs)
 
     def steps_after(self, num_iterations: int) -> int:
-        """Environment steps after so many iterations, the prefill included."""
         return self.prefill + num_iterations * self.num_envs
-
-    @property
-    def num_environment_steps(self) -> int:
-        """Steps that a training takes: `total_steps` rounded up."""
-        return self.steps_after(self.num_iterations)
 
 
 class Transition(NamedTuple):
@@ -294,13 +268,7 @@ class OffPolicyAgent(Agent):
         if self.config.normalize_observations:
             statistics = update_statistics(state.statistics, transitions.observation)
             state = replace(state, statistics=statistics)
-        # Prefill and buffer are multiples of what a step adds (or the ring is scattered into).
-        return replace(state, buffer=replay.add(state.buffer, transitions, aligned=True))
-
-    def _inputs(self, state: OffPolicyState, observation: jax.Array) -> jax.Array:
-        if self.config.normalize_observations:
-            return normalize(state.statistics, observation)
-        return observation
+        return replace(state, buffer=replay.add(state.buffer, transitions))
 
 
 def _flatten(observation: jax.Array) -> jax.Array:
@@ -332,7 +300,7 @@ def require_discrete(algorithm: str, space: spaces.Box | spaces.Discrete, discre
     """Raises a UserError where an algorithm doesn't fit an action space."""
     if isinstance(space, spaces.Discrete) != discrete:
         has, needs = ("continuous", "discrete") if discrete else ("discrete", "continuous")
-        instead = "sac, ppo, td3 or ddpg" if discrete else "sac, ppo, dqn or ddqn"
         raise UserError(
-            f"{algorithm} needs {needs} actions, and this environment has {has} ones: use {instead}."
+            f"{algorithm} needs {needs} actions, and this environment has {has} ones: use an algorithm for "
+            "those, such as ppo or sac."
         )

@@ -22,9 +22,9 @@ from gymnax.environments import spaces
 from jax.typing import ArrayLike
 
 from scb.agents import networks
-from scb.agents.agent import Agent, Algorithm, clip_to_space
-from scb.agents.normalization import RunningStatistics, normalize, update_statistics
-from scb.errors import UserError, unknown_name
+from scb.agents.agent import Agent, AgentConfig, Algorithm, clip_to_space, clipped_adam
+from scb.agents.normalization import RunningStatistics, update_statistics
+from scb.errors import UserError
 from scb.keys import split_key
 
 DriftFunction: TypeAlias = Callable[[Any, jax.Array, jax.Array, jax.Array], jax.Array]
@@ -63,44 +63,29 @@ def clipped_surrogate_drift(
 
 
 @dataclass(frozen=True)
-class PPOConfig:
-    """What decides shapes and program: a change recompiles. Defaults are the paper's inner loop.
+class PPOConfig(AgentConfig):
+    """Defaults are the paper's inner loop.
 
     Attributes:
       num_envs, num_steps: a batch is num_envs * num_steps transitions (on a bandit: that many
         contexts at once).
       num_epochs, num_minibatches: passes over a batch, and equal parts that it is cut into.
-      total_steps: environment steps of the whole training, rounded up to whole batches.
-      hidden_sizes, activation: of policy and value network, which share nothing.
-      normalize_observations: by running mean and variance, frozen with the agent for evaluation.
       anneal_learning_rate: linearly to zero over the training.
-      one_batch_contexts: on one-step environments, draw a batch of contexts at once instead of
-        scanning steps. The same distribution (contexts are independent), several times faster.
     """
 
     num_envs: int = 5
     num_steps: int = 100
     num_epochs: int = 10
     num_minibatches: int = 10
-    total_steps: int = 10_000
-    hidden_sizes: tuple[int, ...] = (64, 64)
-    activation: str = "tanh"
-    normalize_observations: bool = False
     anneal_learning_rate: bool = False
-    one_batch_contexts: bool = True
 
     def __post_init__(self) -> None:
-        for field in ("num_envs", "num_steps", "num_epochs", "num_minibatches", "total_steps"):
-            value = getattr(self, field)
-            if value < 1:
-                raise UserError(f"{field} is {value}: it must be at least 1.")
+        super().__post_init__()
         if self.batch_size % self.num_minibatches:
             raise UserError(
                 f"num_minibatches is {self.num_minibatches}, which does not divide a batch of {self.batch_size} "
                 f"({self.num_envs} environments x {self.num_steps} steps): choose a divisor of {self.batch_size}."
             )
-        if self.activation not in networks.ACTIVATIONS:
-            raise unknown_name("activation", self.activation, networks.ACTIVATIONS)
 
     @property
     def batch_size(self) -> int:
@@ -111,13 +96,7 @@ class PPOConfig:
         return -(-self.total_steps // self.batch_size)
 
     def steps_after(self, num_iterations: int) -> int:
-        """Environment steps after so many iterations."""
         return num_iterations * self.batch_size
-
-    @property
-    def num_environment_steps(self) -> int:
-        """Steps that a training takes: `total_steps` rounded up."""
-        return self.steps_after(self.num_iterations)
 
 
 @struct.dataclass
@@ -212,10 +191,6 @@ class PPO(Agent):
     config: PPOConfig
     drift: DriftFunction = clipped_surrogate_drift
 
-    @property
-    def one_step(self) -> bool:
-        return self.config.one_batch_contexts and super().one_step
-
     def _networks(self, env_params: Any) -> tuple[Any, Any]:
         # Any: flax types `apply` as a union with mutated collections, which these never have.
         space = self.env.action_space(env_params)
@@ -249,7 +224,9 @@ class PPO(Agent):
             standing = (env_state, observation)
         return PPOState(
             params=params,
-            optimizer={name: _optimizer(hyperparameters).init(p) for name, p in params.items()},
+            optimizer={
+                name: clipped_adam(hyperparameters, eps=1e-5).init(p) for name, p in params.items()
+            },
             statistics=RunningStatistics.start(size),
             environment=standing,
             iteration=jnp.int32(0),
@@ -261,11 +238,6 @@ class PPO(Agent):
     ) -> jax.Array:
         distribution = self._policy(state, observation, env_params)
         return distribution.mode() if mode else distribution.sample(seed=key)
-
-    def _inputs(self, state: PPOState, observation: jax.Array) -> jax.Array:
-        if self.config.normalize_observations:
-            return normalize(state.statistics, observation)
-        return observation
 
     def _policy(
         self, state: PPOState, observation: jax.Array, env_params: Any
@@ -379,9 +351,11 @@ class PPO(Agent):
         policy, value = self._networks(env_params)
         batch = batch._replace(observation=self._inputs(state, batch.observation))
         horizon = hyperparameters.horizon
-        progress = state.iteration / (config.num_iterations if horizon is None else horizon)
-        fraction_left = 1.0 - progress if config.anneal_learning_rate else 1.0
-        optimizer = _optimizer(hyperparameters)
+        done = state.iteration / (config.num_iterations if horizon is None else horizon)
+        # A training may go on past its horizon: it is over then, and stays so.
+        progress = jnp.minimum(done, 1.0)
+        fraction_left = jnp.maximum(1.0 - done, 0.0) if config.anneal_learning_rate else 1.0
+        optimizer = clipped_adam(hyperparameters, eps=1e-5)
 
         def loss(params: dict[str, Any], minibatch: Batch) -> jax.Array:
             distribution = policy.apply(params["policy"], minibatch.observation)
@@ -455,13 +429,6 @@ def random_order(key: jax.Array, size: int) -> jax.Array:
     mask = jnp.uint32((1 << index_bits) - 1)
     words = (jax.random.bits(key, (size,), jnp.uint32) & ~mask) | jnp.arange(size, dtype=jnp.uint32)
     return (jnp.sort(words) & mask).astype(jnp.int32)
-
-
-def _optimizer(hyperparameters: PPOHyperparameters) -> optax.GradientTransformation:
-    return optax.chain(
-        optax.clip_by_global_norm(hyperparameters.max_grad_norm),
-        optax.adam(hyperparameters.learning_rate, eps=1e-5),
-    )
 
 
 PPO_ALGORITHM = Algorithm("ppo", PPO, PPOConfig, PPOHyperparameters)

@@ -33,19 +33,19 @@ def empty_buffer(example: Any, capacity: int) -> ReplayBuffer:
     return ReplayBuffer(transitions, jnp.int32(0))
 
 
-def add(buffer: ReplayBuffer, batch: Any, aligned: bool = False) -> ReplayBuffer:
+def add(buffer: ReplayBuffer, batch: Any) -> ReplayBuffer:
     """Adds [N, ...] transitions, N at most the capacity; the oldest make room.
 
-    Args:
-      aligned: the caller's word that N divides the capacity and everything written so far, so that
-        the batch never wraps around the ring's end; a slice is then written instead of a scatter.
+    N must divide what was written so far, as a step of the agents' environments divides the prefill
+    and every step before: where it divides the capacity too, the batch never wraps around the ring's
+    end, and a slice is written instead of a scatter.
     """
     number = jax.tree.leaves(batch)[0].shape[0]
     capacity = buffer.capacity
     if number > capacity:
         raise UserError(f"{number} transitions at once do not fit a replay buffer of {capacity}.")
     start = buffer.written % capacity
-    if aligned and capacity % number == 0:
+    if capacity % number == 0:
 
         def write(ring: jax.Array, new: jax.Array) -> jax.Array:
             return jax.lax.dynamic_update_slice_in_dim(ring, new, start, 0)

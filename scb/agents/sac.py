@@ -77,17 +77,11 @@ class SAC(OffPolicyAgent):
         # Any: flax types `apply` as a union with mutated collections, which these never have.
         discrete, size = self._space(env_params)
         shape = (self.config.hidden_sizes, self.config.activation)
-        twins: dict[str, Any] = {
-            "variable_axes": {"params": 0},
-            "split_rngs": {"params": True},
-            "in_axes": None,
-            "axis_size": 2,
-        }
         if discrete:
             policy: nn.Module = networks.CategoricalPolicy(size, *shape)
-            return policy, nn.vmap(networks.QNetwork, **twins)(size, *shape)
+            return policy, networks.stacked(networks.QNetwork, 2)(size, *shape)
         policy = networks.SquashedGaussianPolicy(size, *shape)
-        return policy, nn.vmap(networks.Critic, **twins)(*shape)
+        return policy, networks.stacked(networks.Critic, 2)(*shape)
 
     def init_learner(
         self, key: jax.Array, hyperparameters: SACHyperparameters, env_params: Any

@@ -8,12 +8,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from flax import linen as nn
 from flax import struct
 from jax.typing import ArrayLike
 
 from scb.agents import networks
-from scb.agents.agent import Algorithm, scale_to_space
+from scb.agents.agent import Algorithm, clipped_adam, scale_to_space
 from scb.agents.off_policy import (
     OffPolicyAgent,
     OffPolicyConfig,
@@ -23,7 +22,6 @@ from scb.agents.off_policy import (
     require_discrete,
     target_values,
 )
-from scb.errors import UserError
 from scb.keys import split_key
 
 
@@ -38,12 +36,6 @@ class TD3Config(OffPolicyConfig):
 
     num_critics: int = 2
     policy_delay: int = 2
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        for field in ("num_critics", "policy_delay"):
-            if getattr(self, field) < 1:
-                raise UserError(f"{field} is {getattr(self, field)}: it must be at least 1.")
 
 
 def ddpg_config(**fields: Any) -> TD3Config:
@@ -91,13 +83,7 @@ class TD3(OffPolicyAgent):
         # The policy follows the first critic; the second only ever lowers a bootstrapped target,
         # and without bootstrapping it has no effect on anything.
         number = 1 if self.one_step else self.config.num_critics
-        critics = nn.vmap(
-            networks.Critic,
-            variable_axes={"params": 0},
-            split_rngs={"params": True},
-            in_axes=None,
-            axis_size=number,
-        )(*shape)
+        critics = networks.stacked(networks.Critic, number)(*shape)
         return networks.DeterministicPolicy(int(np.prod(space.shape)), *shape), critics
 
     def init_learner(
@@ -110,7 +96,7 @@ class TD3(OffPolicyAgent):
             "policy": policy.init(key_policy, observation),
             "critics": critics.init(key_critics, observation, jnp.zeros(policy.action_size)),
         }
-        optimizer = _optimizer(hyperparameters)
+        optimizer = clipped_adam(hyperparameters)
         return TD3Learner(
             params=params,
             targets=None if self.one_step else params,
@@ -157,7 +143,7 @@ class TD3(OffPolicyAgent):
         policy, critics = self._networks(env_params)
         space = self.env.action_space(env_params)
         params, optimizer_state = dict(learner.params), dict(learner.optimizer)
-        optimizer = _optimizer(hyperparameters)
+        optimizer = clipped_adam(hyperparameters)
         action = jnp.reshape(batch.action, (-1, policy.action_size))
         if self.one_step:
             target = batch.reward
@@ -204,13 +190,6 @@ class TD3(OffPolicyAgent):
     ) -> TD3Learner:
         targets = polyak_average(learner.targets, learner.params, hyperparameters.polyak)
         return TD3Learner(learner.params, targets, learner.optimizer)
-
-
-def _optimizer(hyperparameters: TD3Hyperparameters) -> optax.GradientTransformation:
-    return optax.chain(
-        optax.clip_by_global_norm(hyperparameters.max_grad_norm),
-        optax.adam(hyperparameters.learning_rate),
-    )
 
 
 TD3_ALGORITHM = Algorithm("td3", TD3, TD3Config, TD3Hyperparameters, actions=("continuous",))

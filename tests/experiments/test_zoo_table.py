@@ -117,6 +117,13 @@ def test_the_figure_draws_what_the_table_says():
     assert [expected["mode_actions"]["iqm"][end] for end in ("low", "high")] in ends
 
 
+def test_an_algorithm_that_is_not_registered_has_its_place_after_the_others():
+    entry = {"environment": "CartPole-v1", "backend": None, "bandit": "ours"}
+    names = ("mpo", "td3", "ppo", "ddqn", "dqn")
+    places = sorted(names, key=lambda name: zoo_table_page.place({**entry, "algorithm": name}))
+    assert places == ["ppo", "dqn", "ddqn", "td3", "mpo"]
+
+
 def test_every_target_and_paper_figure_is_of_a_fitting_algorithm():
     assert set(zoo_table_page.TARGETS) < set(zoo_table_page.PAPER)
     for environment, figures in zoo_table_page.PAPER.items():

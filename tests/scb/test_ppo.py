@@ -214,7 +214,9 @@ CONTEXTS = jnp.linspace(0.05, 0.95, 10)[:, None]
 
 def bandit_learner(one_batch):
     """jit of [S] keys, learning rate -> ([S] agents, [S] mean returns, [S, 10] mode actions)."""
-    agent = PPO(context_bandit(), replace(LEARNING, one_batch_contexts=one_batch))
+    bandit = context_bandit()
+    bandit.one_step = one_batch  # which nobody but the agent looks at
+    agent = PPO(bandit, LEARNING)
     params = agent.env.default_params
 
     def train(key, learning_rate):
@@ -456,8 +458,10 @@ def one_update():
     )
 
     def watch(largest, log_ratio, advantage, progress):
-        # Makes the gradient NaN where the policy that is updated isn't the one that acted.
-        return log_ratio * jnp.where(jnp.abs(log_ratio) > 1e-5, jnp.nan, 0.0)
+        # Makes the gradient NaN where the policy that is updated isn't the one that acted, and where
+        # more than all of the training is done.
+        wrong = (jnp.abs(log_ratio) > 1e-5) | (progress > 1.0)
+        return log_ratio * jnp.where(wrong, jnp.nan, 0.0)
 
     agent = PPO(Corridor(), config, drift=watch)
     params = CorridorParams(rewards=jnp.array([[1.0, 0.0], [0.0, 5.0], [1.0, 0.0]]))
@@ -491,18 +495,18 @@ def test_each_networks_gradient_is_clipped_by_its_global_norm(one_update):
 
 def test_annealing_goes_linearly_to_zero(one_update):
     # 4 iterations: the k-th update is 1 - k/4 of what it would be, so 1, 1/2 (k = 2), 1/4 for the
-    # last one (k = 3), and nothing at the end of the training (k = 4).
+    # last one (k = 3), and nothing at the end of the training (k = 4) or past it (k = 6).
     _, start, iterate = one_update
     moved = {
         k: displacement(
             start.params,
             iterate(start.replace(iteration=jnp.int32(k)), PPOHyperparameters()).params,
         )
-        for k in (0, 2, 3, 4)
+        for k in (0, 2, 3, 4, 6)
     }
     assert np.abs(moved[0]).max() > 1e-3
-    for k in (2, 3, 4):
-        np.testing.assert_allclose(moved[k], moved[0] * (1 - k / 4), atol=1e-6)
+    for k in (2, 3, 4, 6):
+        np.testing.assert_allclose(moved[k], moved[0] * max(0, 1 - k / 4), atol=1e-6)
 
 
 def test_statistics_are_those_of_all_observations_and_an_update_starts_from_the_policy_that_acted(

@@ -15,10 +15,10 @@ def numbered(*numbers):
     return {"number": number, "pair": jnp.stack([number, number**2], axis=-1)}
 
 
-def filled(capacity, *batches, aligned=False):
+def filled(capacity, *batches):
     buffer = empty_buffer({"number": jnp.zeros(()), "pair": jnp.zeros(2)}, capacity)
     for batch in batches:
-        buffer = add(buffer, numbered(*batch), aligned)
+        buffer = add(buffer, numbered(*batch))
     return buffer
 
 
@@ -32,10 +32,9 @@ def test_an_empty_buffer_has_the_shapes_and_dtypes_of_its_example():
     assert buffer.transitions["observation"].dtype == jnp.bfloat16
 
 
-@pytest.mark.parametrize("aligned", [True, False])
-def test_the_oldest_transitions_make_room(aligned):
+def test_the_oldest_transitions_make_room():
     # Six places, written in pairs: the fourth pair takes the places of the first.
-    buffer = filled(6, (1, 2), (3, 4), (5, 6), (7, 8), aligned=aligned)
+    buffer = filled(6, (1, 2), (3, 4), (5, 6), (7, 8))
     np.testing.assert_array_equal(buffer.transitions["number"], [7, 8, 3, 4, 5, 6])
     np.testing.assert_array_equal(
         buffer.transitions["pair"], [[7, 49], [8, 64], [3, 9], [4, 16], [5, 25], [6, 36]]
@@ -52,25 +51,22 @@ def test_a_batch_that_does_not_fit_at_the_end_goes_on_at_the_start():
 
 
 def test_a_batch_as_large_as_the_buffer_replaces_everything():
-    buffer = filled(3, (1,), (2, 3, 4))
-    np.testing.assert_array_equal(buffer.transitions["number"], [4, 2, 3])
+    buffer = filled(3, (1, 2, 3), (4, 5, 6))
+    np.testing.assert_array_equal(buffer.transitions["number"], [4, 5, 6])
 
 
 # (capacity, first batch, later batches); the agents prefill by one size and go on in another.
 @pytest.mark.parametrize(
     ("capacity", "first", "later"), [(12, 4, 4), (12, 6, 3), (10, 4, 2), (10, 4, 4), (7, 2, 2)]
 )
-def test_aligned_and_unaligned_writes_agree(capacity, first, later):
+def test_the_newest_transitions_are_kept(capacity, first, later):
     # Where `later` doesn't divide the capacity, a slice would not wrap around the ring's end.
     numbers = iter(range(1, 100))
     batches = [[next(numbers) for _ in range(size)] for size in (first, *[later] * 7)]
-    aligned, scattered = (filled(capacity, *batches, aligned=word) for word in (True, False))
-    chex.assert_trees_all_equal(aligned, scattered)
-    # The newest ones in whatever order.
+    # In whatever order.
     total = first + 7 * later
-    assert set(np.asarray(aligned.transitions["number"])) == set(
-        range(total - capacity + 1, total + 1)
-    )
+    stored = filled(capacity, *batches).transitions["number"]
+    assert set(np.asarray(stored)) == set(range(total - capacity + 1, total + 1))
 
 
 def test_only_what_was_stored_is_sampled():
@@ -97,13 +93,12 @@ def test_a_scan_over_writes_is_the_python_loop():
     chex.assert_trees_all_equal(scanned, loop)
 
 
-@pytest.mark.parametrize("aligned", [True, False])
-def test_members_of_a_population_have_their_own_contents_and_one_write_position(aligned):
+def test_members_of_a_population_have_their_own_contents_and_one_write_position():
     # `out_axes=None` is refused by vmap for whatever depends on the member.
     def fill(offset):
         buffer = empty_buffer(jnp.zeros(()), 4)
         for start in (0, 2, 4):
-            buffer = add(buffer, offset + jnp.arange(start, start + 2.0), aligned)
+            buffer = add(buffer, offset + jnp.arange(start, start + 2.0))
         return buffer
 
     axes = ReplayBuffer(transitions=0, written=None)

@@ -1,0 +1,149 @@
+"""What all agents share: evaluation in another environment, and the registry of algorithms."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import struct
+from gymnax.environments import spaces
+
+from scb.agents.agent import Agent, AgentConfig, Algorithm
+from scb.agents.normalization import RunningStatistics
+from scb.agents.off_policy import OffPolicyState
+from scb.agents.spec import ALGORITHMS, algorithms_for, bandit_agent, environment_agent
+from scb.agents.tables import Row, Tables
+from scb.agents.td3 import TD3, TD3Config, TD3Hyperparameters
+from scb.cli import main
+from scb.discovery import BanditDiscovery, DiscoveryConfig
+from scb.environments.synthetic import BanditConfig
+from scb.errors import UserError
+from scb.warm_start import WarmStartConfig
+from tests.scb.probes import ContinuousCorridor, CorridorParams
+
+# -- evaluation in another environment
+# ------------------------------------------------------------
+
+
+@struct.dataclass
+class BoundedParams(CorridorParams):
+    bound: Any = 4.0
+
+
+class BoundedCorridor(ContinuousCorridor):
+    """Its parameters hold the bound of its actions, as Pendulum's do; they lie in [-bound, bound]."""
+
+    def action_space(self, params=None):
+        bound = BoundedParams().bound if params is None else params.bound
+        return spaces.Box(-bound, bound, (1,), jnp.float32)
+
+
+@pytest.mark.parametrize("bound", [None, 0.5])
+def test_the_environment_of_the_evaluation_says_nothing_of_what_the_agents_actions_mean(bound):
+    # In the other corridor, whose parameters have no bound, actions are clipped to [-1, 2], and three
+    # cells pay 1 - (a - 1/2)^2. The agent's lie in [-4, 4], or where it was told another bound in that.
+    config = TD3Config(hidden_sizes=(4,))
+    agent, other = TD3(BoundedCorridor(), config), ContinuousCorridor()
+    trained_in = BoundedParams() if bound is None else BoundedParams(bound=bound)
+    key = jax.random.key(1)
+    learner = agent.init_learner(key, TD3Hyperparameters(), trained_in)
+    state = OffPolicyState(learner, None, RunningStatistics.start(3), None, 0, key)
+    squashed = agent._networks(trained_in)[0].apply(learner.params["policy"], jnp.eye(3))
+    actions = np.clip(trained_in.bound * squashed[:, 0], -1, 2)
+    assert np.ptp(squashed) > 0.1
+    episodes = agent.evaluate(
+        state,
+        key,
+        1,
+        other,
+        other.default_params,
+        mode=True,
+        training_params=None if bound is None else trained_in,
+    )
+    np.testing.assert_allclose(episodes.returns, np.sum(1 - (actions - 0.5) ** 2), rtol=1e-5)
+
+
+# -- a new algorithm: its module and a row of the tables
+# --------------------------------------------
+
+
+@dataclass(frozen=True)
+class ConstantConfig(AgentConfig):
+    total_steps: int = 3
+
+    @property
+    def num_iterations(self) -> int:
+        return self.total_steps
+
+    def steps_after(self, num_iterations: int) -> int:
+        return num_iterations
+
+
+@struct.dataclass
+class ConstantHyperparameters:
+    action: Any = 1.0
+
+
+class Constant(Agent):
+    """Does the same whatever it sees."""
+
+    def init(self, key, hyperparameters, env_params):
+        return {"action": jnp.int32(hyperparameters.action), "iteration": jnp.int32(0)}
+
+    def iterate(self, state, hyperparameters, env_params):
+        return {**state, "iteration": state["iteration"] + 1}
+
+    def choose(self, state, observation, key, env_params, mode):
+        return state["action"]
+
+
+@pytest.fixture
+def constant(monkeypatch):
+    algorithm = Algorithm(
+        "constant", Constant, ConstantConfig, ConstantHyperparameters, actions=("discrete",)
+    )
+    tables = Tables(
+        algorithm,
+        lists={"action": (0.0, 1.0)},
+        general=Row({"total_steps": 5}, "this test"),
+        environments={"CartPole-v1": Row({"total_steps": 7}, "this test")},
+    )
+    monkeypatch.setitem(ALGORITHMS, algorithm.name, tables)
+
+
+def test_a_registered_algorithm_is_known_everywhere(constant):
+    assert algorithms_for(spaces.Discrete(2)) == ("ppo", "sac", "dqn", "constant")
+    assert "constant" not in algorithms_for(spaces.Box(-1, 1, (1,)))
+    assert bandit_agent("constant", "CartPole-v1").lists == {"action": (0.0, 1.0)}
+    assert environment_agent("constant", "Acrobot-v1").steps == 5
+    assert environment_agent("constant", "CartPole-v1").steps == 7
+    assert WarmStartConfig(expert="constant").expert == "constant"
+    with pytest.raises(UserError, match=r"constant does not fit .* continuous actions"):
+        bandit_agent("constant", "Pendulum-v1")
+
+
+def test_a_registered_algorithm_is_trained_in_a_discovery(constant):
+    config = DiscoveryConfig(
+        environment="CartPole-v1",
+        algorithms=("constant",),
+        init="random",
+        bandit=BanditConfig(hidden_size=4),
+        agents_per_candidate=4,
+        evaluation_episodes=2,
+    )
+    problem = BanditDiscovery(config)
+    weights = problem.initial_solution(jax.random.key(0))
+    fitness = jax.jit(problem.evaluate)(weights, jax.random.key(1), jnp.int32(0))["fitness"]
+    # Pushed to one side all the time, a pole falls within eleven steps at the latest.
+    assert fitness.shape == (4,) and 8 <= fitness.min() <= fitness.max() <= 11
+    assert problem.steps().training == 4 * 3
+
+
+def test_a_registered_algorithm_is_one_of_the_command_lines(constant, capsys):
+    arguments = ["train", "--bandit", "Synthetic-CartPole-v1", "--agents", "2", "--episodes", "2"]
+    assert main([*arguments, "--algorithm", "constant"]) == 0
+    assert "IQM" in capsys.readouterr().out
+    assert main([*arguments, "--algorithm", "constnat"]) == 2
+    assert "did you mean constant" in capsys.readouterr().err
