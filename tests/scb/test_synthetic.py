@@ -27,19 +27,13 @@ def small_bandit(space, **config):
     return SyntheticBandit(3, space, BanditConfig(hidden_size=4, **config))
 
 
-def with_random_biases(weights, key):
-    """Flax starts biases at zero, which would hide one that is forgotten."""
-    leaves, treedef = jax.tree.flatten(weights)
-    keys = jax.random.split(key, len(leaves))
-    return treedef.unflatten(
-        [x + jax.random.normal(k, x.shape) for x, k in zip(leaves, keys, strict=True)]
-    )
-
-
 def params_of(bandit, seed=0, **values):
-    key_init, key_bias = jax.random.split(jax.random.key(seed))
+    """Weights by chance: Flax starts biases at zero, which would hide one that is forgotten."""
+    generator = np.random.default_rng(seed)
+    shapes = jax.eval_shape(bandit.init_weights, jax.random.key(0))
     return BanditParams(
-        weights=with_random_biases(bandit.init_weights(key_init), key_bias), **values
+        weights=jax.tree.map(lambda x: generator.normal(size=x.shape).astype(np.float32), shapes),
+        **values,
     )
 
 
@@ -119,13 +113,20 @@ def test_every_episode_terminates_after_one_step_and_is_never_truncated(space):
     bandit = small_bandit(space)
     params = params_of(bandit)
     key_reset, key_action, key_step = jax.random.split(jax.random.key(0), 3)
-    observation, state = jax.vmap(bandit.reset, in_axes=(0, None))(
-        jax.random.split(key_reset, 5), params
-    )
-    actions = jax.vmap(space.sample)(jax.random.split(key_action, 5))
-    after, next_state, reward, terminated, truncated, info = jax.jit(
-        jax.vmap(bandit.step, in_axes=(0, 0, 0, None))
-    )(jax.random.split(key_step, 5), state, actions, params)
+
+    @jax.jit
+    def play():
+        observation, state = jax.vmap(bandit.reset, (0, None))(
+            jax.random.split(key_reset, 5), params
+        )
+        actions = jax.vmap(space.sample)(jax.random.split(key_action, 5))
+        keys = jax.random.split(key_step, 5)
+        outcome = jax.vmap(bandit.step, (0, 0, 0, None))(keys, state, actions, params)
+        expected = jax.vmap(bandit.mean_reward, (0, 0, None))(observation, actions, params)
+        return observation, outcome, expected
+
+    observation, outcome, expected = play()
+    after, next_state, reward, terminated, truncated, info = outcome
     assert terminated.all() and not truncated.any()
     assert terminated.dtype == truncated.dtype == jnp.bool_
     # The step ends where it began; the next episode's context is already there.
@@ -133,7 +134,6 @@ def test_every_episode_terminates_after_one_step_and_is_never_truncated(space):
     np.testing.assert_array_equal(next_state.context, after)
     np.testing.assert_array_equal(next_state.time, 0)
     assert not np.isclose(after, observation).all(axis=1).any()
-    expected = jax.vmap(bandit.mean_reward, in_axes=(0, 0, None))(observation, actions, params)
     np.testing.assert_allclose(reward, expected, rtol=1e-4)
 
 
@@ -150,7 +150,7 @@ def test_is_terminated_says_what_step_says():
 def test_a_population_of_bandits_is_vmap_over_params(space):
     bandit = small_bandit(space)
     members = [params_of(bandit, seed) for seed in range(3)]
-    population = jax.tree.map(lambda *x: jnp.stack(jnp.asarray(x)), *members)
+    population = jax.tree.map(lambda *x: np.stack(x), *members)
     key_reset, key_step = jax.random.split(jax.random.key(0))
     action = space.sample(jax.random.key(1))
 
@@ -159,8 +159,9 @@ def test_a_population_of_bandits_is_vmap_over_params(space):
         return observation, bandit.step(key_step, state, action, params)[2]
 
     contexts, rewards = jax.jit(jax.vmap(play))(population)
+    alone = jax.jit(play)
     for i, params in enumerate(members):
-        context, reward = play(params)
+        context, reward = alone(params)
         np.testing.assert_allclose(contexts[i], context, rtol=1e-5)
         np.testing.assert_allclose(rewards[i], reward, rtol=1e-5)
     assert len(np.unique(rewards)) == 3
@@ -171,10 +172,14 @@ def test_reward_noise_is_gaussian_of_that_standard_deviation():
     context, action = jnp.array([0.25]), jnp.array([0.75])
     state = BanditState(time=jnp.int32(0), context=context)
 
-    def rewards(noise, seed):
+    @jax.jit
+    def steps(noise, key):
         params = bandit.default_params.replace(reward_noise=noise)
         step = jax.vmap(lambda key: bandit.step_env(key, state, action, params)[2])
-        return np.asarray(step(jax.random.split(jax.random.key(seed), 4000)))
+        return step(jax.random.split(key, 4000))
+
+    def rewards(noise, seed):
+        return np.asarray(steps(noise, jax.random.key(seed)))
 
     np.testing.assert_array_equal(rewards(0.0, seed=0), -0.5)
     # -0.5 + 3 N(0, 1): a Kolmogorov-Smirnov test of 4000 draws sees a deviation that is 5 % off.
@@ -194,7 +199,7 @@ def test_noise_levels_can_be_mapped_over():
         params = bandit.default_params.replace(reward_noise=noise)
         return bandit.step(jax.random.key(1), state, best, params)[2]
 
-    rewards = jax.vmap(reward)(jnp.array([0.0, 1.0, 2.0]))
+    rewards = jax.jit(jax.vmap(reward))(np.array([0.0, 1.0, 2.0]))
     assert rewards[0] == 0.0
     assert rewards[2] == pytest.approx(2 * float(rewards[1]))
 
@@ -216,7 +221,7 @@ def test_reward_scale_is_the_deviation_over_contexts_and_actions():
 
 def latents(name, size, count=20_000):
     keys = jax.random.split(jax.random.key(0), count)
-    return np.asarray(jax.vmap(lambda key: LATENTS[name](key, size))(keys))
+    return np.asarray(jax.jit(jax.vmap(lambda key: LATENTS[name](key, size)))(keys))
 
 
 @pytest.mark.parametrize(

@@ -33,10 +33,10 @@ SMALL = {"hidden_size": 4, "activation": "relu", "latent": "softmax_categorical"
 
 def linear(coefficients, bias=0.0):
     """Two relu layers that compute `coefficients @ x + bias`: relu(y) - relu(-y) = y."""
-    column = jnp.array(coefficients, jnp.float32)[:, None]
+    column = np.array(coefficients, np.float32)[:, None]
     return {
-        "Dense_0": {"kernel": jnp.concatenate([column, -column], axis=1), "bias": jnp.zeros(2)},
-        "Dense_1": {"kernel": jnp.array([[1.0], [-1.0]]), "bias": jnp.full(1, bias)},
+        "Dense_0": {"kernel": np.hstack([column, -column]), "bias": np.zeros(2, np.float32)},
+        "Dense_1": {"kernel": np.float32([[1.0], [-1.0]]), "bias": np.float32([bias])},
     }
 
 
@@ -59,7 +59,7 @@ def play(mdp, actions, params=None):
     steps = []
     for action in actions:
         _, state, reward, terminated, truncated, info = mdp.step(
-            jax.random.key(1), state, jnp.array([action]), params
+            jax.random.key(1), state, np.array([action], np.float32), params
         )
         outcome = (info["final_observation"][0], reward, terminated, truncated)
         steps.append(tuple(x.item() for x in outcome))
@@ -69,7 +69,7 @@ def play(mdp, actions, params=None):
 
 
 def stacked(*members):
-    return jax.tree.map(lambda *x: jnp.stack([jnp.asarray(leaf) for leaf in x]), *members)
+    return jax.tree.map(lambda *x: np.stack(x), *members)
 
 
 # -- one episode
@@ -175,7 +175,7 @@ def test_maximum_lengths_can_be_mapped_over():
         )
         return episodes.lengths[0], terminated, truncated, info["final_observation"][0]
 
-    lengths, terminated, truncated, after = jax.vmap(outcome)(jnp.array([1, 2, 9]))
+    lengths, terminated, truncated, after = jax.jit(jax.vmap(outcome))(np.array([1, 2, 9]))
     assert lengths.tolist() == [1, 2, 3]
     # A first step at length 1 terminates there too, although the config promises nothing.
     assert not mdp.one_step
@@ -197,7 +197,8 @@ def test_a_population_of_mdps_is_vmap_over_params(parameterization, space):
     config = MDPConfig(hidden_size=4, parameterization=parameterization, max_steps=3)
     env = Corridor(cells=3) if parameterization == "T" else None
     mdp = SyntheticMDP(3, space, config, env=env)
-    members = [mdp.params(mdp.init_weights(jax.random.key(seed))) for seed in range(3)]
+    init = jax.jit(mdp.init_weights)
+    members = [mdp.params(init(jax.random.key(seed))) for seed in range(3)]
     key_reset, key_step = jax.random.split(jax.random.key(0))
     action = space.sample(jax.random.key(1))
 
@@ -207,7 +208,7 @@ def test_a_population_of_mdps_is_vmap_over_params(parameterization, space):
         return info["final_observation"], reward, terminated, truncated
 
     together = jax.jit(jax.vmap(after))(stacked(*members))
-    alone = stacked(*map(after, members))
+    alone = stacked(*map(jax.jit(after), members))
     jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, atol=1e-6), together, alone)
     assert len(np.unique(together[1])) == 3
 
@@ -224,7 +225,7 @@ def test_an_overflow_is_shown_and_hurts_no_other_member():
     def run(params):
         return evaluate(mdps[0], params, lambda *_: jnp.zeros(1), jax.random.key(0), 1)
 
-    episodes = jax.vmap(run)(params)
+    episodes = jax.jit(jax.vmap(run))(params)
     assert not np.isfinite(episodes.returns[0, 0])
     assert (episodes.returns[1, 0], episodes.lengths[1, 0]) == (-6.0, 6)
 
@@ -238,7 +239,7 @@ def bandit_and_mdp(space, latent="normal", promised=True):
     layers = {"hidden_size": 4, "latent": latent}
     bandit = SyntheticBandit(3, space, BanditConfig(**layers))
     mdp = SyntheticMDP(3, space, MDPConfig(**layers, max_steps=1 if promised else 9))
-    weights = mdp.init_weights(jax.random.key(0))
+    weights = jax.jit(mdp.init_weights)(jax.random.key(0))
     params = mdp.params(weights).replace(max_steps_in_episode=1)
     shared = {name: weights[name] for name in ("initial_state", "reward")}
     return (bandit, BanditParams(weights=shared)), (mdp, params)
@@ -256,9 +257,9 @@ def bandit_and_mdp(space, latent="normal", promised=True):
 def test_a_ti_of_length_one_is_the_bandit(space, latent, promised):
     space = SPACES[space]
     key_reset, key_action, key_step = jax.random.split(jax.random.key(5), 3)
-    actions = jax.vmap(space.sample)(jax.random.split(key_action, 8))
 
     def steps(env, params):
+        actions = jax.vmap(space.sample)(jax.random.split(key_action, 8))
         start, state = jax.vmap(env.reset, in_axes=(0, None))(
             jax.random.split(key_reset, 8), params
         )
@@ -268,6 +269,7 @@ def test_a_ti_of_length_one_is_the_bandit(space, latent, promised):
         info["discount"] = jnp.asarray(info["discount"])
         return start, after, state.time, *outcome, info
 
+    steps = jax.jit(steps, static_argnums=0)
     one, other = bandit_and_mdp(space, latent, promised)
     chex.assert_trees_all_equal(steps(*one), steps(*other))
 
@@ -294,9 +296,9 @@ def test_a_t_starts_where_its_evaluation_environment_does(name):
     env, env_params = gymnax.make(name)
     mdp = synthetic_for(env, env_params, "T", BanditConfig(hidden_size=4), "T", max_steps=2)
     params = MDPParams()  # no weights: where it starts depends on none
+    resets = jax.jit(lambda key: (mdp.reset_env(key, params), env.reset_env(key, env_params)[0]))
     for key in jax.random.split(jax.random.key(1), 2):
-        observation, state = mdp.reset_env(key, params)
-        expected, _ = env.reset_env(key, env_params)
+        (observation, state), expected = resets(key)
         chex.assert_shape(observation, mdp.observation_space(params).shape)
         assert observation.dtype == jnp.float32
         np.testing.assert_array_equal(observation, np.ravel(expected))
@@ -308,9 +310,9 @@ def test_a_t_starts_by_the_evaluation_environments_parameters():
     env = Corridor(cells=3)
     env_params = env.default_params.replace(random_start=1)
     mdp = synthetic_for(env, env_params, "T", BanditConfig(hidden_size=4), "T")
-    params = mdp.params(mdp.init_weights(jax.random.key(0)))
+    params = mdp.params(jax.jit(mdp.init_weights)(jax.random.key(0)))
     keys = jax.random.split(jax.random.key(1), 30)
-    starts = jax.vmap(mdp.reset, in_axes=(0, None))(keys, params)[0]
+    starts = jax.jit(jax.vmap(mdp.reset, in_axes=(0, None)))(keys, params)[0]
     np.testing.assert_array_equal(np.unique(starts, axis=0), np.eye(3)[::-1])
 
 
@@ -378,7 +380,7 @@ def test_weight_shapes_are_those_of_the_weights(parameterization):
             f"{network}/Dense_1/bias": (outputs,),
         }
     assert mdp.weight_shapes() == expected
-    flat = artefacts.flatten(mdp.init_weights(jax.random.key(0)))
+    flat = artefacts.flatten(jax.jit(mdp.init_weights)(jax.random.key(0)))
     assert {name: array.shape for name, array in flat.items()} == expected
 
 
@@ -457,7 +459,7 @@ def saved(folder, parameterization="TI", name="Pendulum-v1", max_steps=7, metada
     mdp = synthetic_for(
         env, env_params, parameterization, BanditConfig(**SMALL), "x", max_steps=max_steps
     )
-    weights = mdp.init_weights(jax.random.key(1))
+    weights = jax.jit(mdp.init_weights)(jax.random.key(1))
     return save_synthetic_mdp(folder / "Synthetic-Test.npz", mdp, weights, metadata), mdp, weights
 
 
