@@ -63,8 +63,8 @@ def _measure_limit(
 
     folder = f"{plan['runs']}/{environment}-{limit}"
     problem, outcome = searches.search(config_of(environment, limit, plan), folder)
-    entry["random"] = round(environment_spec(environment).random_return(), 2)
-    entry["limit"] = int(problem.env_params.max_steps_in_episode)
+    place = environment_spec(environment)
+    entry["random"], entry["limit"] = round(place.random_return(), 2), place.episode_limit
     space = problem.env.action_space(problem.env_params)
     returns: dict[str, list[float]] = {}
     failed = 0

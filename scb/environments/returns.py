@@ -1,13 +1,12 @@
 """What uniformly random actions earn, measured once and kept in returns.json.
 
-    python -m scb.environments.returns CartPole-v1 hopper:spring hopper:generalized
+    python -c 'from scb.environments import returns; returns.main(["CartPole-v1", "hopper:spring"])'
 
 measures anew and writes the table beside this file. What is in it stays as it was first measured, so that
 scores of all reports have one scale. An environment without an entry is measured when it is asked for.
 """
 
 import json
-import sys
 from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
@@ -57,7 +56,3 @@ def main(places: Sequence[str]) -> None:
         kept[place] = random_return(*environment_spec(name).make(backend or None))
         print(f"{place}: {kept[place]}")
         _TABLE.write_text(json.dumps(dict(sorted(kept.items())), indent=2) + "\n")
-
-
-if __name__ == "__main__":
-    main(sys.argv[1:])

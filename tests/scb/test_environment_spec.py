@@ -4,6 +4,7 @@ import pytest
 
 from scb.agents.spec import bandit_agent, environment_agent
 from scb.discovery import BanditDiscovery, DiscoveryConfig
+from scb.environments import returns
 from scb.environments.registry import environment_names, environment_spec, make
 from scb.environments.returns import random_return
 from scb.environments.zoo import bandit_metadata, open_bandit, save_bandit, zoo_names
@@ -63,6 +64,16 @@ def test_the_table_of_random_returns_is_what_is_measured(name):
     spec = environment_spec(name)
     assert spec.random_return() == pytest.approx(random_return(*spec.make()), rel=0.12)
     assert spec.random_return() < spec.reference().value
+
+
+def test_the_table_is_written_by_its_command(corridors, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(returns, "_TABLE", tmp_path / "returns.json")
+    returns._TABLE.write_text('{"hopper:spring": 128.5}')
+    returns.main(["Corridor-v0"])
+    assert capsys.readouterr().out == "Corridor-v0: 3.0\n"
+    returns.table.cache_clear()
+    assert returns.table() == {"hopper": {"spring": 128.5}, "Corridor-v0": {None: 3.0}}
+    returns.table.cache_clear()
 
 
 def test_a_new_family_takes_a_class_and_a_line(corridors):
