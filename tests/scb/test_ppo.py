@@ -1,4 +1,5 @@
 from dataclasses import replace
+from functools import cache
 from operator import itemgetter
 
 import chex
@@ -38,15 +39,15 @@ def test_advantages_of_three_steps_by_hand():
     #   A1 = -2, A0 = 1 - 2/4 = 0.5.
     # Column 2, it is truncated: delta1 = 1 with V(s') = 6, but no trace from A2: A1 = 1, A0 = 1.25.
     def columns(x):
-        return jnp.tile(jnp.array(x)[:, None], (1, 3))
+        return np.tile(np.float32(x)[:, None], (1, 3))
 
-    at_second_step = jnp.array([[False], [True], [False]])
+    at_second_step = np.array([[False], [True], [False]])
     advantages = generalized_advantages(
         reward=columns([1.0, 2.0, 3.0]),
         value=columns([2.0, 4.0, 6.0]),
         next_value=columns([4.0, 6.0, 8.0]),
-        terminated=at_second_step & jnp.array([False, True, False]),
-        truncated=at_second_step & jnp.array([False, False, True]),
+        terminated=at_second_step & np.array([False, True, False]),
+        truncated=at_second_step & np.array([False, False, True]),
         discount=0.5,
         gae_lambda=0.5,
     )
@@ -55,16 +56,20 @@ def test_advantages_of_three_steps_by_hand():
     )
 
 
+advantages_of = jax.jit(generalized_advantages)
+drift_of = jax.jit(clipped_surrogate_drift)
+
+
 @settings(deadline=None, max_examples=20)
 @given(discount=st.floats(0.0, 1.0), gae_lambda=st.floats(0.0, 1.0))
 def test_bandit_advantage_is_reward_minus_value(discount, gae_lambda):
     # One-step episodes: nothing to bootstrap. A = r - V(s) = 3 - 1 = 2 and -1 - 4 = -5, whatever
     # gamma and lambda are, and whatever value the next observation has.
-    ends = jnp.ones((2, 1), bool)
-    advantages = generalized_advantages(
-        jnp.array([[3.0], [-1.0]]),
-        jnp.array([[1.0], [4.0]]),
-        jnp.array([[100.0], [-100.0]]),
+    ends = np.ones((2, 1), bool)
+    advantages = advantages_of(
+        np.array([[3.0], [-1.0]]),
+        np.array([[1.0], [4.0]]),
+        np.array([[100.0], [-100.0]]),
         ends,
         ~ends,
         discount,
@@ -74,7 +79,7 @@ def test_bandit_advantage_is_reward_minus_value(discount, gae_lambda):
 
 
 def test_advantages_of_unequal_shapes_are_refused_not_broadcast():
-    x = jnp.ones((3, 2))
+    x = np.ones((3, 2))
     with pytest.raises(AssertionError):
         generalized_advantages(x, x, x[:, :1], x == 0, x == 0, 0.9, 0.9)
 
@@ -94,8 +99,8 @@ def ppo_minimum(ratio, advantage, clip):
     clip=st.floats(0.015625, 0.75, width=32),
 )
 def test_ratio_times_advantage_minus_the_drift_is_ppos_minimum(log_ratio, advantage, clip):
-    arguments = jnp.array([log_ratio]), jnp.array([advantage]), jnp.zeros(1)
-    drift = clipped_surrogate_drift(clip, *arguments)
+    arguments = np.float32([log_ratio]), np.float32([advantage]), np.zeros(1, np.float32)
+    drift = drift_of(clip, *arguments)
     ratio = np.exp(np.float64(log_ratio))
     # Ratios are at most e^3 = 20 and advantages 5: float32 is exact to about 100 * 6e-8.
     np.testing.assert_allclose(
@@ -105,31 +110,32 @@ def test_ratio_times_advantage_minus_the_drift_is_ppos_minimum(log_ratio, advant
 
 
 def test_the_drift_is_ppos_for_a_whole_batch():
-    key_ratio, key_advantage = jax.random.split(jax.random.key(0))
-    log_ratio = 0.5 * jax.random.normal(key_ratio, (1000,))
-    advantage = jax.random.normal(key_advantage, (1000,))
-    drift = clipped_surrogate_drift(0.2, log_ratio, advantage, jnp.zeros(1000))
+    log_ratio, advantage = np.random.default_rng(0).normal(size=(2, 1000)).astype(np.float32)
+    log_ratio *= 0.5
+    drift = drift_of(0.2, log_ratio, advantage, np.zeros(1000, np.float32))
     ratio = np.exp(log_ratio)
     np.testing.assert_allclose(
-        ratio * advantage - drift, ppo_minimum(ratio, np.asarray(advantage), 0.2), atol=1e-5
+        ratio * advantage - drift, ppo_minimum(ratio, advantage, 0.2), atol=1e-5
     )
     # With deviations of 0.5 in the log-ratio, a good part of the batch is clipped.
     assert 0.2 < np.mean(np.asarray(drift) > 0) < 0.8
 
 
 def test_the_drift_is_flat_where_the_policy_has_not_moved():
-    advantage = jnp.array([-2.0, 0.0, 3.0])
+    advantage = np.float32([-2.0, 0.0, 3.0])
 
     def drift(log_ratio):
-        return clipped_surrogate_drift(0.2, log_ratio, advantage, jnp.zeros(3))
+        charged = clipped_surrogate_drift(0.2, log_ratio, advantage, jnp.zeros(3))
+        return charged.sum(), charged
 
-    np.testing.assert_array_equal(drift(jnp.zeros(3)), 0.0)
-    np.testing.assert_array_equal(jax.grad(lambda x: drift(x).sum())(jnp.zeros(3)), 0.0)
+    gradient, charged = jax.jit(jax.grad(drift, has_aux=True))(np.zeros(3, np.float32))
+    np.testing.assert_array_equal(charged, 0.0)
+    np.testing.assert_array_equal(gradient, 0.0)
 
 
 def test_a_column_against_a_vector_is_refused_not_broadcast():
     # [4, 1] with [4] would broadcast to [4, 4].
-    vector, column = jnp.ones(4), jnp.ones((4, 1))
+    vector, column = np.ones(4), np.ones((4, 1))
     for arguments in [(column, vector, vector), (vector, column, vector)]:
         with pytest.raises(AssertionError):
             clipped_surrogate_drift(0.2, *arguments)
@@ -180,7 +186,7 @@ def test_impossible_configurations_are_refused(arguments, message):
 # 70 000 > 2^16: the range that falls back to jax.random.permutation.
 @pytest.mark.parametrize("size", [1, 2, 10, 500, 512, 70_000])
 def test_random_order_is_a_permutation(size):
-    order = random_order(jax.random.key(size), size)
+    order = jax.jit(random_order, static_argnums=1)(jax.random.key(size), size)
     assert order.dtype == jnp.int32
     np.testing.assert_array_equal(np.sort(order), np.arange(size))
 
@@ -189,7 +195,7 @@ def test_every_number_is_equally_likely_in_every_place():
     # 8000 permutations of 8: each number is expected 1000 times in each place. Chi-square per
     # place; the smallest of 8 p-values is below 1e-4 once in 1250 tries of a correct shuffle.
     keys = jax.random.split(jax.random.key(0), 8000)
-    orders = np.asarray(jax.vmap(lambda key: random_order(key, 8))(keys))
+    orders = np.asarray(jax.jit(jax.vmap(lambda key: random_order(key, 8)))(keys))
     counts = np.stack([np.bincount(place, minlength=8) for place in orders.T])
     assert stats.chisquare(counts, axis=1).pvalue.min() > 1e-4
     # Pairs too: each of the 8 * 7 ordered pairs in the first two places is expected 143 times.
@@ -209,7 +215,7 @@ LEARNING = PPOConfig(
     hidden_sizes=(8,),
     normalize_observations=True,
 )
-CONTEXTS = jnp.linspace(0.05, 0.95, 10)[:, None]
+CONTEXTS = np.linspace(0.05, 0.95, 10, dtype=np.float32)[:, None]
 
 
 def bandit_learner(one_batch):
@@ -299,7 +305,7 @@ def corridor_agents():
         return agent._value(state, jnp.eye(3), params), returns
 
     columns = zip(*CORRIDORS.values(), strict=True)
-    settings = [jnp.array(column) for column in columns]
+    settings = [np.array(column) for column in columns]
     settings[0] = settings[0].astype(float)
     keys = jax.random.split(jax.random.key(0), len(CORRIDORS))
     values, returns = jax.jit(jax.vmap(train))(keys, *settings)
@@ -350,7 +356,9 @@ def displacement(before, after):
 
 @pytest.fixture(scope="module")
 def small():
-    return PPO(Corridor(), SMALL), CorridorParams(rewards=jnp.array([[1.0, 0], [0, 1.0], [1.0, 0]]))
+    return PPO(Corridor(), SMALL), CorridorParams(
+        rewards=np.float32([[1.0, 0], [0, 1.0], [1.0, 0]])
+    )
 
 
 # Each differs from the defaults in one number. A norm of 1e-4 is far below any gradient's, and
@@ -404,8 +412,9 @@ def test_every_hyperparameter_has_an_effect(population):
 
 def test_the_output_scale_multiplies_the_policys_last_layer_and_nothing_else(small):
     agent, params = small
+    init = jax.jit(agent.init)
     full, half = (
-        agent.init(jax.random.key(0), PPOHyperparameters(policy_output_scale=scale), params).params
+        init(jax.random.key(0), PPOHyperparameters(policy_output_scale=scale), params).params
         for scale in (1.0, 0.5)
     )
     name = f"Dense_{len(agent.config.hidden_sizes)}"
@@ -464,8 +473,8 @@ def one_update():
         return log_ratio * jnp.where(wrong, jnp.nan, 0.0)
 
     agent = PPO(Corridor(), config, drift=watch)
-    params = CorridorParams(rewards=jnp.array([[1.0, 0.0], [0.0, 5.0], [1.0, 0.0]]))
-    start = agent.init(jax.random.key(0), PPOHyperparameters(), params)
+    params = CorridorParams(rewards=np.float32([[1.0, 0.0], [0.0, 5.0], [1.0, 0.0]]))
+    start = jax.jit(agent.init)(jax.random.key(0), PPOHyperparameters(), params)
     iterate = jax.jit(lambda state, h: agent.train_iterations(state, h, params, 1))
     return agent, start, iterate
 
@@ -530,34 +539,50 @@ def test_evaluation_normalises_by_the_frozen_statistics(one_update):
     # mean 0.3 and variance 4: the cell's observation 1 becomes (1 - 0.3) / 2 = 0.35, 0 becomes
     # -0.15.
     agent, start, _ = one_update
-    statistics = RunningStatistics(jnp.float32(10.0), jnp.full(3, 0.3), jnp.full(3, 40.0))
+    statistics = RunningStatistics(np.float32(10.0), np.full(3, 0.3), np.full(3, 40.0))
     state = start.replace(statistics=statistics)
     plain = PPO(agent.env, replace(agent.config, normalize_observations=False))
-    by_hand = plain._policy(state, jnp.array([0.35, -0.15, -0.15]), None).logits
-    np.testing.assert_allclose(agent._policy(state, jnp.eye(3)[0], None).logits, by_hand, atol=1e-6)
+
+    @jax.jit
+    def logits():
+        by_hand = plain._policy(state, jnp.array([0.35, -0.15, -0.15]), None).logits
+        return agent._policy(state, jnp.eye(3)[0], None).logits, by_hand
+
+    np.testing.assert_allclose(*logits(), atol=1e-6)
     # Nothing is learned from evaluation episodes: the second of two equal ones is like the first.
-    first, second = (agent.evaluate(state, jax.random.key(0), 4) for _ in range(2))
+    evaluate = jax.jit(lambda key: agent.evaluate(state, key, 4))
+    first, second = (evaluate(jax.random.key(0)) for _ in range(2))
     np.testing.assert_array_equal(first.returns, second.returns)
+
+
+@cache
+def untrained_program():
+    agent = PPO(context_bandit(), replace(SMALL, num_minibatches=1))
+
+    def act(state, mode):
+        keys = jax.random.split(jax.random.key(1), 16)
+        return jax.vmap(lambda key: agent.act(state, jnp.array([0.3]), key, mode=mode))(keys)
+
+    init = jax.jit(lambda key: agent.init(key, PPOHyperparameters(), agent.env.default_params))
+    return init, jax.jit(act, static_argnums=1)
+
+
+def untrained():
+    """An untrained agent, and what makes 16 actions of one: jit of state, mode -> [16, 1]."""
+    init, act = untrained_program()
+    return init(jax.random.key(0)), act
 
 
 def test_actions_stay_within_the_bounds():
     # A policy whose mean is 50 in an action space of [-1, 2].
-    agent = PPO(context_bandit(), replace(SMALL, num_minibatches=1))
-    state = agent.init(jax.random.key(0), PPOHyperparameters(), agent.env.default_params)
+    state, act = untrained()
     bias = state.params["policy"]["params"]["MLP_0"]["Dense_1"]["bias"]
-    state.params["policy"]["params"]["MLP_0"]["Dense_1"]["bias"] = jnp.full_like(bias, 50.0)
+    state.params["policy"]["params"]["MLP_0"]["Dense_1"]["bias"] = np.full_like(bias, 50.0)
     for mode in (True, False):
-        action = agent.act(state, jnp.array([0.3]), jax.random.key(1), mode=mode)
-        np.testing.assert_array_equal(action, [2.0])
+        np.testing.assert_array_equal(act(state, mode), 2.0)
 
 
 def test_sampled_actions_vary_and_mode_actions_do_not():
-    agent = PPO(context_bandit(), SMALL)
-    state = agent.init(jax.random.key(0), PPOHyperparameters(), agent.env.default_params)
-    keys = jax.random.split(jax.random.key(1), 16)
-
-    def act(mode):
-        return jax.vmap(lambda key: agent.act(state, jnp.array([0.3]), key, mode=mode))(keys)
-
-    assert np.unique(act(True)).size == 1
-    assert np.unique(act(False)).size > 8
+    state, act = untrained()
+    assert np.unique(act(state, True)).size == 1
+    assert np.unique(act(state, False)).size > 8
