@@ -285,6 +285,7 @@ def target_values(
 
 def polyak_average(target: Any, online: Any, polyak: jax.typing.ArrayLike) -> Any:
     """Polyak * target + (1 - polyak) * online: the paper's convention, in which 0.99 moves slowly."""
+    # optax.incremental_update is the same sum the other way round, and rounds its last bit otherwise.
     return jax.tree.map(lambda t, o: polyak * t + (1.0 - polyak) * o, target, online)
 
 
