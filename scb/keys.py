@@ -10,7 +10,7 @@ import jax
 from jax.typing import ArrayLike
 
 # Positions are smaller.
-_FIRST_NAME = 2**31
+FIRST_NAME = 2**31
 
 
 def root_key(seed: ArrayLike) -> jax.Array:
@@ -31,4 +31,4 @@ def key_at(key: jax.Array, position: ArrayLike) -> jax.Array:
 def named_key(key: jax.Array, role: str) -> jax.Array:
     """The key of a role, which is no position's: this key may be split or indexed as well."""
     digest = int.from_bytes(hashlib.sha256(role.encode()).digest()[:4], "big")
-    return jax.random.fold_in(key, _FIRST_NAME | digest)
+    return jax.random.fold_in(key, FIRST_NAME | digest)
