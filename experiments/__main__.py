@@ -21,7 +21,6 @@ import tyro
 
 from experiments import claims, harness, rendering
 from experiments.harness import DATA, DOCS, Experiment, Files, Preset
-from scb.cli import configure_jax
 from scb.errors import UserError
 from scb.runs import make_folder
 
@@ -126,7 +125,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     if arguments.list:
         print(listing())
         return 0
-    configure_jax()
     return harness.exit_status("experiments", lambda: _all(arguments))
 
 

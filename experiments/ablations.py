@@ -164,7 +164,6 @@ def facts(report: Report) -> dict[str, Any]:
 
 def draw(report: Mapping[str, Any]) -> Figure:
     """The paper's six panels; a line is left out where a search's mean failed."""
-
     colors = (
         plotting.BLACK,
         plotting.ORANGE,

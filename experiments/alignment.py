@@ -12,18 +12,16 @@ ones of `--held-out FILES`. Regimes that --out holds already are kept, so the sa
 an interrupted one.
 """
 
-import argparse
-import json
-import sys
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
+from matplotlib.figure import Figure
 
-from experiments.harness import exit_status, run_name
+from experiments.harness import Experiment, Save, run_name
 from lpo import figures
 from lpo.alignment import (
     Regime,
@@ -36,11 +34,8 @@ from lpo.alignment import (
 )
 from lpo.fitness import LABELS
 from lpo.objectives import Objective, load_objective
-from scb import plotting
-from scb.cli import configure_jax
 from scb.environments.registry import environment_spec
 from scb.errors import UserError
-from scb.runs import write_json
 
 PENDULUM = "Synthetic-Pendulum-v1"
 # One thing changed at a time.
@@ -68,7 +63,7 @@ FITNESS = "return, mode actions"
 CHOICES = ("pendulum", "pendulum_small_last_layer")
 
 
-def recommendation(report: dict[str, Any]) -> str:
+def recommendation(report: Mapping[str, Any]) -> str:
     """The regime that ranks best under both initialisations, and where the default stands."""
     stages = [report["stages"][name] for name in CHOICES if name in report["stages"]]
     found = {
@@ -111,7 +106,7 @@ def recommendation(report: dict[str, Any]) -> str:
     return said.replace(" -", " \u2212")
 
 
-def markdown(report: dict[str, Any]) -> str:
+def markdown(report: Mapping[str, Any]) -> str:
     """The page with the tables."""
     lines = [
         "# Which bandit regime ranks objectives as the environment does",
@@ -140,7 +135,7 @@ def markdown(report: dict[str, Any]) -> str:
             + (f"Return after {stage['steps']} steps" if stage["steps"] else "Final return")
             + f" (IQM): {family}.",
             "",
-            f"![Correlations with {stage['environment']}](figures/{figure_name(name)})",
+            f"![Correlations with {stage['environment']}](figures/{figure_name(name)}.png)",
             "",
             "| regime | " + " | ".join(LABELS) + " |",
             "| --- |" + " --- |" * len(LABELS),
@@ -165,43 +160,36 @@ def same_drift(one: Objective, other: Objective) -> bool:
     )
 
 
-def measuring(arguments: Sequence[str]) -> list[str]:
-    """The command line without where it writes: what is measured does not depend on that."""
-    kept = list(arguments)
-    for flag in ("--out", "--page"):
-        while flag in kept:
-            at = kept.index(flag)
-            del kept[at : at + 2]
-    return kept
-
-
 def figure_name(stage: str) -> str:
     """The file name of a stage's heat map."""
-    return f"alignment_{stage.replace(', ', '_').replace(' ', '_')}.png"
+    return f"alignment_{stage.replace(', ', '_').replace(' ', '_')}"
 
 
-def main() -> int:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--agents", type=int, default=16, help="agents of each objective")
-    parser.add_argument(
-        "--adversaries", type=Path, nargs="*", default=[], help="learned objectives' files"
-    )
-    parser.add_argument(
-        "--held-out",
-        type=Path,
-        nargs="*",
-        default=[],
-        help="files of objectives that confirm alone",
-    )
-    parser.add_argument("--skip-confirmation", action="store_true")
-    parser.add_argument("--out", type=Path, default=Path("docs/data/alignment.json"))
-    parser.add_argument("--page", type=Path, default=Path("docs/alignment.md"))
-    arguments = parser.parse_args()
-    configure_jax()
+@dataclass(frozen=True)
+class Options:
+    """Who is ranked, and by how many agents."""
 
-    arguments.out.parent.mkdir(parents=True, exist_ok=True)
+    agents: int = 16
+    """agents of each objective"""
+    adversaries: tuple[Path, ...] = ()
+    """learned objectives' files"""
+    held_out: tuple[Path, ...] = ()
+    """files of objectives that confirm alone"""
+    skip_confirmation: bool = False
+
+
+def command_of(options: Options) -> str:
+    """The command line without where it writes: what is measured does not depend on that."""
+    flags = ["python -m experiments.alignment"]
+    if options.agents != Options.agents:
+        flags.append(f"--agents {options.agents}")
+    for flag, files in (("--adversaries", options.adversaries), ("--held-out", options.held_out)):
+        flags += [flag, *map(str, files)] if files else []
+    return " ".join(flags + ["--skip-confirmation"] * options.skip_confirmation)
+
+
+def measure(options: Options, report: dict[str, Any], save: Save) -> None:
+    """A stage at a time."""
 
     def named(path: Path) -> Objective:
         return replace(load_objective(path), name=run_name(path))
@@ -209,21 +197,17 @@ def main() -> int:
     family = [
         *known_drifts(),
         *map(load_objective, OF_THE_ZOO),
-        *map(named, arguments.adversaries),
+        *map(named, options.adversaries),
     ]
-    held_out = [*other_drifts(), *map(named, arguments.held_out)]
+    held_out = [*other_drifts(), *map(named, options.held_out)]
     for objective in held_out:
         twins = [member.name for member in family if same_drift(objective, member)]
         if twins:
             raise UserError(
                 f"{objective.name} is to be held out, and the family has it as {twins[0]}: leave it out of --held-out."
             )
-    report: dict[str, Any] = {
-        "command": " ".join(["python -m experiments.alignment", *measuring(sys.argv[1:])]),
-        "stages": {},
-    }
-    if arguments.out.exists():
-        report["stages"] = json.loads(arguments.out.read_text())["stages"]
+    report["command"] = command_of(options)
+    report.setdefault("stages", {})
 
     def stage(
         name: str,
@@ -237,30 +221,27 @@ def main() -> int:
     ) -> None:
         def keep(measured: dict[str, Any]) -> None:
             report["stages"][name] = {"role": role, **measured}
-            write_json(arguments.out, report)
+            save()
 
         stored = report["stages"].get(name, {})
         measure_alignment(
             regimes,
             objectives,
             environment,
-            list(range(seed, seed + arguments.agents)),
+            list(range(seed, seed + options.agents)),
             steps=steps,
             policy_output_scale=scale,
             tell=lambda line: print(line, flush=True),
             done={k: v for k, v in stored.items() if k != "role"},
             keep=keep,
         )
-        path = arguments.page.parent / "figures" / figure_name(name)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        plotting.save(figures.alignment_heatmap(report["stages"][name]), path)
 
     variations = [Regime(PENDULUM, **variation) for variation in VARIATIONS]
     stage("pendulum", "Pendulum-v1", "the choice", variations, FIRST_SEED)
     small = [replace(regime, policy_output_scale=0.01) for regime in variations]
     role = "the choice, last layer of the policy times 0.01"
     stage("pendulum_small_last_layer", "Pendulum-v1", role, small, FIRST_SEED, scale=0.01)
-    if not arguments.skip_confirmation:
+    if not options.skip_confirmation:
         regimes = [Regime(PENDULUM, **variation) for variation in CONFIRMED]
         role = "the confirmation, objectives that are not in the family"
         stage(HELD_OUT, "Pendulum-v1", role, regimes, CONFIRMATION_SEED, held_out)
@@ -272,9 +253,24 @@ def main() -> int:
             forget_programs()
             role = "the confirmation"
             stage(environment, environment, role, regimes, CONFIRMATION_SEED, steps=steps)
-    arguments.page.write_text(markdown(report))
-    return 0
+
+
+def draw(report: Mapping[str, Any]) -> dict[str, Figure]:
+    """A heat map a stage."""
+    found = report["stages"].items()
+    return {figure_name(name): figures.alignment_heatmap(stage) for name, stage in found}
+
+
+EXPERIMENT = Experiment(
+    name="alignment",
+    title="Which bandit regime ranks objectives as the environment does",
+    measure=measure,
+    draw=draw,
+    markdown=markdown,
+    options=Options,
+    keys=("stages",),
+)
 
 
 if __name__ == "__main__":
-    sys.exit(exit_status("alignment", main))
+    raise SystemExit(EXPERIMENT.main())

@@ -22,7 +22,6 @@ Timings are of the machine that runs them: compare the ratio. Both may use all o
 project deals its population out to them, rejax leaves that to XLA.
 """
 
-import argparse
 import json
 import subprocess
 import sys
@@ -36,12 +35,12 @@ import jax
 import numpy as np
 
 import scb
-from experiments.harness import exit_status
+from experiments.harness import Experiment, Save
 from scb.agents.spec import bandit_agent
-from scb.artefacts import flatten, machine_description, package_versions
-from scb.cli import configure_jax
+from scb.artefacts import flatten
 from scb.environments.registry import environment_spec
 from scb.environments.zoo import open_bandit, space_description
+from scb.errors import unknown_name
 from scb.evolution import map_population
 from scb.keys import named_key, root_key, split_key
 from scb.statistics import Estimate, estimate
@@ -85,7 +84,6 @@ def measure_this_project(task: Task, steps: int) -> dict[str, list[float]]:
 
     Runs in a process of its own.
     """
-    configure_jax()
 
     bandit = bandit_of(task)
     params = bandit.default_params
@@ -249,53 +247,46 @@ def line(*cells: str) -> str:
     return "".join(cell.ljust(width) for cell, width in zip(cells, widths, strict=True)).rstrip()
 
 
-def main() -> int:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument(
-        "--rejax-python", type=Path, help="python of an environment with rejax 0.1.3, gymnax 0.0.9"
-    )
-    parser.add_argument(
-        "--algorithms", default=",".join(TASKS), help="some of them, comma-separated: %(default)s"
-    )
-    parser.add_argument("--out", type=Path, default=Path("runs/benchmark.json"))
-    parser.add_argument("--steps", type=int, default=STEPS, help=argparse.SUPPRESS)
-    parser.add_argument("--only-this", choices=TASKS, help=argparse.SUPPRESS)
-    arguments = parser.parse_args()
-    if arguments.only_this:
-        print(json.dumps(measure_this_project(TASKS[arguments.only_this], arguments.steps)))
-        return 0
-    names = arguments.algorithms.split(",")
-    if unknown := [name for name in names if name not in TASKS]:
-        parser.error(f"unknown algorithm {', '.join(unknown)}: choose from {', '.join(TASKS)}.")
+@dataclass(frozen=True)
+class Options:
+    """What is timed."""
 
-    arguments.out.parent.mkdir(parents=True, exist_ok=True)
-    print(f"Training for {arguments.steps} steps in the bandit; median seconds an agent.")
+    rejax_python: Path | None = None
+    """python of an environment with rejax 0.1.3, gymnax 0.0.9"""
+    algorithms: str = ",".join(TASKS)
+    """some of them, comma-separated"""
+    steps: int = STEPS
+
+
+def measure(options: Options, report: dict[str, Any], save: Save) -> None:
+    """An algorithm at a time, here and there."""
+    names = options.algorithms.split(",")
+    for name in names:
+        if name not in TASKS:
+            raise unknown_name("algorithm", name, list(TASKS))
+    print(f"Training for {options.steps} steps in the bandit; median seconds an agent.")
     print(f"Return in the real environment: IQM [95 %] of agents, {EPISODES} episodes each.\n")
     print(line("algorithm", THIS, PEER, "ratio", f"return, {THIS}", f"return, {PEER}"), flush=True)
     results: dict[str, Any] = {}
     for name in names:
-        this = [sys.executable, "-m", "experiments.benchmark", "--only-this", name]
-        measured = {THIS: _json_of([*this, "--steps", str(arguments.steps)])}
-        if arguments.rejax_python is not None:
+        own = f"from experiments import benchmark; benchmark.print_measured({name!r}, {options.steps})"
+        measured = {THIS: _json_of([sys.executable, "-c", own])}
+        if options.rejax_python is not None:
             with tempfile.TemporaryDirectory() as folder:
-                job = write_rejax_job(Path(folder), TASKS[name], arguments.steps)
-                peer = [str(arguments.rejax_python), str(PEER_SCRIPT), str(job)]
+                job = write_rejax_job(Path(folder), TASKS[name], options.steps)
+                peer = [str(options.rejax_python), str(PEER_SCRIPT), str(job)]
                 measured[PEER] = _json_of(peer)
         results[name] = summary(TASKS[name], measured)
         print(row(name, results[name]), flush=True)
-    if arguments.rejax_python is None:
+    if options.rejax_python is None:
         print("\nrejax was not measured: `make bench` does that.")
-    report = {
-        "steps": arguments.steps,
-        "episodes": EPISODES,
-        "versions": package_versions(),
-        "machine": machine_description(),
-        "algorithms": results,
-    }
-    arguments.out.write_text(json.dumps(report, indent=2) + "\n")
-    return 0
+    report |= {"steps": options.steps, "episodes": EPISODES, "algorithms": results}
+    save()
+
+
+def print_measured(name: str, steps: int) -> None:
+    """What a process of its own does."""
+    print(json.dumps(measure_this_project(TASKS[name], steps)))
 
 
 def _json_of(command: list[str]) -> dict[str, list[float]]:
@@ -303,5 +294,14 @@ def _json_of(command: list[str]) -> dict[str, list[float]]:
     return dict(json.loads(completed.stdout.strip().splitlines()[-1]))
 
 
+EXPERIMENT = Experiment(
+    name="benchmark",
+    title="Training in a bandit, this project against rejax",
+    measure=measure,
+    options=Options,
+    out=Path("runs/benchmark.json"),
+)
+
+
 if __name__ == "__main__":
-    sys.exit(exit_status("benchmark", main))
+    raise SystemExit(EXPERIMENT.main())

@@ -85,7 +85,6 @@ def facts(report: Report) -> dict[str, Any]:
 
 def draw(report: Mapping[str, Any]) -> Figure:
     """Left the curricula, right what the search distribution's mean is worth."""
-
     looks = (
         (plotting.BLACK, "-"),
         (plotting.BLUE, "--"),

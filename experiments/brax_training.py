@@ -138,7 +138,6 @@ def _curves(
     plan: Mapping[str, Any],
 ) -> dict[str, Any]:
     """{"steps": [P + 1], "returns": [N, P + 1], "seconds"}: `number` agents, most likely actions."""
-
     every, iterations = evaluation_steps(agent.config.num_iterations, plan["points"])
     # Evaluations are evenly spaced, for which a few iterations may be added at the end.
     steps = agent.config.steps_after(iterations)
@@ -285,7 +284,6 @@ def _paper(environment: str, algorithm: str) -> float | None:
 
 def draw(report: Mapping[str, Any]) -> Figure:
     """A row a bandit, a column an algorithm; steps on a logarithmic axis."""
-
     algorithms = list(next(iter(report["bandits"].values())))
     figure = Figure(figsize=(3.1 * len(algorithms), 2.9 * len(report["bandits"]) + 0.4))
     panels: Any = figure.subplots(

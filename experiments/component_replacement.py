@@ -201,7 +201,6 @@ def facts(report: Report) -> dict[str, Any]:
 
 def draw(report: Mapping[str, Any]) -> Figure:
     """A line a combination: the score with its interval, each expert a dot."""
-
     number = len(report["experts"])
     figure = Figure(figsize=(plotting.WIDTH, 3.6))
     axes = figure.subplots()

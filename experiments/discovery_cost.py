@@ -8,21 +8,20 @@ environment steps, and tabled with what it took to reach the environment's targe
 computed anew. `--only-render` makes table and figure from the JSON.
 """
 
-import argparse
 import json
-import sys
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import tyro
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import EngFormatter, MaxNLocator
 
-from experiments.harness import exit_status, read
+from experiments.harness import Experiment, Save
 from experiments.zoo_table_page import ENVIRONMENTS, TARGETS, label
 from scb import plotting
-from scb.cli import configure_jax
 from scb.discovery import DiscoveryConfig
 from scb.environments.registry import environment_spec
 from scb.errors import UserError
@@ -295,7 +294,6 @@ def _count(steps: float) -> str:
 
 def figure(report: Mapping[str, Any]) -> Figure:
     """A row an environment: the mean's return against minutes (left) and environment steps (right)."""
-
     runs = report["runs"]
     environments = list(dict.fromkeys(run["environment"] for run in runs))
     looks = {
@@ -360,49 +358,32 @@ def figure(report: Mapping[str, Any]) -> Figure:
     return drawn
 
 
-def render(report: Mapping[str, Any], docs: Path) -> None:
-    """Writes docs/discovery_cost.md and docs/figures/discovery_cost.png."""
-    docs.mkdir(parents=True, exist_ok=True)
-    (docs / "discovery_cost.md").write_text(markdown(report))
-    plotting.save(figure(report), docs / "figures" / "discovery_cost.png")
+@dataclass(frozen=True)
+class Options:
+    """What is read."""
+
+    folders: tyro.conf.Positional[tuple[Path, ...]] = ()
+    """run folders of scb discover"""
 
 
-def write_report(path: Path, report: Mapping[str, Any]) -> None:
-    """Writes the JSON with every point on a line of its own."""
-    points = {f"@{i}@": run["points"] for i, run in enumerate(report["runs"])}
-    runs = [{**run, "points": f"@{i}@"} for i, run in enumerate(report["runs"])]
-    text = json.dumps({**report, "runs": runs}, indent=2)
-    for name, rows in points.items():
-        body = ",\n        ".join(json.dumps(row) for row in rows)
-        text = text.replace(f'"{name}"', f"[\n        {body}\n      ]")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(text + "\n")
+def measure(options: Options, report: dict[str, Any], save: Save) -> None:
+    """Everything anew: nothing is computed here."""
+    report |= collect(options.folders)
+    for left in report["left_out"]:
+        print(f"left out: {left['name']}, since {left['why']}")
+    save()
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("folders", type=Path, nargs="*", help="run folders of scb discover")
-    parser.add_argument("--out", type=Path, default=Path("docs/data/discovery_cost.json"))
-    parser.add_argument(
-        "--docs", type=Path, default=Path("docs"), help="for the table and the figure"
-    )
-    parser.add_argument("--only-render", action="store_true", help="read the JSON, not the runs")
-    arguments = parser.parse_args(argv)
-    configure_jax()
-
-    def collect_and_render() -> int:
-        if not arguments.only_render:
-            report = collect(arguments.folders)
-            write_report(arguments.out, report)
-            for left in report["left_out"]:
-                print(f"left out: {left['name']}, since {left['why']}")
-        render(read(arguments.out), arguments.docs)
-        return 0
-
-    return exit_status("discovery_cost", collect_and_render)
+EXPERIMENT = Experiment(
+    name="discovery_cost",
+    title="What discovering a bandit costs",
+    measure=measure,
+    draw=figure,
+    markdown=markdown,
+    options=Options,
+    keys=("runs",),
+)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    raise SystemExit(EXPERIMENT.main())

@@ -93,7 +93,6 @@ def returns_and_lengths(
     Returns:
       ([N] mean returns in the environment with most likely actions, [N, E] steps of episodes in the synthetic one).
     """
-
     key_draw, key_agents = split_key(key)
 
     def one(hyperparameters: Any, key: Any, weights: Any) -> Any:
@@ -191,7 +190,6 @@ def facts(report: Report) -> dict[str, Any]:
 
 def draw(report: Mapping[str, Any]) -> Figure:
     """Left: lengths, a stacked bar an environment. Right: score against the limit."""
-
     colors = colormaps["viridis"](np.linspace(0.0, 0.95, len(BINS)))
     looks = (
         (plotting.BLUE, "o", "-"),

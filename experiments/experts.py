@@ -33,7 +33,6 @@ REASON = "near-optimal is not equal: a twentieth of the way from random actions 
 
 def train(environment: str, number: int, episodes: int) -> tuple[SACExpert, Any, Any]:
     """(the best of `number` agents on `episodes` episodes, the environment, its parameters)."""
-
     env, env_params = scb.make(environment)
     key = root_key(ILLUSTRATING.start)
     return train_sac_expert(environment, env, env_params, key, number, episodes), env, env_params
@@ -41,7 +40,6 @@ def train(environment: str, number: int, episodes: int) -> tuple[SACExpert, Any,
 
 def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None:
     """An environment at a time."""
-
     found = report.setdefault("environments", {})
     for environment in plan["environments"]:
         if environment in found:
@@ -92,7 +90,6 @@ def facts(report: Report) -> dict[str, Any]:
 
 def draw(report: Mapping[str, Any]) -> Figure:
     """A panel an environment: ours with each evaluation a dot, and the paper's interval."""
-
     figure = Figure(figsize=(plotting.WIDTH, 1.1 * len(report["environments"]) + 0.6))
     panels = figure.subplots(len(report["environments"]), 1, squeeze=False)[:, 0]
     for axes, (name, entry) in zip(panels, report["environments"].items(), strict=True):

@@ -150,7 +150,6 @@ class _Trainer:
 
     def returns(self, agent: str) -> np.ndarray:
         """[N] mean returns of agents of one kind, most likely actions."""
-
         key = root_key(REPORTING.start)
         if agent == OPTIMAL:
             return self._optimal(key)
@@ -211,7 +210,6 @@ def in_environment(config: NeuroevolutionConfig, limit: int) -> NeuroevolutionCo
 
 def with_network(spec: AgentSpec, network: str) -> AgentSpec:
     """The same algorithm with one of the networks that no search saw, or with its own."""
-
     changes: dict[str, dict[str, Any]] = {
         "": {},
         WIDE: {"hidden_sizes": (512,)},
@@ -299,7 +297,6 @@ def facts(report: Report) -> dict[str, Any]:
 
 def draw(report: Mapping[str, Any]) -> Figure:
     """A panel an environment; right of the dashed line what the paper's inner loop does not have."""
-
     looks = (
         (plotting.BLUE, "o"),
         (plotting.SKY_BLUE, "s"),

@@ -11,7 +11,7 @@ import json
 import sys
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, make_dataclass
+from dataclasses import asdict, dataclass, field, make_dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -24,7 +24,6 @@ from experiments import claims, rendering
 from experiments.claims import Claim, Judged
 from scb import plotting
 from scb.artefacts import machine_description, package_versions
-from scb.cli import configure_jax
 from scb.environments.registry import families
 from scb.errors import UserError
 from scb.runs import make_folder, write_json
@@ -77,6 +76,9 @@ class Experiment:
       options: a data class whose fields are its flags.
       keys: what a report holds at least.
       out: the report's place, where it is not docs/data/NAME.json.
+      reports: whether it has a report; a tool has none.
+      markdown: report -> the page, where no template makes it.
+      dpi: of the figures.
     """
 
     name: str
@@ -94,6 +96,9 @@ class Experiment:
     options: type = Preset
     keys: Sequence[str] = ()
     out: Path | None = None
+    reports: bool = True
+    markdown: Callable[[Report], str] | None = None
+    dpi: int = plotting.DPI
 
     def judged(self, report: Report) -> list[Judged]:
         """What becomes of each part of the claim."""
@@ -113,6 +118,8 @@ class Experiment:
 
     def page(self, report: Report) -> str:
         """The page in Markdown."""
+        if self.markdown is not None:
+            return self.markdown(report)
         return rendering.template(self.name).render(self.context(report))
 
     def block(self, part: str, report: Report) -> str:
@@ -131,7 +138,10 @@ class Experiment:
         Returns:
           The exit status: 2 where the user asked for what cannot be, with one sentence on stderr.
         """
-        parts = [("files", Files, Files()), ("options", self.options, self.options())]
+        parts: list[tuple[str, Any] | tuple[str, Any, Any]] = [
+            ("options", self.options),
+            ("files", Files, field(default=Files())),
+        ]
         arguments: Any = tyro.cli(
             make_dataclass("Flags", parts),
             config=(tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff),
@@ -139,7 +149,6 @@ class Experiment:
             prog=f"python -m experiments.{self.name}",
             description=self.description(),
         )
-        configure_jax()
         return exit_status(self.name, lambda: self.run(arguments.options, arguments.files))
 
     def description(self) -> str:
@@ -150,12 +159,17 @@ class Experiment:
 
     def run(self, options: Any, files: Files) -> int:
         """Measures what is missing, and writes page and figure."""
+        if not self.reports:
+            self.measure(options, {}, lambda: None)
+            return 0
         out = files.out or self.out or DATA / f"{self.name}.json"
         # What is measured elsewhere leaves the documentation's page as it is.
         docs = files.docs or (DOCS if files.out is None else out.parent)
         make_folder(docs, "--docs")
         report = read(out, missing_is_new=not files.only_render, keys=self.keys)
-        if report and report.get("experiment", None if self.presets else self.name) != self.name:
+        # Studies of before November 2026 do not say what they are; they lack a key of another's.
+        unnamed = None if self.presets and not self.keys else self.name
+        if report and report.get("experiment", unnamed) != self.name:
             raise UserError(f"{out} is no report of {self.name}: choose another --out.")
         if not files.only_render:
             make_folder(out.parent)
@@ -205,10 +219,10 @@ class Experiment:
                 f"the report of {self.name} is not complete: run python -m experiments.{self.name} "
                 f"--preset {report.get('preset', 'quick')}, which goes on where it was."
             )
-        if rendering.has_template(self.name):
+        if self.markdown is not None or rendering.has_template(self.name):
             (docs / f"{self.name}.md").write_text(self.page(report))
         for name, figure in self.figures(report).items():
-            plotting.save(figure, docs / "figures" / f"{name}.png")
+            plotting.save(figure, docs / "figures" / f"{name}.png", self.dpi)
         if self.extras is not None:
             self.extras(report, docs)
 

@@ -152,7 +152,6 @@ def facts(report: Report) -> dict[str, Any]:
 
 def draw(report: Mapping[str, Any]) -> Figure:
     """Best actions above, importance below, a column an environment."""
-
     figure = Figure(figsize=(15.0, 6.0))
     panels: Any = figure.subplots(2, len(CLASSIC_CONTROL), height_ratios=[1.6, 1.0])
     for column, (name, found) in enumerate(report["environments"].items()):

@@ -189,7 +189,6 @@ def claims(report: Report) -> list[Claim]:
 
 def draw(report: Mapping[str, Any]) -> Figure:
     """The share of MDPs where every optimum of the bandit is optimal."""
-
     found = report["regrets"]
     palette = (plotting.VERMILLION, plotting.BLUE, plotting.GREEN, plotting.GREY)
     colors = dict(zip(CONTEXTS, palette, strict=True))

@@ -197,7 +197,6 @@ def markdown(report: Mapping[str, Any]) -> str:
 
 def draw(report: Mapping[str, Any]) -> Figure:
     """(i) over generations, (ii) over steps and minutes; (iii) Pendulum; (iv) Hopper."""
-
     looks = {
         "bandit": plotting.Look(plotting.VERMILLION, "-", "o"),
         "environment": plotting.Look(plotting.PURPLE, "--", "D"),

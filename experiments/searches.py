@@ -68,7 +68,6 @@ def curriculum_of(environment: str, shape: str, generations: int) -> CurriculumC
     Raises:
       UserError: the paper has no curriculum for the environment.
     """
-
     if shape == NONE:
         return None
     curriculum = paper_curriculum(environment, generations)

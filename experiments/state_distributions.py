@@ -179,7 +179,6 @@ def facts(report: Report) -> dict[str, Any]:
 
 def draw(report: Mapping[str, Any]) -> Figure:
     """A column an environment: the expert above, the bandit below."""
-
     figure = Figure(figsize=(3.0 * len(report["environments"]), 6.2))
     panels: Any = figure.subplots(2, len(report["environments"]), squeeze=False)
     for column, (name, entry) in enumerate(report["environments"].items()):

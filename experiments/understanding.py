@@ -13,31 +13,27 @@ numbers. Learned drifts that were written down as formulas join it with what the
 What the file of numbers holds of formulas and comparisons is kept where they aren't given again.
 """
 
-import argparse
 import json
-import sys
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 
-from experiments.harness import exit_status
+from experiments.harness import Experiment, Save
 from lpo import drift_figures
 from lpo.drifts import ClosedFormDrift
 from lpo.objectives import load_objective, zoo_names
 from lpo.update_regions import REGIONS, analyze
-from scb import plotting
-from scb.artefacts import package_versions
-from scb.cli import configure_jax
 from scb.errors import UserError
-from scb.runs import write_json
 from scb.statistics import paired_difference
 
 PROGRESS = (0.0, 0.5, 1.0)
 
 
-def measure(names: Sequence[str]) -> list[dict[str, Any]]:
+def analyses(names: Sequence[str]) -> list[dict[str, Any]]:
     """The analyses of these objectives, temporal ones at every fraction of `PROGRESS`."""
     rows = []
     for objective in map(load_objective, names):
@@ -264,48 +260,48 @@ def _stop(ratio: float | None) -> str:
     return "never" if ratio is None else f"{ratio:.2f}"
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--objectives", nargs="+", help="ppo, dpo and the zoo if left out")
-    parser.add_argument("--formulas", type=Path, nargs="*", help="of lpo distill")
-    parser.add_argument("--comparisons", type=Path, nargs="*", help="of lpo evaluate")
-    parser.add_argument("--docs", type=Path, default=Path("docs"))
-    arguments = parser.parse_args(argv)
-    configure_jax()
+@dataclass(frozen=True)
+class Options:
+    """What is analysed, and what of elsewhere joins it."""
 
-    out = arguments.docs / "data" / "understanding.json"
+    objectives: tuple[str, ...] = ()
+    """ppo, dpo and the zoo if left out"""
+    formulas: tuple[Path, ...] | None = None
+    """of lpo distill"""
+    comparisons: tuple[Path, ...] | None = None
+    """of lpo evaluate"""
 
-    def measure_and_render() -> int:
-        kept = json.loads(out.read_text()) if out.exists() else {}
-        names = arguments.objectives or ["ppo", "dpo", *zoo_names()]
-        comparisons = arguments.comparisons
-        formulas = (
-            kept.get("formulas", [])
-            if arguments.formulas is None
-            else [read_formula(path) for path in arguments.formulas]
-        )
-        report = {
-            "versions": package_versions(),
-            "analyses": measure(names),
-            "formulas": formulas,
-            "comparisons": kept.get("comparisons", [])
-            if comparisons is None
-            else [read_comparison(path, formulas) for path in comparisons],
-        }
-        figure = drift_figures.drift_and_gradient(
-            [load_objective(name) for name in names], PROGRESS
-        )
-        out.parent.mkdir(parents=True, exist_ok=True)
-        write_json(out, report)
-        (arguments.docs / "understanding.md").write_text(markdown(report))
-        # Half the usual resolution: it is a tall figure of smooth maps, which compress badly.
-        plotting.save(figure, arguments.docs / "figures" / "understanding.png", dpi=100)
-        return 0
 
-    return exit_status("understanding", measure_and_render)
+def measure(options: Options, report: dict[str, Any], save: Save) -> None:
+    """The analyses anew; formulas and comparisons where they are given."""
+    report["analyses"] = analyses(options.objectives or ["ppo", "dpo", *zoo_names()])
+    if options.formulas is not None:
+        report["formulas"] = [read_formula(path) for path in options.formulas]
+    formulas = report.setdefault("formulas", [])
+    if options.comparisons is not None:
+        report["comparisons"] = [read_comparison(path, formulas) for path in options.comparisons]
+    report.setdefault("comparisons", [])
+    save()
+
+
+def draw(report: Mapping[str, Any]) -> Figure:
+    """Drift and gradient of every objective."""
+    names = dict.fromkeys(row["objective"] for row in report["analyses"])
+    return drift_figures.drift_and_gradient([load_objective(name) for name in names], PROGRESS)
+
+
+EXPERIMENT = Experiment(
+    name="understanding",
+    title="What the drifts do to an update",
+    measure=measure,
+    draw=draw,
+    markdown=markdown,
+    options=Options,
+    # Half the usual resolution: it is a tall figure of smooth maps, which compress badly.
+    dpi=100,
+    keys=("analyses",),
+)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    raise SystemExit(EXPERIMENT.main())

@@ -135,7 +135,6 @@ def facts(report: Report) -> dict[str, Any]:
 
 def draw(report: Mapping[str, Any]) -> Figure:
     """A film strip: a row an environment, from the first step to the last."""
-
     films = {n: e for n, e in report["environments"].items() if "film" in e}
     figure = Figure(figsize=(plotting.WIDTH, 1.6 * len(films)))
     panels: Any = figure.subplots(len(films), FRAMES, squeeze=False)

@@ -9,25 +9,20 @@ the environment itself says which construction trains best. No evolution is invo
 that --out holds already are kept, so that they can be measured one at a time.
 """
 
-import argparse
-import json
-import sys
 import time
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from experiments.harness import exit_status
+from experiments.harness import Experiment, Save
 from scb import make
 from scb.agents.spec import algorithms_for, bandit_agent
-from scb.artefacts import machine_description, package_versions
-from scb.cli import configure_jax
 from scb.discovery import SyntheticTraining, judge
 from scb.environments.synthetic import BanditConfig, bandit_for
 from scb.keys import root_key, split_key
-from scb.runs import write_json
 from scb.statistics import estimate
 from scb.warm_start import WarmStartConfig, expert_dataset, find_expert, fit_bandit
 
@@ -63,31 +58,22 @@ def markdown(report: Mapping[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def main() -> int:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--environment", nargs="+", default=["MountainCar-v0"])
-    parser.add_argument(
-        "--algorithms", nargs="*", help="the paper's for the action space if left out"
-    )
-    parser.add_argument("--agents", type=int, default=16)
-    parser.add_argument("--episodes", type=int, default=20)
-    parser.add_argument("--out", type=Path, default=Path("runs/warm_start.json"))
-    arguments = parser.parse_args()
-    configure_jax()
+@dataclass(frozen=True)
+class Options:
+    """What is fitted, and how it is judged."""
 
-    report: dict[str, Any] = {
-        "seed": SEED,
-        "agents": arguments.agents,
-        "episodes": arguments.episodes,
-        "versions": package_versions(),
-        "machine": machine_description(),
-        "environments": {},
-    }
-    if arguments.out.exists():
-        report["environments"] = json.loads(arguments.out.read_text())["environments"]
-    for name in arguments.environment:
+    environment: tuple[str, ...] = ("MountainCar-v0",)
+    algorithms: tuple[str, ...] = ()
+    """the paper's for the action space if left out"""
+    agents: int = 16
+    episodes: int = 20
+
+
+def measure(options: Options, report: dict[str, Any], save: Save) -> None:
+    """An environment at a time."""
+    report |= {"seed": SEED, "agents": options.agents, "episodes": options.episodes}
+    report.setdefault("environments", {})
+    for name in options.environment:
         env, env_params = make(name)
         space = env.action_space(env_params)
         key_expert, key_data, key_fit = split_key(root_key(SEED), 3)
@@ -110,7 +96,7 @@ def main() -> int:
                 env_params,
                 bandit_agent(algorithm, name),
             )
-            for algorithm in arguments.algorithms or algorithms_for(space)
+            for algorithm in options.algorithms or algorithms_for(space)
         }
         for arm, fields in ARMS.items():
             config = WarmStartConfig(**fields)
@@ -120,7 +106,7 @@ def main() -> int:
             weights, fit = fit_bandit(bandit, dataset, key_fit, config)
             row: dict[str, Any] = {"fit": fit, "fit_seconds": round(time.perf_counter() - start, 1)}
             for algorithm, training in trainings.items():
-                returns = judge(training, weights, SEED, arguments.agents, arguments.episodes)
+                returns = judge(training, weights, SEED, options.agents, options.episodes)
                 row[algorithm] = {
                     actions: {
                         "iqm": estimate(x).as_dict(),
@@ -132,11 +118,18 @@ def main() -> int:
                 print(f"{name} | {arm} | {algorithm} | {both}", flush=True)
             result["returns"][arm] = row
         report["environments"][name] = result
-        arguments.out.parent.mkdir(parents=True, exist_ok=True)
-        write_json(arguments.out, report)
+        save()
     print(markdown(report))
-    return 0
+
+
+EXPERIMENT = Experiment(
+    name="warm_start",
+    title="Which bandit fitted to an expert trains best",
+    measure=measure,
+    options=Options,
+    out=Path("runs/warm_start.json"),
+)
 
 
 if __name__ == "__main__":
-    sys.exit(exit_status("warm_start", main))
+    raise SystemExit(EXPERIMENT.main())

@@ -7,14 +7,15 @@ measured at its end; nothing is edited by hand. A new bandit enters with what it
 measures the zoo, and the same command again fills the table's results in.
 """
 
-import argparse
 import json
-import sys
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from experiments.harness import exit_status
+import tyro
+
+from experiments.harness import Experiment, Save
 from scb.environments.zoo import bandit_metadata, load_bandit, save_bandit
 
 
@@ -40,17 +41,20 @@ def results_of(table: Mapping[str, Any], sha256: str, backend: str | None = None
     return results
 
 
-def main() -> int:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("bandits", type=Path, nargs="+", help="files that scb discover wrote")
-    parser.add_argument("--table", type=Path, default=Path("docs/data/zoo_table.json"))
-    parser.add_argument("--folder", type=Path, default=Path("scb/zoo"))
-    arguments = parser.parse_args()
+@dataclass(frozen=True)
+class Options:
+    """Which bandits, and from where to where."""
 
-    table = json.loads(arguments.table.read_text()) if arguments.table.exists() else {}
-    for path in arguments.bandits:
+    bandits: tyro.conf.Positional[tuple[Path, ...]]
+    """files that scb discover wrote"""
+    table: Path = Path("docs/data/zoo_table.json")
+    folder: Path = Path("scb/zoo")
+
+
+def measure(options: Options, report: dict[str, Any], save: Save) -> None:
+    """Writes the entries."""
+    table = json.loads(options.table.read_text()) if options.table.exists() else {}
+    for path in options.bandits:
         bandit = load_bandit(path)
         metadata = dict(bandit_metadata(str(path)))
         # The weights' bytes decide the checksum, so that it stays the same in every folder.
@@ -59,11 +63,19 @@ def main() -> int:
         for own in ("schema_version", "name", "versions", "sha256", "kind"):
             metadata.pop(own)
         weights = bandit.default_params.weights
-        written = save_bandit(arguments.folder / path.name, bandit, weights, metadata)
+        written = save_bandit(options.folder / path.name, bandit, weights, metadata)
         measured = ", ".join(metadata["results"]) or "nothing yet"
         print(f"{written}: measured {measured}")
-    return 0
+
+
+EXPERIMENT = Experiment(
+    name="zoo_bandit",
+    title="Discovered bandits into the zoo",
+    measure=measure,
+    options=Options,
+    reports=False,
+)
 
 
 if __name__ == "__main__":
-    sys.exit(exit_status("zoo_bandit", main))
+    raise SystemExit(EXPERIMENT.main())

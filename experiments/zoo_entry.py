@@ -5,14 +5,15 @@
 The comparisons are what `lpo evaluate --out` wrote for that objective; nothing is edited by hand.
 """
 
-import argparse
 import json
-import sys
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from experiments.harness import exit_status, run_name
+import tyro
+
+from experiments.harness import Experiment, Save, run_name
 from lpo.objectives import load_objective, save_objective
 from scb.errors import UserError
 
@@ -27,24 +28,27 @@ def _short(name: str, file: Path, zoo_name: str) -> str:
     return run_name(path)
 
 
-def main() -> int:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("objective", type=Path)
-    parser.add_argument("name")
-    parser.add_argument("--comparisons", type=Path, nargs="*", default=[])
-    parser.add_argument("--folder", type=Path, default=Path("lpo/zoo"))
-    arguments = parser.parse_args()
+@dataclass(frozen=True)
+class Options:
+    """Which objective, by what name, and what it was measured to be worth."""
 
-    objective = load_objective(arguments.objective)
+    objective: tyro.conf.Positional[Path]
+    name: tyro.conf.Positional[str]
+    comparisons: tuple[Path, ...] = ()
+    """comparison.json of lpo evaluate"""
+    folder: Path = Path("lpo/zoo")
+
+
+def measure(options: Options, report: dict[str, Any], save: Save) -> None:
+    """Writes the entry."""
+    objective = load_objective(options.objective)
     if not objective.drift.learned:
         raise UserError(f"{objective.name} is a closed form: the zoo holds learned objectives.")
     metadata: dict[str, Any] = dict(objective.metadata)
     results = dict(metadata["results"])
-    short = partial(_short, file=arguments.objective, zoo_name=arguments.name)
+    short = partial(_short, file=options.objective, zoo_name=options.name)
     reporting_seeds = {}
-    for path in arguments.comparisons:
+    for path in options.comparisons:
         comparison = json.loads(path.read_text())
         curves = comparison["curves"]
         environment = curves[0]["environment"]
@@ -69,11 +73,19 @@ def main() -> int:
     for own in ("schema_version", "name", "versions", "sha256", "kind", "certificate"):
         metadata.pop(own, None)
     path, certificate = save_objective(
-        arguments.folder / f"{arguments.name}.npz", objective.drift, objective.parameters, metadata
+        options.folder / f"{options.name}.npz", objective.drift, objective.parameters, metadata
     )
     print(f"{path}: {certificate}")
-    return 0
+
+
+EXPERIMENT = Experiment(
+    name="zoo_entry",
+    title="A learned objective into the zoo",
+    measure=measure,
+    options=Options,
+    reports=False,
+)
 
 
 if __name__ == "__main__":
-    sys.exit(exit_status("zoo_entry", main))
+    raise SystemExit(EXPERIMENT.main())

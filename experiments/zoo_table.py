@@ -13,9 +13,7 @@ the same command continues an interrupted one. The table and the figure are made
 `--only-render` does nothing but that.
 """
 
-import argparse
 import hashlib
-import sys
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -24,31 +22,27 @@ from typing import Any
 
 import numpy as np
 
-from experiments.harness import exit_status, read
+from experiments.harness import Experiment, Save
 from experiments.zoo_table_page import (
     ACTIONS,
     BANDITS,
     TARGETS,
     cell,
     environment_rank,
+    figure,
+    markdown,
     pairs,
     place,
-    render,
 )
 from scb.agents.spec import algorithms_for, bandit_agent
-from scb.artefacts import machine_description, package_versions
-from scb.cli import configure_jax
 from scb.discovery import SyntheticTraining, check_fits, judge
 from scb.environments.registry import environment_spec
 from scb.environments.synthetic import BanditConfig, SyntheticBandit
 from scb.environments.zoo import bandit_metadata, open_bandit, zoo_names
 from scb.errors import UserError
 from scb.importer import PUBLISHED_BANDITS, published_bandit
-from scb.runs import write_json
 from scb.seeds import REPORTING
 from scb.statistics import estimate, paired_difference
-
-DEFAULT_PUBLISHED = Path("../shared/published_scbs")
 
 
 @dataclass(frozen=True)
@@ -141,14 +135,13 @@ def arrays_digest(path: Path) -> str:
     return digest.hexdigest()
 
 
-def measure(
-    found: Iterable[Candidate], protocol: Protocol, report: dict[str, Any], out: Path
+def measure_bandits(
+    found: Iterable[Candidate], protocol: Protocol, report: dict[str, Any], save: Save
 ) -> None:
     """Fills `report["entries"]` with every algorithm's returns in every bandit, writing it after each.
 
     An entry that is there already, of the same bandit under the same protocol, stays as it is.
     """
-    out.parent.mkdir(parents=True, exist_ok=True)
     entries: list[dict[str, Any]] = report.setdefault("entries", [])
     environment = ""
     # One compiled program for all bandits of an environment that differ in their weights only.
@@ -194,11 +187,11 @@ def measure(
             entries[:] = [entry for entry in entries if place(entry) != place(row)] + [row]
             entries.sort(key=place)
             report["differences"] = differences(entries)
-            write_json(out, report)
+            save()
             both = ", ".join(f"{ACTIONS[a]} {cell(row[a]['iqm'])}" for a in returns)
             print(f"{environment} | {candidate.kind} | {algorithm} | {both}", flush=True)
     report["differences"] = differences(entries)
-    write_json(out, report)
+    save()
 
 
 def _comparable(entry: Mapping[str, Any]) -> dict[str, Any]:
@@ -235,81 +228,57 @@ def differences(entries: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     return rows
 
 
-def command_text(arguments: argparse.Namespace, published: bool) -> str:
+def command_text(options: "Options") -> str:
     """The command, with no path of this machine in it."""
     parts = ["python -m experiments.zoo_table"]
-    if published:
+    if options.published is not None:
         parts.append("--published DIRECTORY")
-    if arguments.bandits:
-        parts.append(f"--bandits {' '.join(Path(name).name for name in arguments.bandits)}")
-    parts.append(f"--agents {arguments.agents} --episodes {arguments.episodes}")
-    if arguments.skip_brax:
+    if options.bandits:
+        parts.append(f"--bandits {' '.join(Path(name).name for name in options.bandits)}")
+    parts.append(f"--agents {options.agents} --episodes {options.episodes}")
+    if options.skip_brax:
         parts.append("--skip-brax")
     else:
-        parts.append(f"--brax-episodes {arguments.brax_episodes} --backend {arguments.backend}")
+        parts.append(f"--brax-episodes {options.brax_episodes} --backend {options.backend}")
     return " ".join(parts)
 
 
-def parser() -> argparse.ArgumentParser:
-    made = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    made.add_argument(
-        "--published", type=Path, help="folder with the published bandits' .npz files"
-    )
-    made.add_argument(
-        "--bandits", nargs="+", help="zoo names or path.npz; the zoo and all published if left out"
-    )
-    made.add_argument("--agents", type=int, default=20)
-    made.add_argument("--episodes", type=int, default=50, help="of each agent in classic control")
-    made.add_argument("--brax-episodes", type=int, default=5, help="of each agent in Brax")
-    made.add_argument("--backend", default="generalized", help="Brax's physics")
-    made.add_argument("--skip-brax", action="store_true")
-    made.add_argument("--out", type=Path, default=Path("docs/data/zoo_table.json"))
-    made.add_argument(
-        "--docs", type=Path, default=Path("docs"), help="for the table and the figure"
-    )
-    made.add_argument("--only-render", action="store_true", help="measure nothing")
-    return made
+@dataclass(frozen=True)
+class Options:
+    """What is measured, and how."""
+
+    published: Path | None = None
+    """folder with the published bandits' .npz files"""
+    bandits: tuple[str, ...] = ()
+    """zoo names or path.npz; the zoo and all published if left out"""
+    agents: int = 20
+    episodes: int = 50
+    """of each agent in classic control"""
+    brax_episodes: int = 5
+    """of each agent in Brax"""
+    backend: str = "generalized"
+    """Brax's physics"""
+    skip_brax: bool = False
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    arguments = parser().parse_args(argv)
-    configure_jax()
+def measure(options: Options, report: dict[str, Any], save: Save) -> None:
+    """All bandits. Entries that are there already stay, so several commands may have made them."""
+    commands = dict.fromkeys([*report.get("commands", []), command_text(options)])
+    report |= {"commands": list(commands), "targets": TARGETS}
+    protocol = Protocol(options.agents, options.episodes, options.brax_episodes, options.backend)
+    found = candidates(options.bandits or None, options.published, options.skip_brax)
+    measure_bandits(found, protocol, report, save)
 
-    def measure_and_render() -> int:
-        if not arguments.only_render:
-            published = arguments.published
-            if published is None and DEFAULT_PUBLISHED.is_dir():
-                published = DEFAULT_PUBLISHED
-            report = read(arguments.out, missing_is_new=True)
-            entries = report.get("entries", [])
-            report = {
-                # Entries that are there already stay, so several commands may have made them.
-                "commands": list(
-                    dict.fromkeys(
-                        [
-                            *report.get("commands", []),
-                            command_text(arguments, published is not None),
-                        ]
-                    )
-                ),
-                "versions": package_versions(),
-                "machine": machine_description(),
-                "targets": TARGETS,
-                "differences": [],
-                "entries": entries,
-            }
-            protocol = Protocol(
-                arguments.agents, arguments.episodes, arguments.brax_episodes, arguments.backend
-            )
-            found = candidates(arguments.bandits, published, arguments.skip_brax)
-            measure(found, protocol, report, arguments.out)
-        render(read(arguments.out), arguments.docs)
-        return 0
 
-    return exit_status("zoo_table", measure_and_render)
+EXPERIMENT = Experiment(
+    name="zoo_table",
+    title="The bandits, by environment and algorithm",
+    measure=measure,
+    draw=figure,
+    markdown=markdown,
+    options=Options,
+)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    raise SystemExit(EXPERIMENT.main())

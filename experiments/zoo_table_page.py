@@ -3,7 +3,6 @@
 import math
 import textwrap
 from collections.abc import Iterable, Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 from matplotlib.figure import Figure
@@ -244,7 +243,6 @@ def _target_cell(environment: str, ours: Mapping[str, Any] | None) -> str:
 
 def figure(report: Mapping[str, Any]) -> Figure:
     """One panel an environment: every algorithm's interquartile mean and interval, ours and published."""
-
     entries = report["entries"]
     if not entries:
         raise UserError("nothing has been measured yet: there is no figure to draw.")
@@ -341,10 +339,3 @@ def _panel_title(environment: str, entries: Sequence[Mapping[str, Any]]) -> str:
         return environment
     episodes = " or ".join(str(n) for n in sorted({entry["episodes"] for entry in of_it}))
     return f"{environment.removesuffix(')')}, {episodes} episodes)"
-
-
-def render(report: Mapping[str, Any], docs: Path) -> None:
-    """Writes docs/zoo_table.md and docs/figures/zoo_table.png."""
-    docs.mkdir(parents=True, exist_ok=True)
-    (docs / "zoo_table.md").write_text(markdown(report))
-    plotting.save(figure(report), docs / "figures" / "zoo_table.png")

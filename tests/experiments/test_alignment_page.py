@@ -4,7 +4,6 @@ from pathlib import Path
 
 import lpo
 from experiments import alignment
-from experiments.harness import exit_status
 
 
 def stage(environment, correlations, bandit="Synthetic-Pendulum-v1"):
@@ -43,12 +42,13 @@ def test_the_recommendation_is_the_best_over_both_initialisations():
 
 
 def test_the_files_of_a_stage_have_no_spaces_in_their_names():
-    assert alignment.figure_name(alignment.HELD_OUT) == "alignment_Pendulum-v1_held_out.png"
+    assert alignment.figure_name(alignment.HELD_OUT) == "alignment_Pendulum-v1_held_out"
 
 
 def test_a_reports_command_says_what_is_measured_and_not_where_it_is_written():
-    measured = ["--agents", "8", "--held-out", "a.npz"]
-    assert alignment.measuring(["--out", "x.json", *measured, "--page", "x.md"]) == measured
+    options = alignment.Options(agents=8, held_out=(Path("a.npz"),), skip_confirmation=True)
+    command = "python -m experiments.alignment --agents 8 --held-out a.npz --skip-confirmation"
+    assert alignment.command_of(options) == command
 
 
 def test_the_committed_page_is_that_of_the_committed_report():
@@ -57,13 +57,12 @@ def test_the_committed_page_is_that_of_the_committed_report():
     assert (docs / "alignment.md").read_text() == alignment.markdown(report)
 
 
-def test_what_is_held_out_is_not_in_the_family_under_another_name(tmp_path, monkeypatch, capsys):
+def test_what_is_held_out_is_not_in_the_family_under_another_name(tmp_path, capsys):
     zoo = Path(lpo.__file__).parent / "zoo"
     for suffix in ("npz", "json"):
         shutil.copy(zoo / f"ta-lpo.{suffix}", tmp_path / f"other.{suffix}")
     out = tmp_path / "alignment.json"
     arguments = ["--held-out", str(tmp_path / "other.npz"), "--out", str(out)]
-    monkeypatch.setattr("sys.argv", ["alignment", *arguments])
-    assert exit_status("alignment", alignment.main) == 2
+    assert alignment.EXPERIMENT.main(arguments) == 2
     assert "the family has it as ta-lpo: leave it out" in capsys.readouterr().err
     assert not out.exists()

@@ -33,16 +33,13 @@ def test_a_brax_result_says_its_backend():
     assert (result["backend"], result["hyperparameters"]) == ("spring", "fixed")
 
 
-def test_a_bandit_enters_with_its_weights_unchanged(tmp_path, monkeypatch, capsys):
+def test_a_bandit_enters_with_its_weights_unchanged(tmp_path, capsys):
     source = "scb/zoo/Synthetic-CartPole-v1.npz"
     table = tmp_path / "table.json"
     sha256 = bandit_metadata("Synthetic-CartPole-v1")["sha256"]
     table.write_text(json.dumps({"entries": [entry(sha256=sha256)]}))
-    monkeypatch.setattr(
-        "sys.argv",
-        ["zoo_bandit", source, "--table", str(table), "--folder", str(tmp_path / "zoo")],
-    )
-    assert zoo_bandit.main() == 0
+    flags = ["--table", str(table), "--folder", str(tmp_path / "zoo")]
+    assert zoo_bandit.EXPERIMENT.main([source, *flags]) == 0
     assert "measured PPO" in capsys.readouterr().out
     written = bandit_metadata(str(tmp_path / "zoo" / "Synthetic-CartPole-v1.npz"))
     assert written["sha256"] == sha256

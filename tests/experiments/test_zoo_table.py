@@ -1,6 +1,7 @@
 """The table says what was measured, and nothing is measured twice."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -152,7 +153,6 @@ def tiny(tmp_path, monkeypatch):
 
     monkeypatch.setattr(zoo_table, "bandit_agent", small)
     monkeypatch.setattr(zoo_table, "algorithms_for", lambda space: ("ppo",))
-    monkeypatch.setattr(zoo_table, "DEFAULT_PUBLISHED", tmp_path / "nothing")
     arguments = ["--bandits", str(path), "--agents", "2", "--episodes", "2"]
     arguments += ["--out", str(tmp_path / "data" / "zoo_table.json"), "--docs", str(tmp_path)]
     return path, arguments, small
@@ -166,7 +166,7 @@ def zoo_key():
 
 def test_a_measurement_is_what_judging_gives_and_is_not_repeated(tiny, tmp_path, monkeypatch):
     path, arguments, small = tiny
-    assert zoo_table.main(arguments) == 0
+    assert zoo_table.EXPERIMENT.main(arguments) == 0
     stored = json.loads((tmp_path / "data" / "zoo_table.json").read_text())
     [made] = stored["entries"]
 
@@ -191,11 +191,11 @@ def test_a_measurement_is_what_judging_gives_and_is_not_repeated(tiny, tmp_path,
         return {"sampled_actions": np.ones(num_agents), "mode_actions": np.ones(num_agents)}
 
     monkeypatch.setattr(zoo_table, "judge", counted)
-    assert zoo_table.main(arguments) == 0
+    assert zoo_table.EXPERIMENT.main(arguments) == 0
     assert calls == []
     # Another number of episodes is another measurement, and takes the old one's place.
     arguments[arguments.index("--episodes") + 1] = "3"
-    assert zoo_table.main(arguments) == 0
+    assert zoo_table.EXPERIMENT.main(arguments) == 0
     assert calls == [(10_000, 2, 3)]
     stored = json.loads((tmp_path / "data" / "zoo_table.json").read_text())
     assert [e["episodes"] for e in stored["entries"]] == [3]
@@ -204,7 +204,7 @@ def test_a_measurement_is_what_judging_gives_and_is_not_repeated(tiny, tmp_path,
     bandit_weights["reward"]["Dense_1"]["bias"] += 1.0
     metadata = {"seeds": {}, "results": {}, "cost": {}, "command": "none", "config": {}}
     save_bandit(path, bandit, bandit_weights, metadata)
-    assert zoo_table.main(arguments) == 0
+    assert zoo_table.EXPERIMENT.main(arguments) == 0
     assert len(calls) == 2
 
 
@@ -212,17 +212,20 @@ def test_only_rendering_measures_nothing(tmp_path, monkeypatch):
     def forbidden(*arguments):
         raise AssertionError("measured")
 
-    monkeypatch.setattr(zoo_table, "measure", forbidden)
+    monkeypatch.setattr(zoo_table, "measure_bandits", forbidden)
     out = tmp_path / "report.json"
     out.write_text(json.dumps(PENDULUM))
     arguments = ["--only-render", "--out", str(out), "--docs", str(tmp_path)]
-    assert zoo_table.main(arguments) == 0
+    assert zoo_table.EXPERIMENT.main(arguments) == 0
     assert (tmp_path / "zoo_table.md").read_text() == zoo_table_page.markdown(PENDULUM)
 
 
 def test_rendering_without_a_report_says_to_measure_first(tmp_path, capsys):
     out = tmp_path / "report.json"
-    assert zoo_table.main(["--only-render", "--out", str(out), "--docs", str(tmp_path)]) == 2
+    assert (
+        zoo_table.EXPERIMENT.main(["--only-render", "--out", str(out), "--docs", str(tmp_path)])
+        == 2
+    )
     assert "measure first" in capsys.readouterr().err
 
 
@@ -234,6 +237,22 @@ def published_pendulum(folder):
         shapes = bandit.weight_shapes()
         np.savez(folder / f"{name}.npz", **{k: np.ones(v, np.float32) for k, v in shapes.items()})
     return folder
+
+
+def test_published_bandits_count_only_where_their_folder_is_named(tmp_path, monkeypatch):
+    # Such a folder beside the checkout changes nothing.
+    (tmp_path / "shared").mkdir()
+    published_pendulum(tmp_path / "shared" / "published_scbs")
+    (tmp_path / "checkout").mkdir()
+    monkeypatch.chdir(tmp_path / "checkout")
+    asked = []
+    monkeypatch.setattr(zoo_table, "measure_bandits", lambda found, *_: asked.append(found))
+    options = zoo_table.Options(bandits=("Synthetic-Pendulum-v1",))
+    zoo_table.measure(options, {}, lambda: None)
+    zoo_table.measure(
+        replace(options, published=tmp_path / "shared" / "published_scbs"), {}, lambda: None
+    )
+    assert [[x.kind for x in found] for found in asked] == [["ours"], ["ours", "published"]]
 
 
 def test_ours_comes_before_the_published_and_brax_last(tmp_path):

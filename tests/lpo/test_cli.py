@@ -384,7 +384,8 @@ def test_a_process_exits_with_two_and_shows_no_traceback(python):
 CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
 CONFIGURED = """
 import lpo.cli
-from experiments import page
+from experiments import __main__ as experiments
+experiments.found()  # none of them computes at import
 from scb.cli import configure_jax
 configure_jax()
 import jax
