@@ -39,7 +39,7 @@ from scb.discovery import SyntheticTraining, check_fits, judge
 from scb.environments.registry import environment_spec
 from scb.environments.synthetic import BanditConfig, SyntheticBandit
 from scb.environments.zoo import bandit_metadata, open_bandit, zoo_names
-from scb.errors import UserError
+from scb.errors import UserError, at_least
 from scb.importer import PUBLISHED_BANDITS, published_bandit
 from scb.seeds import REPORTING
 from scb.statistics import estimate, paired_difference
@@ -72,10 +72,7 @@ class Protocol:
     backend: str = "generalized"
 
     def __post_init__(self) -> None:
-
-        for name in ("agents", "episodes", "brax_episodes"):
-            if getattr(self, name) < 1:
-                raise UserError(f"{name} is {getattr(self, name)}: it must be at least 1.")
+        at_least(1, self, "agents", "episodes", "brax_episodes")
 
 
 def candidates(

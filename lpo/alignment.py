@@ -24,7 +24,7 @@ from scb.agents.ppo import PPOHyperparameters
 from scb.agents.spec import AgentSpec, environment_agent
 from scb.artefacts import machine_description, package_versions
 from scb.environments.registry import environment_spec, make
-from scb.errors import UserError
+from scb.errors import UserError, at_least
 from scb.evolution import map_population
 from scb.keys import root_key, split_key
 from scb.measurement import check_seeds, families
@@ -59,10 +59,7 @@ class Regime:
                 f"a regime asks for a bandit, and {self.bandit!r} is none: give a name such as "
                 "Synthetic-Pendulum-v1, or a bandit's file."
             )
-        for name in ("iterations", "epochs", "minibatches", "contexts"):
-            value = getattr(self, name)
-            if value is not None and value < 1:
-                raise UserError(f"{name} is {value}: it must be at least 1.")
+        at_least(1, self, "iterations", "epochs", "minibatches", "contexts")
 
     def spec(self) -> AgentSpec:
         """Of its agents: the setting's own but for what is given here."""

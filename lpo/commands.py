@@ -39,8 +39,7 @@ from scb.statistics import estimate
 def seed_list(count: int, first: int, counted: str = "seeds") -> list[int]:
     """`count` consecutive seeds; a UserError, which says what is `counted`, for none or a negative one."""
     at_least(1, **{counted: count})
-    if first < 0:
-        raise UserError(f"seed is {first}: it must be 0 or larger.")
+    at_least(0, seed=first)
     return list(range(first, first + count))
 
 

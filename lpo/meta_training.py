@@ -24,7 +24,7 @@ from scb.agents.ppo import PPOConfig, PPOHyperparameters, PPOState
 from scb.agents.spec import AgentSpec, check_lists, environment_agent
 from scb.environments.registry import environment_spec, families
 from scb.environments.spec import EnvironmentSpec, Made
-from scb.errors import UserError, unknown_name
+from scb.errors import UserError, at_least, unknown_name
 from scb.evolution import EnvironmentSteps, EvolutionConfig, Outcome, evolve
 from scb.keys import key_at, named_key, root_key, split_key
 from scb.runs import Run
@@ -125,10 +125,7 @@ class MetaTrainingConfig:
                     f"{name} is not drawn from a list: the drift is what is learned, and horizons are a setting of "
                     "their own."
                 )
-        for name in ("agents_per_candidate", "evaluation_episodes", "contexts"):
-            value = getattr(self, name)
-            if value is not None and value < 1:
-                raise UserError(f"{name} is {value}: it must be at least 1.")
+        at_least(1, self, "agents_per_candidate", "evaluation_episodes", "contexts")
         if not 0 <= self.reward_noise < math.inf:
             raise UserError(
                 f"reward_noise is {self.reward_noise}: it must be 0 or larger, and finite."

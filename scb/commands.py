@@ -30,7 +30,7 @@ from scb.environments.zoo import (
     save,
     zoo_names,
 )
-from scb.errors import UserError
+from scb.errors import at_least
 from scb.evolution import EvolutionConfig, evolve
 from scb.runs import config_dict
 from scb.seeds import VALIDATING
@@ -96,12 +96,8 @@ class Judgement:
     judge_episodes: int = 50
 
     def __post_init__(self) -> None:
-        if self.judge_agents < 0:
-            raise UserError(
-                f"judge_agents is {self.judge_agents}: give 0 for no judgement, or more."
-            )
-        if self.judge_episodes < 1:
-            raise UserError(f"judge_episodes is {self.judge_episodes}: give at least 1.")
+        at_least(0, self, "judge_agents")
+        at_least(1, self, "judge_episodes")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -229,11 +225,8 @@ def train(
       fixed_hyperparameters: the paper's underlined values instead of draws from its lists.
       sampled_actions: evaluate sampled actions rather than the most likely ones.
     """
-    for name, value in (("agents", agents), ("episodes", episodes)):
-        if value < 1:
-            raise UserError(f"{name} is {value}: give at least 1.")
-    if seed < 0:
-        raise UserError(f"seed is {seed}: it must be 0 or larger.")
+    at_least(1, agents=agents, episodes=episodes)
+    at_least(0, seed=seed)
     loaded = open_synthetic(bandit)
     target = evaluation_environment or environment_spec(bandit).evaluation_environment
     env, env_params = make(target, backend)

@@ -45,7 +45,7 @@ from scb.environments.synthetic import (
 )
 from scb.environments.synthetic_mdp import PARAMETERIZATIONS, SyntheticMDP, synthetic_for
 from scb.environments.zoo import open_bandit
-from scb.errors import UserError, unknown_name
+from scb.errors import UserError, at_least, unknown_name
 from scb.evolution import EnvironmentSteps, EvolutionConfig, Outcome, evolve, map_population
 from scb.keys import named_key, root_key, split_key
 from scb.lists import read_lists, write_lists
@@ -167,9 +167,7 @@ class DiscoveryConfig:
             raise UserError(
                 f"reward_std is for bandits, and parameterization {self.parameterization} is none: leave it out."
             )
-        for name in ("agents_per_candidate", "evaluation_episodes"):
-            if getattr(self, name) < 1:
-                raise UserError(f"{name} is {getattr(self, name)}: it must be at least 1.")
+        at_least(1, self, "agents_per_candidate", "evaluation_episodes")
 
 
 class SyntheticTraining:

@@ -11,11 +11,12 @@ class UserError(Exception):
     """
 
 
-def at_least(minimum: int, **values: float | None) -> None:
-    """Raises a UserError where one of the values, told by name, is smaller; None is left alone."""
-    for name, value in values.items():
+def at_least(minimum: int, of: object = None, *names: str, **values: float | None) -> None:
+    """Raises a UserError where a value, or an attribute `of` something by these names, is smaller; None is not."""
+    for name, value in {**{name: getattr(of, name) for name in names}, **values}.items():
         if value is not None and not value >= minimum:
-            raise UserError(f"{name} is {value}: it must be at least {minimum}.")
+            allowed = f"at least {minimum}" if minimum else "0 or larger"
+            raise UserError(f"{name} is {value}: it must be {allowed}.")
 
 
 def unknown_name(kind: str, name: str, known: Iterable[str]) -> UserError:

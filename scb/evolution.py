@@ -25,7 +25,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, Ti
 from scipy.stats import rankdata
 
 from scb.artefacts import machine_description
-from scb.errors import UserError, unknown_name
+from scb.errors import UserError, at_least, unknown_name
 from scb.keys import key_at, root_key, split_key
 from scb.runs import Checkpoints, Run, Stopwatch
 from scb.seeds import VALIDATING, searching
@@ -105,14 +105,8 @@ class EvolutionConfig:
             raise UserError(
                 f"population_size is {self.population_size}: Open_ES samples antithetic pairs, so it must be even."
             )
-        for field in (
-            "num_generations",
-            "mean_evaluations",
-            "evaluate_mean_every",
-            "checkpoint_every",
-        ):
-            if getattr(self, field) < 1:
-                raise UserError(f"{field} is {getattr(self, field)}: it must be at least 1.")
+        counts = ("num_generations", "mean_evaluations", "evaluate_mean_every", "checkpoint_every")
+        at_least(1, self, *counts)
         searching(self.seed)
         for field in ("sigma", "learning_rate", "sigma_decay", "learning_rate_decay"):
             if not getattr(self, field) > 0:

@@ -28,7 +28,7 @@ from scb.agents.agent import Agent
 from scb.agents.spec import AgentSpec
 from scb.artefacts import package_versions
 from scb.environments.registry import environment_spec
-from scb.errors import UserError
+from scb.errors import UserError, at_least
 from scb.evaluation import Episodes
 from scb.evolution import map_population
 from scb.keys import root_key, split_key
@@ -235,10 +235,7 @@ def measure(
     Raises:
       UserError: the rows hold such agents measured under another configuration.
     """
-    numbers = {"points": points, "episodes": episodes, "side_by_side": side_by_side}
-    for what, value in numbers.items():
-        if value is not None and value < 1:
-            raise UserError(f"{what} is {value}: it must be at least 1.")
+    at_least(1, points=points, episodes=episodes, side_by_side=side_by_side)
     judge_in, rows = judge_in or train_in, Rows() if rows is None else rows
     agents = agents if isinstance(agents, Agents) else Agents.seeded(spec, agents)
     every, iterations = None, spec.config.num_iterations

@@ -26,7 +26,7 @@ from scb.agents.spec import (
 from scb.agents.tables import WARM_START
 from scb.curriculum import paper_curriculum
 from scb.environments.synthetic import BanditParams, SyntheticBandit, Weights
-from scb.errors import UserError, unknown_name
+from scb.errors import UserError, at_least, unknown_name
 from scb.experts import Expert, PolicySearchConfig, evolve_expert, train_expert
 from scb.keys import split_key
 
@@ -83,16 +83,8 @@ class WarmStartConfig:
                 f"min_spread is {self.min_spread}, which the construction {self.construction} cannot use: "
                 "take action_distance, or a min_spread of 0."
             )
-        for field in (
-            "num_experts",
-            "num_states",
-            "num_actions",
-            "horizon",
-            "fit_steps",
-            "expert_generations",
-        ):
-            if getattr(self, field) < 1:
-                raise UserError(f"{field} is {getattr(self, field)}: it must be at least 1.")
+        at_least(1, self, "num_experts", "num_states", "num_actions")
+        at_least(1, self, "horizon", "fit_steps", "expert_generations")
 
 
 class ExpertDataset(NamedTuple):

@@ -25,7 +25,7 @@ import jax.numpy as jnp
 
 from lpo.drifts.contract import Array, Drift
 from scb.agents.ppo import relu
-from scb.errors import UserError
+from scb.errors import UserError, at_least
 from scb.keys import split_key
 
 # Units bend within a fifth of the ratio or so, which is PPO's clip, and at ratios from 1/2 to 2.
@@ -56,8 +56,7 @@ class MirrorDrift(Drift):
     xi: float = 1e-6
 
     def __post_init__(self) -> None:
-        if self.hidden_size < 1:
-            raise UserError(f"hidden_size is {self.hidden_size}: it must be at least 1.")
+        at_least(1, self, "hidden_size")
         if not (self.strength > 0 and self.xi > 0):
             raise UserError(
                 f"strength and xi are {self.strength} and {self.xi}: both must be positive."

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from lpo.drifts.contract import Array, CorrectedDrift
-from scb.errors import UserError
+from scb.errors import UserError, at_least
 from scb.keys import split_key
 
 # The order of the network's inputs, d = ratio - 1 side. Other code uses other orders and signs, so it
@@ -50,8 +50,7 @@ class LearnedDrift(CorrectedDrift):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.hidden_size < 1:
-            raise UserError(f"hidden_size is {self.hidden_size}: it must be at least 1.")
+        at_least(1, self, "hidden_size")
 
     @property
     def features(self) -> tuple[str, ...]:

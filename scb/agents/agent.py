@@ -18,7 +18,7 @@ from jax.typing import ArrayLike
 
 from scb.agents import networks
 from scb.agents.normalization import normalize
-from scb.errors import UserError, unknown_name
+from scb.errors import UserError, at_least, unknown_name
 from scb.evaluation import Episodes, evaluate
 from scb.keys import split_key
 
@@ -41,10 +41,7 @@ class AgentConfig(ABC):
     normalize_observations: bool = False
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if isinstance(value, int) and not isinstance(value, bool) and value < 1:
-                raise UserError(f"{field.name} is {value}: it must be at least 1.")
+        at_least(1, self, *(f.name for f in fields(self) if type(getattr(self, f.name)) is int))
         if self.activation not in networks.ACTIVATIONS:
             raise unknown_name("activation", self.activation, networks.ACTIVATIONS)
 

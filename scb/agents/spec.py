@@ -18,7 +18,7 @@ from scb.agents.agent import Agent
 from scb.agents.tables import ACTIVATIONS, DISCRETE_ONLY, TABLES, Lists, Row, Tables
 from scb.curriculum import with_limit
 from scb.environments.registry import environment_spec
-from scb.errors import UserError, unknown_name
+from scb.errors import UserError, at_least, unknown_name
 from scb.keys import split_key
 
 # {name: its tables, with the algorithm itself}. In the order that lists and pages name them in.
@@ -117,8 +117,7 @@ class AgentSpec:
 
     def with_steps(self, steps: int | None) -> "AgentSpec":
         """Trained for another number of environment steps; as it is where that is None."""
-        if steps is not None and steps < 1:
-            raise UserError(f"steps is {steps}: it must be at least 1.")
+        at_least(1, steps=steps)
         return self.with_values(total_steps=steps)
 
     def on_bandit(self, contexts: int) -> "AgentSpec":

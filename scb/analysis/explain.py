@@ -19,7 +19,7 @@ from scb.discovery import check_fits
 from scb.environments.registry import environment_spec, make
 from scb.environments.synthetic import SyntheticBandit
 from scb.environments.zoo import open_bandit
-from scb.errors import UserError
+from scb.errors import at_least
 from scb.keys import root_key, split_key
 from scb.runs import make_folder, write_json
 from scb.statistics import estimate
@@ -119,10 +119,8 @@ def explain_command(
     from scb import plotting
     from scb.analysis import figures
 
-    if episodes < 1:
-        raise UserError(f"episodes is {episodes}: give at least 1.")
-    if seed < 0:
-        raise UserError(f"seed is {seed}: it must be 0 or larger.")
+    at_least(1, episodes=episodes)
+    at_least(0, seed=seed)
     loaded = open_bandit(bandit)
     target = evaluation_environment or environment_spec(bandit).evaluation_environment
     env, env_params = make(target, backend)

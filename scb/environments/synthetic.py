@@ -19,7 +19,7 @@ from flax import struct
 from gymnax.environments import environment, spaces
 from jax.typing import ArrayLike
 
-from scb.errors import UserError, unknown_name
+from scb.errors import UserError, at_least, unknown_name
 from scb.keys import root_key, split_key
 
 Latent: TypeAlias = Literal["normal", "uniform", "categorical", "softmax_categorical"]
@@ -97,9 +97,7 @@ class BanditConfig:
             raise unknown_name("bandit activation", self.activation, ACTIVATIONS)
         if self.latent not in LATENTS:
             raise unknown_name("latent distribution", self.latent, LATENTS)
-        for field, value in (("hidden_size", self.hidden_size), ("latent_size", self.latent_size)):
-            if value is not None and value < 1:
-                raise UserError(f"{field} is {value}: it must be at least 1.")
+        at_least(1, self, "hidden_size", "latent_size")
 
 
 class SyntheticBandit(environment.Environment[BanditState, BanditParams]):

@@ -34,7 +34,7 @@ from scb.environments.synthetic import (
     flat_size,
     shapes_of,
 )
-from scb.errors import UserError, unknown_name
+from scb.errors import UserError, at_least, unknown_name
 from scb.keys import split_key
 
 MDP_PARAMETERIZATIONS = ("T", "TI")
@@ -80,8 +80,7 @@ class MDPConfig(BanditConfig):
             raise unknown_name(
                 "parameterization of a synthetic MDP", self.parameterization, MDP_PARAMETERIZATIONS
             )
-        if self.max_steps < 1:
-            raise UserError(f"max_steps is {self.max_steps}: it must be at least 1.")
+        at_least(1, self, "max_steps")
 
 
 class SyntheticMDP(environment.Environment[MDPState, MDPParams]):

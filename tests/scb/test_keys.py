@@ -127,7 +127,7 @@ def test_a_meta_training_and_its_evaluation_use_every_key_at_one_place():
     config = MetaTrainingConfig(
         tasks=("Synthetic-Pendulum-v1", "Synthetic-CartPole-v1"),
         drift=LearnedDrift(hidden_size=4),
-        contexts=8,
+        contexts=20,
         horizons=(0.5, 1.0),
         agents_per_candidate=2,
         evaluation_episodes=2,
