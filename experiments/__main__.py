@@ -20,7 +20,7 @@ from typing import Any, Literal
 import tyro
 
 from experiments import claims, harness, rendering
-from experiments.harness import DATA, DOCS, Experiment, Files, Preset
+from experiments.harness import DATA, DOCS, Experiment, Files
 from scb.errors import UserError
 from scb.runs import make_folder
 
@@ -144,10 +144,10 @@ def _all(arguments: All) -> int:
         note = " kept: it has the paper's size" if kept else ""
         print(f"{experiment.name} ...{note}", flush=True)
         files = Files(out, arguments.docs, arguments.only_render or kept)
-        options = Preset(arguments.preset)
+        options = experiment.options(arguments.preset)
 
         def run(
-            experiment: Experiment = experiment, options: Preset = options, files: Files = files
+            experiment: Experiment = experiment, options: Any = options, files: Files = files
         ) -> int:
             return experiment.run(options, files)
 

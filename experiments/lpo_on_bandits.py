@@ -10,12 +10,10 @@ resumed; what --out holds already is not measured again, so the same command con
 one. `--only-render` makes page and figure from --out.
 """
 
-import argparse
 import json
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -24,22 +22,22 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, LogLocator, NullFormatter, StrMethodFormatter
 
-from experiments.harness import exit_status, read
-from experiments.rendering import text
+from experiments.claims import OF_THE_WAY, TENTH, Claim
+from experiments.harness import Experiment, Preset, Report, Save
 from lpo.comparison import compare
 from lpo.learning import objective_of_run
 from lpo.objectives import Objective, load_objective
 from scb import plotting
 from scb.agents.spec import AgentSpec, environment_agent
-from scb.artefacts import machine_description, package_versions
-from scb.cli import configure_jax
+from scb.environments.registry import environment_spec
 from scb.errors import UserError
-from scb.runs import write_json
 from scb.seeds import REPORTING, reporting, validation
-from scb.statistics import estimate, iqm, pooled_estimate
+from scb.statistics import Estimate, estimate, iqm, pooled_estimate
 
 SOURCES = ("bandit", "environment")
-BANDIT = "LPO (bandit)"
+BANDIT, ENVIRONMENT = "LPO (bandit)", "LPO (environment)"
+ROUGHLY = 50  # times as many are roughly two orders of magnitude
+SIZES = ("population_size", "agents_per_candidate", "generations")
 CLIPS = ("ppo-0.1", "ppo", "ppo-0.3", "ppo-0.5", "ppo-1")
 SCALES = {"Flax's initialisation": 1.0, "small last layer": 0.01}
 
@@ -126,73 +124,86 @@ def search_curve(metrics: Sequence[Mapping[str, Any]], seconds: Sequence[float])
     }
 
 
-def markdown(report: Mapping[str, Any]) -> str:
-    """The page."""
-    lines = [
-        "# Learned policy optimisation on synthetic contextual bandits",
-        "",
-        f"`python -m experiments.lpo_on_bandits --preset {report['preset']}`",
-        "",
-        "![Meta-training and what its objectives are worth](figures/lpo_on_bandits.png)",
-        "",
-        "## What a search costs",
-        "",
-        "| learned on | searches | generations | candidates x agents | steps a generation (training + evaluation) | "
-        "seconds a generation | steps of the search | steps to judge means |",
-        "| --- | --- | --- | --- | --- | --- | --- | --- |",
-    ]
-    for search in report["searches"].values():
-        settings, curves = search["settings"], search["curves"]
-        per = curves[0]["steps_per_generation"]
-        seconds = np.median([c["seconds_per_generation"] for c in curves])
-        lines.append(
-            f"| {settings['environment']} | {len(curves)} | {settings['generations']} | "
-            f"{settings['population_size']} x {settings['agents_per_candidate']} | "
-            f"{per['training']:,} + {per['evaluation']:,} | {seconds:.1f} | "
-            f"{per['total'] * settings['generations']:,} | {search['steps_to_judge']:,} |"
-        )
-    lines += [
-        "",
-        "Means are judged by agents that train on Pendulum; the mean that was judged best is the objective. Those "
-        "steps choose when to stop, and no step of Pendulum enters the fitness of a bandit's search.",
-    ]
-    for name, table in report["evaluations"].items():
-        lines += ["", f"## {name}", "", table["protocol"], ""]
+def claims(report: Report) -> list[Claim]:
+    """Cheaper to learn on the bandit, better than PPO on Pendulum, no worse for it, comparable on Hopper."""
+    plan = [search["settings"] for search in report["searches"].values()]
+    same = all(len({x[size] for x in plan}) == 1 for size in SIZES)
+    spec = environment_spec("Pendulum-v1")
+    tenth = round(TENTH * (spec.reference_return() - spec.random_return()), 1)
+    steps = f"a candidate's agent takes {ROUGHLY} times fewer steps on the bandit, roughly two orders of magnitude"
+    found = [Claim(steps, cheaper(report) >= ROUGHLY)]
+    for place, table in report["evaluations"].items():
         finals, areas = table["finals"], table["areas"]
-        lines += [
-            "| objective | final return, IQM [95 %] | area under the curve |",
-            "| --- | --- | --- |",
-            *(
-                f"| {o} | {text(pooled_estimate(finals[o]))} | {text(pooled_estimate(areas[o]))} |"
-                for o in finals
-            ),
-            "",
-            f"| {BANDIT} against | final return | area under the curve |",
-            "| --- | --- | --- |",
-            *(
-                f"| {o} | {text(pooled_estimate(finals[BANDIT], finals[o]), sign=True)} "
-                f"| {text(pooled_estimate(areas[BANDIT], areas[o]), sign=True)} |"
-                for o in finals
+
+        def above(one: list[Any], other: list[Any]) -> partial[Estimate] | Estimate:
+            evidence = partial(pooled_estimate, one, other)
+            return evidence if len(one) > 1 else replace(evidence(), low=None, high=None)
+
+        if place.startswith("Hopper"):
+            ppo = abs(float(np.mean(finals["ppo"])))
+            for name in (BANDIT, ENVIRONMENT):
+                text, reason = (
+                    f"{place}: {name} ends no lower than PPO",
+                    "comparable: a tenth of PPO's return",
+                )
+                evidence = above(finals[name], finals["ppo"])
+                found.append(Claim(text, evidence, 0.0, round(0.1 * ppo, 1), reason, places=0))
+            continue
+        for name in (BANDIT, ENVIRONMENT):
+            for what, returns in (
+                ("ends higher", finals),
+                ("learns faster (area under the curve)", areas),
+            ):
+                text = f"{place}: {name} {what} than PPO"
+                found.append(Claim(text, above(returns[name], returns["ppo"]), places=1))
+        text = f"{place}: {BANDIT} ends no lower than {ENVIRONMENT}, after searches of one size"
+        alike = above(finals[BANDIT], finals[ENVIRONMENT]) if same else None
+        if alike is not None and len(finals[ENVIRONMENT]) < 2:
+            alike = replace(pooled_estimate(finals[BANDIT], finals[ENVIRONMENT]), low=None)
+        found.append(Claim(text, alike, 0.0, tenth, OF_THE_WAY, places=1))
+    return found
+
+
+def cheaper(report: Report) -> float:
+    """How many times the steps of a candidate's agent are fewer on the bandit."""
+    steps = []
+    for source in SOURCES:
+        search = report["searches"][source]
+        settings = search["settings"]
+        agents = settings["population_size"] * settings["agents_per_candidate"]
+        steps.append(search["curves"][0]["steps_per_generation"]["total"] / agents)
+    return float(steps[1] / steps[0])
+
+
+def facts(report: Report) -> dict[str, Any]:
+    """What a search costs, and the tables' estimates."""
+    searches = {
+        source: {
+            **search,
+            "per": search["curves"][0]["steps_per_generation"],
+            "second": float(np.median([c["seconds_per_generation"] for c in search["curves"]])),
+        }
+        for source, search in report["searches"].items()
+    }
+    tables = {}
+    for place, table in report["evaluations"].items():
+        kinds = (table["finals"], table["areas"])
+        tables[place] = {
+            "earned": {o: [pooled_estimate(x[o]) for x in kinds] for o in kinds[0]},
+            "against": {
+                o: [pooled_estimate(x[BANDIT], x[o]) for x in kinds]
+                for o in kinds[0]
                 if o != BANDIT
-            ),
-        ]
-        if "tuned" in table:
-            sweep = ", ".join(
-                f"{clip} {value:.0f}".replace(" -", " \u2212")
-                for clip, value in table["sweep"].items()
-            )
-            lines += ["", f"The tuned clip is {table['tuned']}: on other agents {sweep}."]
-        elif any(clip in finals for clip in CLIPS if clip != "ppo"):
-            lines += ["", "The clip other than 0.2 is the one that was tuned on Pendulum."]
-    machine = report["machine"]
-    lines += [
-        "",
-        "Interquartile means over agents, and for learned objectives over searches and agents, with 95 % bootstrap "
-        "intervals that resample both; differences are paired by seed. Most likely actions, seeds from "
-        f"{REPORTING.start}. Measured on {machine['cores']} cores, {machine['processor']}.",
-        "",
-    ]
-    return "\n".join(lines)
+            },
+            "carried": [x for x in CLIPS if x != "ppo" and x in kinds[0] and "tuned" not in table],
+        }
+    return {
+        "searches": searches,
+        "tables": tables,
+        "bandit": BANDIT,
+        "times": cheaper(report),
+        "seed": REPORTING.start,
+    }
 
 
 def draw(report: Mapping[str, Any]) -> Figure:
@@ -201,51 +212,50 @@ def draw(report: Mapping[str, Any]) -> Figure:
         "bandit": plotting.Look(plotting.VERMILLION, "-", "o"),
         "environment": plotting.Look(plotting.PURPLE, "--", "D"),
     }
-    with plotting.figure_style():
-        figure = Figure(figsize=(12.0, 8.0))
-        parts: Any = figure.subfigures(2, 1)
-        top, bottom = parts
-        panels: Any = top.subplots(1, 3, sharey=True)
-        for source, search in report["searches"].items():
-            curves, look = search["curves"], looks[source]
-            name = f"on the {source} ({len(curves)} searches)"
-            per = curves[0]["steps_per_generation"]
-            seconds = float(np.median([c["seconds_per_generation"] for c in curves]))
-            generations = np.asarray(curves[0]["generations"], float)
-            returns = [c["returns"] for c in curves]
-            _band(panels[0], generations, returns, look, name)
-            # No step is taken and no time passes before generation 0, which a logarithm cannot show.
-            later, returns = generations[1:], [r[1:] for r in returns]
-            _band(panels[1], later * per["total"], returns, look, f"{source}: total")
-            _band(panels[2], later * seconds / 60, returns, look, name)
-            middle = iqm(np.asarray(returns), axis=0)
-            for kind, style in (("training", ":"), ("evaluation", "-.")):
-                panels[1].plot(
-                    later * per[kind],
-                    middle,
-                    linestyle=style,
-                    color=look.color,
-                    label=f"{source}: {kind}",
-                )
-        titles = ("(i) over generations", "(ii) over environment steps", "(ii) over wall-clock")
-        labels = ("generation", "environment steps of the search", "minutes of the search")
-        for panel, title, label in zip(panels, titles, labels, strict=True):
-            panel.set_title(title)
-            panel.set_xlabel(label)
-            panel.legend(fontsize=8)
-        for panel in panels[1:]:
-            panel.set_xscale("log")
-            panel.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-            panel.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
-            panel.xaxis.set_minor_formatter(NullFormatter())
-        panels[1].xaxis.set_major_locator(LogLocator())
-        panels[1].xaxis.set_major_formatter(EngFormatter(sep=""))
-        panels[0].set_ylabel("return on Pendulum of agents\ntrained with the search's mean")
-        below = bottom.subplots(1, len(report["evaluations"]), squeeze=False)[0]
-        for panel, (name, table) in zip(below, report["evaluations"].items(), strict=True):
-            _dots(panel, table)
-            number = "(iv)" if name.startswith("Hopper") else "(iii)"
-            panel.set_title(f"{number} {name}".replace(", ", ",\n", 1), fontsize=9)
+    figure = Figure(figsize=(12.0, 8.0))
+    parts: Any = figure.subfigures(2, 1)
+    top, bottom = parts
+    panels: Any = top.subplots(1, 3, sharey=True)
+    for source, search in report["searches"].items():
+        curves, look = search["curves"], looks[source]
+        name = f"on the {source} ({len(curves)} searches)"
+        per = curves[0]["steps_per_generation"]
+        seconds = float(np.median([c["seconds_per_generation"] for c in curves]))
+        generations = np.asarray(curves[0]["generations"], float)
+        returns = [c["returns"] for c in curves]
+        _band(panels[0], generations, returns, look, name)
+        # No step is taken and no time passes before generation 0, which a logarithm cannot show.
+        later, returns = generations[1:], [r[1:] for r in returns]
+        _band(panels[1], later * per["total"], returns, look, f"{source}: total")
+        _band(panels[2], later * seconds / 60, returns, look, name)
+        middle = iqm(np.asarray(returns), axis=0)
+        for kind, style in (("training", ":"), ("evaluation", "-.")):
+            panels[1].plot(
+                later * per[kind],
+                middle,
+                linestyle=style,
+                color=look.color,
+                label=f"{source}: {kind}",
+            )
+    titles = ("(i) over generations", "(ii) over environment steps", "(ii) over wall-clock")
+    labels = ("generation", "environment steps of the search", "minutes of the search")
+    for panel, title, label in zip(panels, titles, labels, strict=True):
+        panel.set_title(title)
+        panel.set_xlabel(label)
+        panel.legend(fontsize=8)
+    for panel in panels[1:]:
+        panel.set_xscale("log")
+        panel.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        panel.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+        panel.xaxis.set_minor_formatter(NullFormatter())
+    panels[1].xaxis.set_major_locator(LogLocator())
+    panels[1].xaxis.set_major_formatter(EngFormatter(sep=""))
+    panels[0].set_ylabel("return on Pendulum of agents\ntrained with the search's mean")
+    below = bottom.subplots(1, len(report["evaluations"]), squeeze=False)[0]
+    for panel, (name, table) in zip(below, report["evaluations"].items(), strict=True):
+        _dots(panel, table)
+        number = "(iv)" if name.startswith("Hopper") else "(iii)"
+        panel.set_title(f"{number} {name}".replace(", ", ",\n", 1), fontsize=9)
     return figure
 
 
@@ -278,41 +288,11 @@ def _dots(axes: Axes, table: Mapping[str, Any]) -> None:
     axes.set_xlabel("final return")
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--preset", choices=PRESETS, default="quick")
-    parser.add_argument("--runs", type=Path, default=Path("runs/lpo_on_bandits"))
-    parser.add_argument("--out", type=Path, default=Path("docs/data/lpo_on_bandits.json"))
-    parser.add_argument("--page", type=Path, default=Path("docs/lpo_on_bandits.md"))
-    parser.add_argument("--only-render", action="store_true")
-    arguments = parser.parse_args(argv)
-    configure_jax()
-
-    keys = ("preset", "searches", "evaluations")
-    report = read(arguments.out, missing_is_new=not arguments.only_render, keys=keys)
-    if not arguments.only_render:
-        measure(arguments.preset, arguments.runs / arguments.preset, arguments.out, report)
-    arguments.page.write_text(markdown(report))
-    (arguments.page.parent / "figures").mkdir(exist_ok=True)
-    plotting.save(draw(report), arguments.page.parent / "figures" / "lpo_on_bandits.png")
-    return 0
-
-
-def measure(preset: str, runs: Path, out: Path, report: dict[str, Any]) -> None:
-    """Does what the report lacks, and writes it after every part."""
-    plan = PRESETS[preset]
-    if report and report["preset"] != preset:
-        raise UserError(f"{out} is of preset {report['preset']}: choose another --out.")
-    report |= {
-        "preset": preset,
-        "versions": package_versions(),
-        "machine": machine_description(),
-    }
+def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None:
+    """Searches, then agents trained with what they found."""
+    runs = Path(plan["runs"]) / report["preset"]
     found = report.setdefault("searches", {})
     evaluations = report.setdefault("evaluations", {})
-    out.parent.mkdir(parents=True, exist_ok=True)
     groups: dict[str, list[_Learned]] = {}
     for source, search in plan["searches"].items():
         groups[f"LPO ({source})"] = group = [
@@ -320,23 +300,21 @@ def measure(preset: str, runs: Path, out: Path, report: dict[str, Any]) -> None:
         ]
         entry = found.setdefault(source, {"settings": search["settings"], "curves": []})
         if entry["settings"] != search["settings"]:
-            raise UserError(
-                f"{out} was measured when the preset {preset} was another one: choose another --out."
-            )
+            raise UserError("the report is of other searches: choose another --out.")
         for learned in group[len(entry["curves"]) :]:
             cost = learned.objective.metadata["cost"]
             # A run folder of before November 2026 has the second name.
             names = ("environment_steps_judgements", "environment_steps_validation")
             entry["steps_to_judge"] = next(cost[name] for name in names if name in cost)
             entry["curves"].append(_curve_of(learned.folder))
-            write_json(out, report)
+            save()
     for label, scale in SCALES.items():
         table = evaluations.setdefault(f"Pendulum, {label}", {})
         spec = environment_agent("ppo", "Pendulum-v1").with_values(policy_output_scale=scale)
         if "tuned" not in table:
             table |= _tuned_clip(spec, plan["tuning_agents"])
         _judge(table, "Pendulum-v1", table["tuned"], groups, plan["agents"], spec)
-        write_json(out, report)
+        save()
     hopper = plan["hopper"]
     backend, steps = hopper["backend"], hopper["steps"]
     first = {name: group[: hopper["searches"]] for name, group in groups.items()}
@@ -351,7 +329,7 @@ def measure(preset: str, runs: Path, out: Path, report: dict[str, Any]) -> None:
         environment_agent("ppo", "hopper").with_steps(steps).with_values(policy_output_scale=1.0),
         backend,
     )
-    write_json(out, report)
+    save()
 
 
 @dataclass(frozen=True)
@@ -440,5 +418,32 @@ def _judge(
     )
 
 
+@dataclass(frozen=True)
+class Options(Preset):
+    """A preset, and where its searches are kept."""
+
+    runs: Path = Path("runs/lpo_on_bandits")
+    """for the run folders"""
+
+
+EXPERIMENT = Experiment(
+    name="lpo_on_bandits",
+    title="Learned policy optimisation on synthetic contextual bandits",
+    paper="figure and section on learned policy optimisation",
+    claim="objectives learned on Pendulum's bandit and on Pendulum itself both outperform PPO's on Pendulum, in speed "
+    "and at the end; the bandit takes two orders of magnitude fewer environment steps, with no negative effect on the "
+    "final performance; on Hopper both are comparable to PPO.",
+    presets=PRESETS,
+    minutes={"quick": "120", "paper": "days; for a GPU"},
+    measure=measure,
+    claims=claims,
+    facts=facts,
+    draw=draw,
+    options=Options,
+    keys=("preset", "searches", "evaluations"),
+    needs="keeps its searches under --runs",
+)
+
+
 if __name__ == "__main__":
-    sys.exit(exit_status("lpo_on_bandits", main))
+    raise SystemExit(EXPERIMENT.main())

@@ -2,7 +2,6 @@
 
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,10 +9,7 @@ import pytest
 from experiments import lpo_on_bandits as module
 from lpo.comparison import Comparison, LearningCurves
 from lpo.objectives import load_objective
-from scb import plotting
 from scb.errors import UserError
-
-DOCS = Path(__file__).parents[2] / "docs"
 
 
 def line(generation, **more):
@@ -71,7 +67,8 @@ def report():
     table = {"protocol": "Two agents.", "seeds": [1, 2], "finals": finals, "areas": finals}
     return {
         "preset": "quick",
-        "machine": {"cores": 2, "processor": "a processor"},
+        "machine": {"cores": 2, "processor": "a processor", "accelerator": "none"},
+        "versions": {"jax": "0.0"},
         "searches": searches,
         "evaluations": {
             "Pendulum, Flax's initialisation": {
@@ -84,16 +81,34 @@ def report():
     }
 
 
-def test_the_page_says_costs_returns_and_differences(report, tmp_path):
-    page = module.markdown(report)
+def test_the_page_says_costs_returns_and_differences(report):
+    page = module.EXPERIMENT.page(report)
     assert "| Synthetic-Pendulum-v1 | 3 | 4 | 2 x 1 | 100 + 20 | 3.0 | 480 | 1,000 |" in page
     # (-850 of PPO, -200 of the pooled bandit's objectives.)
     assert "| ppo | −850 [" in page
     assert "| LPO (bandit) | −200 [" in page
     assert "| ppo | +650 [" in page and "| LPO (environment) | +100 [" in page
     assert "The tuned clip is ppo-0.5: on other agents ppo −900, ppo-0.5 −400." in page
-    path = plotting.save(module.draw(report), tmp_path / "figure.png")
-    assert path.stat().st_size > 20_000
+    (figure,) = module.EXPERIMENT.figures(report).values()
+    assert len(figure.axes) == 3 + 2
+
+
+def test_one_search_decides_nothing_and_searches_of_other_sizes_are_not_compared(report):
+    def outcomes():
+        return {x.claim.text: x.outcome for x in module.EXPERIMENT.judged(report)}
+
+    place = "Pendulum, Flax's initialisation"
+    found = outcomes()
+    assert found[f"{place}: LPO (bandit) ends higher than PPO"] == "holds"
+    # 550 higher, by one search.
+    assert found[f"{place}: LPO (environment) ends higher than PPO"] == "undecided"
+    like = f"{place}: LPO (bandit) ends no lower than LPO (environment), after searches of one size"
+    assert found[like] == "undecided"
+    for table in report["evaluations"].values():
+        table["finals"]["LPO (environment)"] *= 2
+    assert outcomes()[like] == "holds"
+    report["searches"]["bandit"]["settings"] |= {"population_size": 4}
+    assert outcomes()[like] == "not tested at this size"
 
 
 @pytest.fixture
@@ -111,8 +126,8 @@ def tiny(monkeypatch):
             load_objective("dpo"), metadata={"cost": {"environment_steps_validation": 7}}
         )
 
-    def compare(environment, objectives, seeds, setting, backend=None, points=15):
-        scale = setting.hyperparameters.policy_output_scale
+    def compare(environment, objectives, seeds, spec, backend=None, points=15):
+        scale = spec.hyperparameters.policy_output_scale
         asked.append((environment, scale, *(o.name for o in objectives)))
         return Comparison(
             [
@@ -130,22 +145,21 @@ def tiny(monkeypatch):
             ]
         )
 
-    monkeypatch.setattr("lpo.learning.objective_of_run", objective_of_run)
-    monkeypatch.setattr("lpo.comparison.compare", compare)
+    monkeypatch.setattr(module, "objective_of_run", objective_of_run)
+    monkeypatch.setattr(module, "compare", compare)
     plan = {
         "searches": {source: {"seeds": 1, "settings": {"of": source}} for source in module.SOURCES},
         "agents": 2,
         "tuning_agents": 2,
         "hopper": {"backend": "spring", "steps": 100, "agents": 2, "searches": 1},
     }
-    monkeypatch.setitem(module.PRESETS, "tiny", plan)
     return plan, asked
 
 
 def test_what_a_report_has_is_not_measured_again(tiny, tmp_path):
     plan, asked = tiny
-    out, report = tmp_path / "report.json", {}
-    module.measure("tiny", tmp_path / "runs", out, report)
+    plan["runs"], report = str(tmp_path / "runs"), {"preset": "tiny"}
+    module.measure(plan, report, lambda: None)
     both = ("LPO (bandit) 0", "LPO (environment) 0")
     compared = ("ppo", "ppo-0.5", "dpo", *both)
     judged = [("Pendulum-v1", scale, *x) for scale in (1.0, 0.01) for x in (module.CLIPS, compared)]
@@ -155,28 +169,26 @@ def test_what_a_report_has_is_not_measured_again(tiny, tmp_path):
     assert table["finals"]["LPO (bandit)"] == [[-14.0, -15.0]]
 
     asked.clear()
-    module.measure("tiny", tmp_path / "runs", out, report)
+    module.measure(plan, report, lambda: None)
     assert asked == []
 
     plan["searches"]["environment"]["seeds"] = 2
-    report = json.loads(out.read_text())
-    module.measure("tiny", tmp_path / "runs", out, report)
+    module.measure(plan, report, lambda: None)
     second = "LPO (environment) 1"
     assert asked == ["environment-1", *(("Pendulum-v1", scale, second) for scale in (1.0, 0.01))]
     finals = report["evaluations"]["Pendulum, small last layer"]["finals"]
     assert finals["LPO (environment)"] == [[-14.0, -15.0]] * 2
     assert list(finals) == ["ppo", "ppo-0.5", "dpo", "LPO (bandit)", "LPO (environment)"]
     assert [len(x["curves"]) for x in report["searches"].values()] == [1, 2]
-    assert json.loads(out.read_text()) == report
 
 
 def test_a_report_of_other_searches_is_refused(tiny, tmp_path):
     plan, _ = tiny
-    report = {}
-    module.measure("tiny", tmp_path / "runs", tmp_path / "report.json", report)
+    plan["runs"], report = str(tmp_path / "runs"), {"preset": "tiny"}
+    module.measure(plan, report, lambda: None)
     plan["searches"]["bandit"]["settings"] = {"of": "something else"}
-    with pytest.raises(UserError, match="was measured when the preset tiny was another one"):
-        module.measure("tiny", tmp_path / "runs", tmp_path / "report.json", report)
+    with pytest.raises(UserError, match="the report is of other searches"):
+        module.measure(plan, report, lambda: None)
 
 
 def test_the_settings_of_every_preset_are_those_of_the_command():
@@ -188,10 +200,3 @@ def test_the_settings_of_every_preset_are_those_of_the_command():
             assert config.validation
             assert config.evolution.num_generations == search["settings"]["generations"]
     assert module.PRESETS["paper"]["hopper"]["steps"] == 5_242_880
-
-
-def test_the_committed_page_is_that_of_the_committed_report():
-    data = DOCS / "data" / "lpo_on_bandits.json"
-    if not data.exists():
-        pytest.skip("not measured yet")
-    assert (DOCS / "lpo_on_bandits.md").read_text() == module.markdown(json.loads(data.read_text()))
