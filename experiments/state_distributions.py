@@ -36,12 +36,13 @@ from scb.environments.registry import environment_spec
 from scb.environments.synthetic import SyntheticBandit
 from scb.environments.zoo import bandit_metadata, open_bandit
 from scb.keys import root_key, split_key
+from scb.seeds import ILLUSTRATING
 from scb.statistics import Estimate, estimate
 
 POINTS = 50  # of the grid of best actions, in either direction
 CELLS = 20  # of the grid whose share of visited cells is the coverage
 STATES = 2000
-SEED = 41_000
+SEED = ILLUSTRATING[1_000]
 BANDIT_COVERAGE, EXPERT_COVERAGE = "bandit's coverage", "expert's coverage"
 OUTSIDE = "contexts off the plane"
 MANY = 0.5  # of the contexts, where the verdict says so

@@ -28,6 +28,7 @@ from lpo.objectives import load_objective
 from scb.agents.spec import environment_agent
 from scb.errors import UserError, unknown_name
 from scb.plotting import BLUE, GREY, VERMILLION, estimate_row
+from scb.seeds import REPORTING
 from scb.statistics import Estimate, estimate, pooled_estimate
 
 # Flags of `lpo meta-train`. The first is what the others differ from in one thing each.
@@ -69,7 +70,7 @@ class Evaluation:
     steps: int | None = None
     policy_output_scale: float = 1.0
     seeds: int = 20
-    first_seed: int = 21_000
+    first_seed: int = REPORTING[11_000]
 
     def seed_list(self) -> list[int]:
         return list(range(self.first_seed, self.first_seed + self.seeds))

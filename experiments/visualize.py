@@ -33,6 +33,7 @@ from scb.environments.registry import environment_spec
 from scb.environments.zoo import open_bandit
 from scb.errors import UserError
 from scb.keys import root_key, split_key
+from scb.seeds import ILLUSTRATING
 from scb.statistics import Estimate, estimate
 
 HOPPER = "hopper (spring)"
@@ -162,7 +163,7 @@ EXPERIMENT = Experiment(
             "brax_episodes": 4,
             "brax_steps": 300,
             "every": 2,
-            "seed": 50_000,
+            "seed": ILLUSTRATING[10_000],
         },
         "paper": {
             "agents": 20,
@@ -170,7 +171,7 @@ EXPERIMENT = Experiment(
             "brax_episodes": 10,
             "brax_steps": 1000,
             "every": 2,
-            "seed": 50_000,
+            "seed": ILLUSTRATING[10_000],
         },
     },
     minutes={"quick": "2", "paper": "3"},

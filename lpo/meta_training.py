@@ -26,7 +26,7 @@ from scb.environments.registry import environment_spec, families
 from scb.environments.spec import EnvironmentSpec, Made
 from scb.errors import UserError, at_least, unknown_name
 from scb.evolution import EnvironmentSteps, EvolutionConfig, Outcome, evolve
-from scb.keys import key_at, named_key, root_key, split_key
+from scb.keys import named_key, root_key, split_key
 from scb.runs import Run
 
 # Agents that judge a mean on the environment, where each costs a training there.
@@ -209,7 +209,9 @@ class TaskTraining:
         self.evaluation_episodes = config.evaluation_episodes or (50 if judged_in.is_bandit else 20)
         self.training_params = self.env_params
         if spec.is_bandit and config.reward_noise:
-            scale = self.env.reward_scale(self.env_params, named_key(root_key(0), "reward scale"))
+            scale = self.env.reward_scale(
+                self.env_params, named_key(root_key(0), f"reward scale of {self.env.name}")
+            )
             self.training_params = self.env_params.replace(reward_noise=config.reward_noise * scale)
 
     def fitness(
@@ -315,23 +317,25 @@ class MetaTraining:
         self, candidate: Any, key: jax.Array, generation: jax.Array
     ) -> dict[str, jax.Array]:
         config = self.config
+        *keys, key_horizon = split_key(key, len(self.tasks) + 1)
         horizon: Any = 1.0
         if config.horizons:
             # One for the whole generation: candidates are compared on it, and no agent waits for
             # another.
-            key_horizon = key_at(key, len(config.tasks))
             horizon = jax.random.choice(key_horizon, jnp.asarray(config.horizons))
         fitness = {
-            name: task.fitness(candidate, key_at(key, i), config.agents_per_candidate, horizon)
-            for i, (name, task) in enumerate(self.tasks.items())
+            name: task.fitness(candidate, key_task, config.agents_per_candidate, horizon)
+            for key_task, (name, task) in zip(keys, self.tasks.items(), strict=True)
         }
         apart = {} if len(fitness) == 1 else {f"fitness/{n}": x.mean() for n, x in fitness.items()}
         return {"fitness": jnp.concatenate(list(fitness.values())), **apart}
 
     def evaluate_mean(self, candidate: Any, key: jax.Array) -> dict[str, jax.Array]:
         fitness = {
-            name: task.fitness(candidate, key_at(key, i), 1)[0]
-            for i, (name, task) in enumerate(self.judges.items())
+            name: task.fitness(candidate, key_judge, 1)[0]
+            for key_judge, (name, task) in zip(
+                split_key(key, len(self.judges)), self.judges.items(), strict=True
+            )
         }
         apart = {} if len(fitness) == 1 else {f"fitness/{n}": x for n, x in fitness.items()}
         scores = [

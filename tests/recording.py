@@ -86,41 +86,50 @@ def _place() -> str:
     return f"{name}:{frame.f_lineno}"
 
 
+def _passed(note: Any, value: jax.Array) -> jax.Array:
+    # Its result is what is gone on with: what is not needed is not computed, and not recorded.
+    shape = jax.ShapeDtypeStruct(value.shape, value.dtype)
+    return jax.pure_callback(note, shape, value, vmap_method="expand_dims")
+
+
+@contextmanager
+def recorded_seeds(record: Record | None = None) -> Iterator[set[int]]:
+    """The seeds that keys are made from meanwhile; of programs compiled before, none."""
+    record = Record() if record is None else record
+    make = jax.random.key
+
+    def made(seed: Any, **named: Any) -> Any:
+        if isinstance(seed, jax.core.Tracer):
+            return make(_passed(record._seed, seed), **named)
+        return make(record._seed(seed), **named)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(jax.random, "key", made)
+        yield record.seeds
+
+
 @contextmanager
 def recorded() -> Iterator[Record]:
     """Programs compiled before are compiled again, and those compiled meanwhile are dropped."""
     record = Record()
-
-    def passed(note: Any, value: jax.Array) -> jax.Array:
-        # Its result is what is gone on with: what is not needed is not computed, and not recorded.
-        shape = jax.ShapeDtypeStruct(value.shape, value.dtype)
-        return jax.pure_callback(note, shape, value, vmap_method="expand_dims")
 
     def used(function: Any, kind: str) -> Any:
         @wraps(function)
         def wrapper(key: Any, *arguments: Any, **named: Any) -> Any:
             if kind == "fold_in" and isinstance(arguments[0], int) and arguments[0] >= FIRST_NAME:
                 return function(key, *arguments, **named)  # no position's: see scb.keys
-            data = passed(partial(record._use, (_place(), kind)), jax.random.key_data(key))
+            data = _passed(partial(record._use, (_place(), kind)), jax.random.key_data(key))
             if jnp.issubdtype(key.dtype, jax.dtypes.prng_key):
                 data = jax.random.wrap_key_data(data)
             return function(data, *arguments, **named)
 
         return wrapper
 
-    def made(function: Any) -> Any:
-        @wraps(function)
-        def wrapper(seed: Any, **named: Any) -> Any:
-            return function(passed(record._seed, jnp.asarray(seed)), **named)
-
-        return wrapper
-
     jax.clear_caches()
-    with pytest.MonkeyPatch.context() as patch:
+    with recorded_seeds(record), pytest.MonkeyPatch.context() as patch:
         for name in SAMPLERS:
             if name not in ASKING or name in DERIVING:
                 kind = name if name in DERIVING else "draw"
                 patch.setattr(jax.random, name, used(getattr(jax.random, name), kind))
-        patch.setattr(jax.random, "key", made(jax.random.key))
         yield record
     jax.clear_caches()

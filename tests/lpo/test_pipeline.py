@@ -13,6 +13,7 @@ from lpo.objectives import load_objective
 from scb.agents.ppo import PPOConfig, PPOHyperparameters
 from scb.agents.spec import AgentSpec
 from scb.measurement import pivot
+from tests.recording import recorded_seeds
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -54,7 +55,10 @@ def small(tiny_agent, tiny_drift):
 def folder(small, tmp_path_factory) -> Path:
     """A finished run. Tests may resume it, and leave it as it was but for clocks."""
     out = tmp_path_factory.mktemp("runs") / "tiny"
-    assert cli.main(["run", "--preset", "tiny", "--seed", "3", "--out", str(out)]) == 0
+    with recorded_seeds() as seeds:
+        assert cli.main(["run", "--preset", "tiny", "--seed", "3", "--out", str(out)]) == 0
+    # Constants, the search, the judges of its end, and those of the report.
+    assert seeds == {0, 3, 30_000, 13_000, 13_001}
     return out
 
 

@@ -31,6 +31,7 @@ from scb.environments.zoo import bandit_metadata, load_bandit, save_bandit, zoo_
 from scb.evolution import EvolutionConfig
 from scb.runs import config_dict
 from scb.warm_start import WarmStartConfig
+from tests.recording import recorded_seeds
 
 METADATA = {"seeds": {}, "results": {}, "cost": {}, "command": "scb discover", "config": {}}
 TINY = PPOConfig(
@@ -81,8 +82,11 @@ def small_inner_loop():
 @pytest.fixture(scope="module")
 def discovered(tmp_path_factory):
     folder = tmp_path_factory.mktemp("runs") / "cartpole"
-    result = call(*DISCOVER, "--judge-episodes", "2", "--out", folder)
+    with recorded_seeds() as seeds:
+        result = call(*DISCOVER, "--judge-episodes", "2", "--out", folder)
     assert result.code == 0, result.err
+    # Its own, that of its end's judges, and that of constants such as a pendulum's start.
+    assert seeds - {0} == {7, 30_000}
     return folder, result
 
 

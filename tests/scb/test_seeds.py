@@ -1,12 +1,15 @@
 """Every purpose has seeds of its own, and a search takes no other's."""
 
+import ast
 import itertools
+import re
 
 import pytest
 
 from scb import seeds
 from scb.errors import UserError
 from scb.evolution import EvolutionConfig
+from tests.scb.test_imports import MODULES, ROOT
 
 PURPOSES = (seeds.SEARCHING, seeds.REPORTING, seeds.VALIDATING, seeds.ILLUSTRATING)
 
@@ -32,3 +35,41 @@ def test_seeds_are_handed_out_from_their_range():
 def test_what_lies_outside_of_the_range_is_refused(number, offset):
     with pytest.raises(UserError, match="reporting seeds"):
         seeds.reporting(number, offset)
+
+
+# What reports: `lpo run`, the zoo's tables, and the experiments. No search, and nothing that a search calls.
+REPORTERS = {
+    "lpo": {"lpo/pipeline.py"},
+    "scb": {"scb/seeds.py"},
+    "experiments": {
+        f"experiments/{name}.py"
+        for name in (
+            "brax_training",
+            "component_replacement",
+            "episode_lengths",
+            "experts",
+            "generality",
+            "lpo_on_bandits",
+            "transfer_study",
+            "zoo_table",
+        )
+    },
+}
+
+
+@pytest.mark.parametrize("package", MODULES)
+def test_reporting_seeds_are_named_only_where_something_is_reported(package):
+    named = set()
+    for path in MODULES[package]:
+        names = {n.id for n in ast.walk(ast.parse(path.read_text())) if isinstance(n, ast.Name)}
+        if names & {"REPORTING", "reporting"}:
+            named.add(str(path.relative_to(ROOT)))
+    assert named == REPORTERS[package]
+
+
+@pytest.mark.parametrize("package", MODULES)
+def test_a_seed_beyond_those_that_search_comes_from_the_registry(package):
+    literal = re.compile(r"seed\w*(\"|: int)?\s*[:=]\s*[1-9]\d_?\d{3}", re.IGNORECASE)
+    assert literal.search("first_seed: int = 21_000") and literal.search('"seed": 50000')
+    for path in MODULES[package]:
+        assert not literal.search(path.read_text()), path
