@@ -526,15 +526,3 @@ class _progress:
 
     def __exit__(self, *_: object) -> None:
         self._bar.stop()
-
-
-__all__ = [
-    "STRATEGIES",
-    "EnvironmentSteps",
-    "EvolutionConfig",
-    "Outcome",
-    "Problem",
-    "evolve",
-    "map_population",
-    "rank_failed_last",
-]
