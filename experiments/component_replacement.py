@@ -22,10 +22,11 @@ from scb import plotting
 from scb.agents.spec import bandit_agent
 from scb.analysis import components
 from scb.analysis.states import follow
-from scb.discovery import SyntheticTraining, judge
+from scb.discovery import judge
 from scb.environments.registry import environment_spec
 from scb.environments.zoo import bandit_metadata, open_bandit
 from scb.keys import key_at, root_key, split_key
+from scb.measurement import Place
 from scb.seeds import ILLUSTRATING, REPORTING
 from scb.statistics import Estimate, iqm, normalized_score, pooled_estimate
 
@@ -77,10 +78,15 @@ def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None
     def learn(reward: Any, states: Any) -> list[float]:
         """Returns of agents trained in the bandit with these parts replaced."""
         replaced = components.ReplacedBandit(bandit, reward, states)
-        training = SyntheticTraining(replaced, env, env_params, spec)
-        weights = bandit.default_params.weights
         (returns,) = judge(
-            training, weights, REPORTING.start, plan["agents"], plan["episodes"], mode=True
+            spec,
+            replaced,
+            bandit.default_params.weights,
+            Place(ENVIRONMENT, env, env_params),
+            REPORTING.start,
+            plan["agents"],
+            plan["episodes"],
+            mode=True,
         ).values()
         return counted(returns)
 

@@ -18,12 +18,12 @@ from experiments.claims import OF_THE_WAY, TENTH, Claim
 from experiments.harness import CLASSIC_CONTROL, Experiment, Report, Save, finite
 from experiments.searches import PAPER_SIZES
 from scb import plotting
-from scb.agents.spec import algorithms_for, bandit_agent
+from scb.agents.spec import AgentSpec, algorithms_for, bandit_agent
 from scb.curriculum import paper_curriculum
-from scb.discovery import DiscoveryConfig, SyntheticTraining
+from scb.discovery import BanditDiscovery, DiscoveryConfig
 from scb.environments.registry import environment_spec
 from scb.evolution import map_population
-from scb.keys import root_key, split_key
+from scb.measurement import Agents, Judge, train_and_judge
 from scb.seeds import REPORTING
 from scb.statistics import Estimate, estimate, normalized_score, paired_difference
 
@@ -69,14 +69,8 @@ def _measure_limit(
     returns: dict[str, list[float]] = {}
     failed = 0
     for algorithm in plan["judged_by"] or algorithms_for(space):
-        training = SyntheticTraining(
-            problem.bandit,
-            problem.env,
-            problem.env_params,
-            bandit_agent(algorithm, environment),
-        )
         judged, lengths = returns_and_lengths(
-            training, outcome.mean, root_key(REPORTING.start), plan["agents"], plan["episodes"]
+            bandit_agent(algorithm, environment), problem, outcome.mean, plan
         )
         returns[algorithm], number = finite(judged, entry["random"])
         failed += number
@@ -86,26 +80,27 @@ def _measure_limit(
 
 
 def returns_and_lengths(
-    training: SyntheticTraining, weights: Any, key: Any, num_agents: int, num_episodes: int
+    spec: AgentSpec, problem: BanditDiscovery, weights: Any, plan: Mapping[str, Any]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Of agents trained in the synthetic environment.
+    """Of agents trained in the synthetic environment with these weights.
 
     Returns:
       ([N] mean returns in the environment with most likely actions, [N, E] steps of episodes in the synthetic one).
     """
-    key_draw, key_agents = split_key(key)
+    agents = Agents.drawn_from(spec, REPORTING.start, plan["agents"])
 
     def one(hyperparameters: Any, key: Any, weights: Any) -> Any:
-        key_train, key_judge, key_act = split_key(key, 3)
-        state = training.train(weights, hyperparameters, key_train)
-        returns = training.evaluate(state, key_judge, num_episodes, mode=True)
-        params = training.synthetic.params(weights)
-        episodes = training.agent.evaluate(state, key_act, num_episodes, env_params=params)
-        return returns.mean(), episodes.lengths
+        params = problem.bandit.params(weights)
+        judges = {
+            "environment": Judge(problem.env, problem.env_params, plan["episodes"], mode=True),
+            "synthetic": Judge(problem.bandit, params, plan["episodes"]),
+        }
+        agent = spec.agent(problem.bandit)
+        _, earned = train_and_judge(agent, hyperparameters, key, params, judges)
+        return earned["environment"].returns.mean(), earned["synthetic"].lengths
 
-    hyperparameters = training.spec.sample(key_draw, num_agents)
-    keys = split_key(key_agents, num_agents)
-    returns, lengths = map_population(one, num_agents, (0, 0, None))(hyperparameters, keys, weights)
+    mapped = map_population(one, plan["agents"], (0, 0, None))
+    returns, lengths = mapped(agents.hyperparameters, agents.keys, weights)
     return np.asarray(returns), np.asarray(lengths)
 
 

@@ -22,7 +22,7 @@ from experiments import searches
 from experiments.claims import OF_THE_WAY, TENTH, Claim
 from experiments.harness import CLASSIC_CONTROL, Experiment, Report, Save, finite
 from experiments.searches import PAPER_SIZES
-from scb import plotting
+from scb import measurement, plotting
 from scb.agents.spec import AgentSpec, algorithms_for, bandit_agent
 from scb.analysis.optimal_actions import optimal_policy
 from scb.curriculum import paper_curriculum
@@ -32,6 +32,7 @@ from scb.environments.zoo import bandit_metadata, open_bandit
 from scb.evaluation import evaluate
 from scb.evolution import map_population
 from scb.keys import root_key, split_key
+from scb.measurement import Agents, Place, pivot
 from scb.neuroevolution import NeuroevolutionConfig, evolve_policy
 from scb.seeds import REPORTING
 from scb.statistics import (
@@ -156,25 +157,17 @@ class _Trainer:
         if agent == EVOLVED:
             return self._evolved(key)
         algorithm, _, network = agent.partition(", ")
-        return self._trained(with_network(bandit_agent(algorithm, self.environment), network), key)
+        return self._trained(with_network(bandit_agent(algorithm, self.environment), network))
 
-    def _trained(self, spec: AgentSpec, key: Any) -> np.ndarray:
-
-        agent, episodes = spec.agent(self.trained_in), self.plan["episodes"]
-        key_draw, key_agents = split_key(key)
-        number = self.plan["agents"]
-
-        def judged(hyperparameters: Any, key: Any, params: Any) -> Any:
-            key_train, key_judge = split_key(key)
-            state = agent.train(key_train, hyperparameters, params)
-            return agent.evaluate(
-                state, key_judge, episodes, self.env, self.env_params, mode=True
-            ).returns.mean()
-
-        hyperparameters = spec.sample(key_draw, number)
-        keys = split_key(key_agents, number)
-        judge = map_population(judged, number, (0, 0, None))
-        return np.asarray(judge(hyperparameters, keys, self.trained_in_params))
+    def _trained(self, spec: AgentSpec) -> np.ndarray:
+        rows = measurement.measure(
+            spec,
+            Place("trained in", self.trained_in, self.trained_in_params),
+            Place(self.environment, self.env, self.env_params),
+            Agents.drawn_from(spec, REPORTING.start, self.plan["agents"]),
+            episodes=self.plan["episodes"],
+        )
+        return pivot(rows, "agent")
 
     def _evolved(self, key: Any) -> np.ndarray:
 

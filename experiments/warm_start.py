@@ -20,9 +20,10 @@ import numpy as np
 from experiments.harness import Experiment, Save
 from scb import make
 from scb.agents.spec import algorithms_for, bandit_agent
-from scb.discovery import SyntheticTraining, judge
+from scb.discovery import judge
 from scb.environments.synthetic import BanditConfig, bandit_for
 from scb.keys import root_key, split_key
+from scb.measurement import Place
 from scb.statistics import estimate
 from scb.warm_start import WarmStartConfig, expert_dataset, find_expert, fit_bandit
 
@@ -89,24 +90,18 @@ def measure(options: Options, report: dict[str, Any], save: Save) -> None:
             "expert_environment_steps": expert.environment_steps,
             "returns": {},
         }
-        trainings = {
-            algorithm: SyntheticTraining(
-                bandit_for(env, env_params, BanditConfig(), name),
-                env,
-                env_params,
-                bandit_agent(algorithm, name),
-            )
-            for algorithm in options.algorithms or algorithms_for(space)
-        }
+        bandit = bandit_for(env, env_params, BanditConfig(), name)
+        judge_in = Place(name, env, env_params)
         for arm, fields in ARMS.items():
             config = WarmStartConfig(**fields)
             start = time.perf_counter()
             dataset, _ = expert_dataset(expert, env, env_params, key_data, config)
-            bandit = bandit_for(env, env_params, BanditConfig(), name)
             weights, fit = fit_bandit(bandit, dataset, key_fit, config)
             row: dict[str, Any] = {"fit": fit, "fit_seconds": round(time.perf_counter() - start, 1)}
-            for algorithm, training in trainings.items():
-                returns = judge(training, weights, SEED, options.agents, options.episodes)
+            for algorithm in options.algorithms or algorithms_for(space):
+                spec = bandit_agent(algorithm, name)
+                size = options.agents, options.episodes
+                returns = judge(spec, bandit, weights, judge_in, SEED, *size)
                 row[algorithm] = {
                     actions: {
                         "iqm": estimate(x).as_dict(),

@@ -35,12 +35,13 @@ from experiments.zoo_table_page import (
     place,
 )
 from scb.agents.spec import algorithms_for, bandit_agent
-from scb.discovery import SyntheticTraining, check_fits, judge
+from scb.discovery import check_fits, judge
 from scb.environments.registry import environment_spec
 from scb.environments.synthetic import BanditConfig, SyntheticBandit
 from scb.environments.zoo import bandit_metadata, open_bandit, zoo_names
 from scb.errors import UserError, at_least
 from scb.importer import PUBLISHED_BANDITS, published_bandit
+from scb.measurement import Place
 from scb.seeds import REPORTING
 from scb.statistics import estimate, paired_difference
 
@@ -142,12 +143,12 @@ def measure_bandits(
     entries: list[dict[str, Any]] = report.setdefault("entries", [])
     environment = ""
     # One compiled program for all bandits of an environment that differ in their weights only.
-    trainings: dict[tuple[BanditConfig, str], SyntheticTraining] = {}
+    bandits: dict[BanditConfig, SyntheticBandit] = {}
     for candidate in found:
         home = environment_spec(candidate.environment)
         backend = home.physics(protocol.backend)
         if candidate.environment != environment:
-            environment, trainings = candidate.environment, {}
+            environment, bandits = candidate.environment, {}
             env, env_params = home.make(backend)
         check_fits(candidate.bandit, env, env_params, environment)
         space = env.action_space(env_params)
@@ -167,13 +168,12 @@ def measure_bandits(
             }
             if any(row.items() <= _comparable(entry).items() for entry in entries):
                 continue
-            key = (candidate.bandit.config, algorithm)
-            if key not in trainings:
-                trainings[key] = SyntheticTraining(candidate.bandit, env, env_params, spec)
             start = time.perf_counter()
             returns = judge(
-                trainings[key],
+                spec,
+                bandits.setdefault(candidate.bandit.config, candidate.bandit),
                 candidate.bandit.default_params.weights,
+                Place(environment, env, env_params, backend),
                 REPORTING.start,
                 row["agents"],
                 row["episodes"],

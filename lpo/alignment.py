@@ -27,7 +27,7 @@ from scb.environments.registry import environment_spec, make
 from scb.errors import UserError, at_least
 from scb.evolution import map_population
 from scb.keys import root_key, split_key
-from scb.measurement import check_seeds, families
+from scb.measurement import Judge, check_seeds, families, train_and_judge
 from scb.runs import Stopwatch
 from scb.statistics import iqm, spearman
 
@@ -74,7 +74,10 @@ class Regime:
     def task(self, objective: Objective) -> TaskTraining:
         """The inner loop with this objective."""
         config = MetaTrainingConfig(
-            tasks=(self.bandit,), agent=self.spec().config, reward_noise=self.reward_noise
+            tasks=(self.bandit,),
+            agent=self.spec().config,
+            reward_noise=self.reward_noise,
+            fitness="area",
         )
         return TaskTraining(config, self.bandit, objective.drift)
 
@@ -210,28 +213,24 @@ def _program(regime: Regime, drift: Drift, size: int) -> Callable[..., Any]:
         env_params: Any,
         training_params: Any,
     ) -> jax.Array:
-        def returns(
-            state: Any, key: jax.Array, judges: Sequence[tuple[bool, bool]]
-        ) -> dict[tuple[bool, bool], jax.Array]:
-            """{judge: mean return}."""
-            found = {}
-            for judge, key_judge in zip(judges, split_key(key, len(judges)), strict=True):
-                at_home, mode = judge
-                env, params = (home, home_params) if at_home else (task.env, env_params)
-                number = 20 if at_home else task.evaluation_episodes
-                episodes = task.agent.evaluate(state, key_judge, number, env, params, mode=mode)
-                found[judge] = episodes.returns.mean()
-            return found
+        def judge(kind: tuple[bool, bool]) -> Judge:
+            at_home, mode = kind
+            if at_home:
+                return Judge(home, home_params, 20, mode)
+            return Judge(task.env, env_params, task.evaluation_episodes, mode)
 
         key_train, key_end = split_key(root_key(seed))
-        state, measured = task.agent.train_with_evaluations(
-            key_train,
+        state, earned = train_and_judge(
+            task.agent,
             replace(hyperparameters, drift=parameters),
+            key_train,
             training_params,
-            lambda state, key: returns(state, key, along),
-            every=task.area_every,
+            {kind: judge(kind) for kind in along},
+            every=task.every,
         )
-        measured |= {judge: x[None] for judge, x in returns(state, key_end, at_end).items()}
+        for kind, key in zip(at_end, split_key(key_end, len(at_end)), strict=True):
+            earned[kind] = judge(kind)(task.agent, state, key)
+        measured = {kind: jnp.atleast_1d(x.returns.mean(-1)) for kind, x in earned.items()}
         return jnp.stack([f.of(measured[f.judge]) for f in FITNESSES.values()])
 
     return map_population(train, size, (0, 0, None, None, None))

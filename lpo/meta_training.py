@@ -20,17 +20,19 @@ from jax.typing import ArrayLike
 
 from lpo.drifts import Drift, LearnedDrift
 from lpo.fitness import FITNESSES, Fitness
-from scb.agents.ppo import PPOConfig, PPOHyperparameters, PPOState
+from scb.agents.ppo import PPOConfig, PPOHyperparameters
 from scb.agents.spec import AgentSpec, check_lists, environment_agent
 from scb.environments.registry import environment_spec, families
 from scb.environments.spec import EnvironmentSpec, Made
 from scb.errors import UserError, at_least, unknown_name
 from scb.evolution import EnvironmentSteps, EvolutionConfig, Outcome, evolve
 from scb.keys import named_key, root_key, split_key
+from scb.measurement import Judge, spaced, train_and_judge
 from scb.runs import Run
 
 # Agents that judge a mean on the environment, where each costs a training there.
 VALIDATION_AGENTS = 16
+POINTS = 5  # of the curve that the area is under
 
 
 @dataclass(frozen=True)
@@ -205,6 +207,9 @@ class TaskTraining:
         self.spec = replace(
             agent, config=config.agent or agent.config, lists=config.hyperparameters
         )
+        self.every, iterations = spaced(self.spec.config.num_iterations, POINTS)
+        if config.judgement.along:
+            self.spec = self.spec.with_steps(self.spec.config.steps_after(iterations))
         self.agent = self.spec.agent(self.env, drift or config.drift)
         self.evaluation_episodes = config.evaluation_episodes or (50 if judged_in.is_bandit else 20)
         self.training_params = self.env_params
@@ -235,48 +240,31 @@ class TaskTraining:
         key: jax.Array,
         horizon: ArrayLike,
     ) -> jax.Array:
-        config, fitness = self.config, self.config.judgement
-        key_train, key_evaluate = split_key(key)
+        fitness = self.config.judgement
         hyperparameters = replace(hyperparameters, drift=drift_parameters)
-
-        def judge(state: PPOState, key: jax.Array) -> jax.Array:
-            return self.agent.evaluate(
-                state,
-                key,
-                self.evaluation_episodes,
-                self.evaluation_env,
-                self.evaluation_params,
-                mode=fitness.mode,
-            ).returns.mean()
-
-        if fitness.along:
-            _, returns = self.agent.train_with_evaluations(
-                key_train, hyperparameters, self.training_params, judge, every=self.area_every
-            )
-            return fitness.of(returns)
-        if not config.horizons:
-            state = self.agent.train(key_train, hyperparameters, self.training_params)
-            return fitness.of(judge(state, key_evaluate)[None])
-        iterations = jnp.round(jnp.asarray(horizon) * self.spec.config.num_iterations)
-        iterations = jnp.maximum(1, iterations.astype(jnp.int32))
-        hyperparameters = replace(hyperparameters, horizon=iterations)
-        state = self.agent.init(key_train, hyperparameters, self.training_params)
-        state = self.agent.train_iterations(
-            state, hyperparameters, self.training_params, iterations
+        iterations = None
+        if self.config.horizons:
+            iterations = jnp.round(jnp.asarray(horizon) * self.spec.config.num_iterations)
+            iterations = jnp.maximum(1, iterations.astype(jnp.int32))
+            hyperparameters = replace(hyperparameters, horizon=iterations)
+        env, params = self.evaluation_env, self.evaluation_params
+        _, earned = train_and_judge(
+            self.agent,
+            hyperparameters,
+            split_key(key)[0] if fitness.along else key,
+            self.training_params,
+            {"return": Judge(env, params, self.evaluation_episodes, fitness.mode)},
+            self.every if fitness.along else None,
+            iterations,
         )
-        return fitness.of(judge(state, key_evaluate)[None])
-
-    @property
-    def area_every(self) -> int:
-        """Iterations between about five points of the curve, at equal distances that divide the training."""
-        iterations = self.spec.config.num_iterations
-        return next(n for n in range(max(1, iterations // 5), 0, -1) if iterations % n == 0)
+        returns = earned["return"].returns.mean(-1)
+        return fitness.of(returns if fitness.along else returns[None])
 
     def steps(self, agents: int, share: float = 1.0) -> EnvironmentSteps:
         """Of so many agents that train for this share of the agent's steps."""
         points = 1
         if self.config.judgement.along:
-            points = self.spec.config.num_iterations // self.area_every + 1
+            points = self.spec.config.num_iterations // self.every + 1
         return EnvironmentSteps(
             training=round(agents * self.spec.steps * share),
             evaluation=agents

@@ -8,7 +8,6 @@ from typing import Annotated, Any
 
 import numpy as np
 import tyro
-from gymnax.environments import environment as environments
 from rich.table import Column, Table
 
 from scb.agents.spec import algorithms_for, bandit_agent
@@ -17,11 +16,10 @@ from scb.console import console
 from scb.discovery import (
     BanditDiscovery,
     DiscoveryConfig,
-    SyntheticTraining,
     check_fits,
     judge,
 )
-from scb.environments.registry import environment_spec, make
+from scb.environments.registry import environment_spec
 from scb.environments.synthetic import SyntheticBandit, Weights
 from scb.environments.synthetic_mdp import SyntheticMDP
 from scb.environments.zoo import (
@@ -32,6 +30,7 @@ from scb.environments.zoo import (
 )
 from scb.errors import at_least
 from scb.evolution import EvolutionConfig, evolve
+from scb.measurement import Place
 from scb.runs import config_dict
 from scb.seeds import VALIDATING
 from scb.statistics import estimate
@@ -132,9 +131,7 @@ class Discover(LongRun):
             results = judge_all(
                 problem.bandit,
                 weights,
-                config.environment,
-                problem.env,
-                problem.env_params,
+                Place(config.environment, problem.env, problem.env_params),
                 not config.fixed_hyperparameters,
                 self.judgement.judge_agents,
                 self.judgement.judge_episodes,
@@ -161,33 +158,27 @@ class Discover(LongRun):
 def judge_all(
     synthetic: SyntheticBandit | SyntheticMDP,
     weights: Weights,
-    name: str,
-    env: environments.Environment[Any, Any],
-    env_params: Any,
+    judge_in: Place,
     sampled: bool = True,
     num_agents: int = 20,
     num_episodes: int = 50,
     seed: int = VALIDATING.start,
 ) -> dict[str, Any]:
     """What agents of every fitting algorithm earn, by name of the algorithm in capitals, printed as it comes."""
-    space = env.action_space(env_params)
     results = {}
-    for algorithm in algorithms_for(space):
-        training = SyntheticTraining(
-            synthetic, env, env_params, bandit_agent(algorithm, name, sampled)
-        )
-        returns = judge(training, weights, seed, num_agents, num_episodes)
-        lists = training.spec.lists
+    for algorithm in algorithms_for(judge_in.env.action_space(judge_in.params)):
+        spec = bandit_agent(algorithm, judge_in.name, sampled)
+        returns = judge(spec, synthetic, weights, judge_in, seed, num_agents, num_episodes)
         results[algorithm.upper()] = {
             "agents": num_agents,
             "episodes": num_episodes,
-            "hyperparameters": "sampled from the paper's lists" if lists else "fixed",
+            "hyperparameters": "sampled from the paper's lists" if spec.lists else "fixed",
             **{actions: estimate(x).as_dict() for actions, x in returns.items()},
         }
         line = "; ".join(
             f"{actions.replace('_', ' ')} IQM {estimate(x)}" for actions, x in returns.items()
         )
-        console().print(f"{algorithm.upper()} on {name}: {line}")
+        console().print(f"{algorithm.upper()} on {judge_in.name}: {line}")
     return results
 
 
@@ -229,12 +220,13 @@ def train(
     at_least(0, seed=seed)
     loaded = open_synthetic(bandit)
     target = evaluation_environment or environment_spec(bandit).evaluation_environment
-    env, env_params = make(target, backend)
-    check_fits(loaded, env, env_params, target)
+    judge_in = Place.named(target, backend)
+    check_fits(loaded, judge_in.env, judge_in.params, target)
     spec = bandit_agent(algorithm, target, not fixed_hyperparameters)
-    training = SyntheticTraining(loaded, env, env_params, spec)
     weights = loaded.default_params.weights
-    by_actions = judge(training, weights, seed, agents, episodes, mode=not sampled_actions)
+    by_actions = judge(
+        spec, loaded, weights, judge_in, seed, agents, episodes, mode=not sampled_actions
+    )
     (returns,) = by_actions.values()
     print(f"returns on {target}: {' '.join(f'{r:.0f}' for r in np.sort(returns))}")
     print(f"IQM: {estimate(returns)}")

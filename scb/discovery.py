@@ -6,7 +6,7 @@ their return in the evaluation environment. The same search finds the paper's fu
 """
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Annotated, Any
@@ -46,9 +46,10 @@ from scb.environments.synthetic import (
 from scb.environments.synthetic_mdp import PARAMETERIZATIONS, SyntheticMDP, synthetic_for
 from scb.environments.zoo import open_bandit
 from scb.errors import UserError, at_least, unknown_name
-from scb.evolution import EnvironmentSteps, EvolutionConfig, Outcome, evolve, map_population
+from scb.evolution import EnvironmentSteps, EvolutionConfig, Outcome, evolve
 from scb.keys import named_key, root_key, split_key
 from scb.lists import read_lists, write_lists
+from scb.measurement import MODE, SAMPLED, Agents, Judge, Place, measure, pivot, train_and_judge
 from scb.runs import Run, Stopwatch
 from scb.warm_start import (
     WarmStartConfig,
@@ -170,85 +171,6 @@ class DiscoveryConfig:
         at_least(1, self, "agents_per_candidate", "evaluation_episodes")
 
 
-class SyntheticTraining:
-    """Trains one agent in a synthetic environment and evaluates it in the evaluation environment.
-
-    Args:
-      synthetic: the bandit or MDP, whose weights are given at each call.
-      env, env_params: the evaluation environment.
-      spec: what its agents are trained with.
-    """
-
-    def __init__(
-        self,
-        synthetic: SyntheticBandit | SyntheticMDP,
-        env: environment.Environment[Any, Any],
-        env_params: Any,
-        spec: AgentSpec,
-    ) -> None:
-        self.synthetic, self.spec = synthetic, spec
-        self.agent = spec.agent(synthetic)
-        self.env, self.env_params = env, env_params
-        self._populations: dict[tuple[int, int, tuple[bool, ...]], Callable[..., Any]] = {}
-
-    def population(
-        self, num_agents: int, num_episodes: int, modes: tuple[bool, ...]
-    ) -> Callable[..., Any]:
-        """(weights, [N] hyperparameters, [N] keys) -> [N] mean returns with each of `modes`, compiled once."""
-
-        def returns(weights: Weights, hyperparameters: Any, key: jax.Array) -> list[jax.Array]:
-            key_train, key_evaluate = split_key(key)
-            state = self.train(weights, hyperparameters, key_train)
-            return [self.evaluate(state, key_evaluate, num_episodes, m).mean() for m in modes]
-
-        size = (num_agents, num_episodes, modes)
-        if size not in self._populations:
-            # The weights are an argument: as constants they would make another program of every
-            # bandit.
-            self._populations[size] = map_population(returns, num_agents, (None, 0, 0))
-        return self._populations[size]
-
-    def train(self, weights: Weights, hyperparameters: Any, key: jax.Array) -> Any:
-        """An agent trained in the synthetic environment with these weights."""
-        return self.agent.train(key, hyperparameters, self.synthetic.params(weights))
-
-    def evaluate(
-        self,
-        state: Any,
-        key: jax.Array,
-        num_episodes: int,
-        mode: bool,
-        limit: ArrayLike | None = None,
-        longest: int | None = None,
-    ) -> jax.Array:
-        """[E] returns of a trained agent in the evaluation environment.
-
-        Args:
-          mode: the most likely actions instead of sampled ones.
-          limit: steps after which an episode is cut; traced. None: the environment's own.
-          longest: an upper bound of `limit` that may exceed the environment's own limit.
-        """
-        env_params = self.env_params if longest is None else with_limit(self.env_params, longest)
-        return self.agent.evaluate(
-            state, key, num_episodes, self.env, env_params, mode=mode, horizon=limit
-        ).returns
-
-    def returns(
-        self,
-        weights: Weights,
-        hyperparameters: Any,
-        key: jax.Array,
-        num_episodes: int,
-        mode: bool,
-        limit: ArrayLike | None = None,
-        longest: int | None = None,
-    ) -> jax.Array:
-        """[E] returns of one agent: `train`, then `evaluate`."""
-        key_train, key_evaluate = split_key(key)
-        state = self.train(weights, hyperparameters, key_train)
-        return self.evaluate(state, key_evaluate, num_episodes, mode, limit, longest)
-
-
 class BanditDiscovery:
     """The evolution problem: a candidate is a synthetic environment's weights."""
 
@@ -283,10 +205,7 @@ class BanditDiscovery:
             environment_spec(config.environment).bandit,
             config.max_steps,
         )
-        self.trainings = {
-            name: SyntheticTraining(self.bandit, self.env, self.env_params, self._spec(name))
-            for name in dict.fromkeys(config.algorithms)
-        }
+        self.specs = {name: self._spec(name) for name in dict.fromkeys(config.algorithms)}
         self._horizon, self._longest = None, None
         if isinstance(config.curriculum, CurriculumConfig):
             limit = int(self.env_params.max_steps_in_episode)
@@ -350,25 +269,18 @@ class BanditDiscovery:
         self, candidate: Weights, key: jax.Array, generation: jax.Array
     ) -> dict[str, jax.Array]:
         config = self.config
-        limit = None if self._horizon is None else self._horizon(generation)
+        limit, env_params = None, self.env_params
+        if self._horizon is not None and self._longest is not None:
+            limit, env_params = self._horizon(generation), with_limit(env_params, self._longest)
 
         def returns_of(name: str, key: jax.Array) -> jax.Array:
-            training = self.trainings[name]
             key_draw, key_agents = split_key(key)
             number = config.agents_per_candidate
-            return jax.vmap(
-                lambda h, k: training.returns(
-                    candidate,
-                    h,
-                    k,
-                    config.evaluation_episodes,
-                    config.mode_actions,
-                    limit,
-                    self._longest,
-                ).mean()
-            )(training.spec.sample(key_draw, number), split_key(key_agents, number))
+            return jax.vmap(lambda h, k: self._earned(name, candidate, h, k, env_params, limit))(
+                self.specs[name].sample(key_draw, number), split_key(key_agents, number)
+            )
 
-        names = list(self.trainings)
+        names = list(self.specs)
         if config.mode == "all":
             returns = {
                 # The first has the generation's own key, as where it is alone.
@@ -389,18 +301,34 @@ class BanditDiscovery:
         }
         return {"fitness": fitness, **logged}
 
+    def _earned(
+        self,
+        algorithm: str,
+        weights: Weights,
+        hyperparameters: Any,
+        key: jax.Array,
+        env_params: Any,
+        limit: ArrayLike | None = None,
+    ) -> jax.Array:
+        """[] mean return in the evaluation environment of an agent trained in a candidate."""
+        episodes, mode = self.config.evaluation_episodes, self.config.mode_actions
+        _, earned = train_and_judge(
+            self.specs[algorithm].agent(self.bandit),
+            hyperparameters,
+            key,
+            self.bandit.params(weights),
+            {"return": Judge(self.env, env_params, episodes, mode, limit)},
+        )
+        return earned["return"].returns.mean()
+
     def evaluate_mean(self, candidate: Weights, key: jax.Array) -> dict[str, jax.Array]:
         results = {}
-        for i, (name, training) in enumerate(self.trainings.items()):
+        for i, (name, spec) in enumerate(self.specs.items()):
             key_draw, key_agent = split_key(named_key(key, name) if i else key)
-            hyperparameters = jax.tree.map(lambda x: x[0], training.spec.sample(key_draw, 1))
-            results[f"fitness/{name}"] = training.returns(
-                candidate,
-                hyperparameters,
-                key_agent,
-                self.config.evaluation_episodes,
-                self.config.mode_actions,
-            ).mean()
+            drawn = jax.tree.map(lambda x: x[0], spec.sample(key_draw, 1))
+            results[f"fitness/{name}"] = self._earned(
+                name, candidate, drawn, key_agent, self.env_params
+            )
         return {"fitness": jnp.stack(list(results.values())).mean(), **results}
 
     def steps(self) -> EnvironmentSteps:
@@ -408,10 +336,10 @@ class BanditDiscovery:
         config = self.config
         agents = config.agents_per_candidate
         if config.mode == "all":
-            training = sum(t.spec.steps for t in self.trainings.values())
-            evaluations = len(self.trainings)
+            training = sum(spec.steps for spec in self.specs.values())
+            evaluations = len(self.specs)
         else:
-            turns = [self.trainings[name].spec.steps for name in config.algorithms]
+            turns = [self.specs[name].steps for name in config.algorithms]
             training, evaluations = sum(turns) // len(turns), 1
         limit = self._longest or int(self.env_params.max_steps_in_episode)
         return EnvironmentSteps(
@@ -421,9 +349,9 @@ class BanditDiscovery:
 
     def judgement_steps(self) -> EnvironmentSteps:
         """Of one agent of each algorithm, in episodes of the environment's own length."""
-        episodes = len(self.trainings) * self.config.evaluation_episodes
+        episodes = len(self.specs) * self.config.evaluation_episodes
         return EnvironmentSteps(
-            training=sum(t.spec.steps for t in self.trainings.values()),
+            training=sum(spec.steps for spec in self.specs.values()),
             evaluation=episodes * int(self.env_params.max_steps_in_episode),
         )
 
@@ -482,8 +410,10 @@ def discover(
 
 
 def judge(
-    training: SyntheticTraining,
+    spec: AgentSpec,
+    synthetic: SyntheticBandit | SyntheticMDP,
     weights: Weights,
+    judge_in: Place,
     seed: int,
     num_agents: int = 20,
     num_episodes: int = 50,
@@ -492,18 +422,23 @@ def judge(
     """[num_agents] mean returns in the evaluation environment of agents trained in a synthetic one.
 
     Args:
-      weights: the synthetic environment's.
+      spec: the agents'; what it has lists for is drawn.
+      synthetic, weights: where they train.
+      judge_in: the evaluation environment.
       seed: decides hyperparameters, training and evaluation.
 
     Returns:
       {"sampled_actions": [N], "mode_actions": [N]} of the same agents; with `mode` given, only that
       one.
     """
-    key_draw, key_agents = split_key(root_key(seed))
-    names = {False: "sampled_actions", True: "mode_actions"}
-    modes = tuple(names) if mode is None else (mode,)
-    hyperparameters = training.spec.sample(key_draw, num_agents)
-    keys = split_key(key_agents, num_agents)
-    population = training.population(num_agents, num_episodes, modes)
-    returns = population(weights, hyperparameters, keys)
-    return {names[m]: np.asarray(x) for m, x in zip(modes, returns, strict=True)}
+    actions = (SAMPLED, MODE) if mode is None else (MODE if mode else SAMPLED,)
+    rows = measure(
+        spec,
+        Place(synthetic.name, synthetic, synthetic.params(weights)),
+        judge_in,
+        Agents.drawn_from(spec, seed, num_agents),
+        episodes=num_episodes,
+        actions=actions,
+    )
+    returns = pivot(rows, "actions", "agent")
+    return {f"{kind}_actions": of_it for kind, of_it in zip(actions, returns, strict=True)}

@@ -23,6 +23,7 @@ from scb.errors import UserError
 from scb.evaluation import evaluate
 from scb.evolution import EnvironmentSteps, EvolutionConfig, evolve
 from scb.keys import named_key, root_key, split_key
+from scb.measurement import Judge, train_and_judge
 from scb.neuroevolution import network_action, policy_network
 
 EPISODES = 20  # by which an expert is judged
@@ -73,16 +74,13 @@ def best_agent(
     Raises:
       UserError: no agent has a finite return.
     """
+    judges = {"return": Judge(agent.env, env_params, num_episodes, mode=True)}
     training_params = spec.training_params(env_params)
 
     @jax.jit
     def train(key: jax.Array) -> tuple[Any, jax.Array]:
-        key_train, key_evaluate = split_key(key)
-        state = agent.train(key_train, spec.hyperparameters, training_params)
-        episodes = agent.evaluate(
-            state, key_evaluate, num_episodes, env_params=env_params, mode=True
-        )
-        return state, episodes.returns.mean()
+        state, earned = train_and_judge(agent, spec.hyperparameters, key, training_params, judges)
+        return state, earned["return"].returns.mean()
 
     states, returns = jax.vmap(train)(split_key(key, num_agents))
     if not bool(jnp.isfinite(returns).any()):

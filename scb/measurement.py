@@ -69,10 +69,10 @@ def train_and_judge(
     hyperparameters: Any,
     key: jax.Array,
     params: Any,
-    judges: Mapping[str, Judge],
+    judges: Mapping[Any, Judge],
     every: int | None = None,
     iterations: jax.Array | None = None,
-) -> tuple[Any, dict[str, Episodes]]:
+) -> tuple[Any, dict[Any, Episodes]]:
     """One agent's training, and what it earns. Traced: to be jitted and vmapped by the caller.
 
     Args:
@@ -87,7 +87,7 @@ def train_and_judge(
       The trained agent's state, and {judge: episodes}, of shape [points, E] with `every`, else [E].
     """
 
-    def judged(state: Any, key: jax.Array) -> dict[str, Episodes]:
+    def judged(state: Any, key: jax.Array) -> dict[Any, Episodes]:
         return {name: judge(agent, state, key) for name, judge in judges.items()}
 
     if every is not None:

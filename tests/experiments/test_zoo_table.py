@@ -8,11 +8,12 @@ import pytest
 
 import scb.agents.spec as specs
 from experiments import zoo_table, zoo_table_page
-from scb.discovery import SyntheticTraining, judge
+from scb.discovery import judge
 from scb.environments.registry import environment_spec, make
 from scb.environments.synthetic import BanditConfig, bandit_for
 from scb.environments.zoo import load_bandit, save_bandit
 from scb.errors import UserError
+from scb.measurement import Place
 from scb.statistics import estimate, iqm
 
 MACHINE = {"processor": "AMD EPYC", "cores": 2}
@@ -173,8 +174,8 @@ def test_a_measurement_is_what_judging_gives_and_is_not_repeated(tiny, tmp_path,
     env, params = make("CartPole-v1")
     bandit = load_bandit(path)
     spec = small("ppo", "CartPole-v1")
-    training = SyntheticTraining(bandit, env, params, spec)
-    expected = judge(training, bandit.default_params.weights, 10_000, 2, 2)
+    place = Place("CartPole-v1", env, params)
+    expected = judge(spec, bandit, bandit.default_params.weights, place, 10_000, 2, 2)
     for actions, returns in expected.items():
         assert made[actions]["agents"] == pytest.approx(returns, abs=1e-3)
         assert made[actions]["iqm"]["value"] == pytest.approx(float(iqm(returns)), abs=1e-3)
@@ -186,7 +187,7 @@ def test_a_measurement_is_what_judging_gives_and_is_not_repeated(tiny, tmp_path,
 
     calls = []
 
-    def counted(training, weights, seed, num_agents, num_episodes):
+    def counted(spec, synthetic, weights, judge_in, seed, num_agents, num_episodes):
         calls.append((seed, num_agents, num_episodes))
         return {"sampled_actions": np.ones(num_agents), "mode_actions": np.ones(num_agents)}
 

@@ -129,8 +129,9 @@ def test_area_is_the_mean_over_the_training_and_a_new_fitness_is_one_entry(
     monkeypatch.setitem(FITNESSES, "worst", worst)
 
     class Recorded:
-        def train_with_evaluations(self, *arguments, every):
-            return None, jnp.array([100.0, 1.0, 2.0, 6.0])
+        def train_with_evaluations(self, *arguments):
+            returns = jnp.array([[100.0], [1.0], [2.0], [6.0]])
+            return None, {"return": Episodes(returns, returns)}
 
     problem = TaskTraining(replace(config, fitness=name, reward_noise=0.0), PENDULUM)
     problem.agent = Recorded()
@@ -144,7 +145,7 @@ def test_a_fitness_says_which_actions_judge_and_where(config):
         def train(self, *arguments):
             return None
 
-        def evaluate(self, state, key, episodes, env, env_params, mode):
+        def evaluate(self, state, key, episodes, env, env_params, mode, limit):
             seen.append((type(env).__name__, mode))
             return Episodes(*[jnp.full(episodes, -1.0)] * 2)
 
@@ -251,10 +252,11 @@ def test_steps_of_a_candidate(config, changes, training, evaluation):
 
 
 def test_area_of_a_training_with_a_prime_number_of_batches_has_equal_distances(config):
-    # A fifth of 13 is 2, which does not divide it; 1 does: 13 points and the start.
+    # Nothing near a fifth of 13 divides it: 15 batches have five points and the start.
     agent = replace(config.agent, total_steps=13 * 8)
     problem = MetaTraining(replace(config, fitness="area", agent=agent, reward_noise=0.0))
-    assert problem.steps().evaluation == 14 * 2
+    steps = problem.steps()
+    assert (steps.training, steps.evaluation) == (15 * 8, 6 * 2)
 
 
 # -- several tasks -------------------------------------------------------------------------------

@@ -287,7 +287,7 @@ def test_a_file_gives_the_lists_to_draw_from(tmp_path):
     path.write_text('{"ppo": {"learning_rate": [0.25, 1]}, "sac": {"polyak": [0.5]}}')
     config = asked_for("--hyperparameters", path)
     assert config.lists == {"ppo": {"learning_rate": (0.25, 1)}, "sac": {"polyak": (0.5,)}}
-    drawn = BanditDiscovery(config).trainings["ppo"].spec.sample(jax.random.key(0), 2)
+    drawn = BanditDiscovery(config).specs["ppo"].sample(jax.random.key(0), 2)
     assert sorted(drawn.learning_rate.tolist()) == [0.25, 1.0]
     # The content itself does too, so that a run's command is whole without the file.
     assert asked_for("--hyperparameters", path.read_text()) == config

@@ -7,13 +7,12 @@ import pytest
 from gymnax.environments import spaces
 
 from scb.agents.dqn import DQNConfig
-from scb.agents.ppo import PPO, PPOConfig, PPOHyperparameters
+from scb.agents.ppo import PPOConfig, PPOHyperparameters
 from scb.agents.spec import AgentSpec, algorithms_for, bandit_agent
 from scb.curriculum import CurriculumConfig, paper_curriculum
 from scb.discovery import (
     BanditDiscovery,
     DiscoveryConfig,
-    SyntheticTraining,
     check_fits,
     discover,
     judge,
@@ -30,7 +29,9 @@ from scb.environments.zoo import (
     zoo_names,
 )
 from scb.errors import UserError
+from scb.evaluation import Episodes
 from scb.evolution import EvolutionConfig, map_population
+from scb.measurement import Place
 from scb.runs import Run, config_dict
 from scb.statistics import iqm
 from scb.warm_start import WarmStartConfig
@@ -106,28 +107,20 @@ def test_agents_trained_in_a_bandit_do_in_the_environment_what_the_bandit_reward
     bad = {**good, "reward": {**good["reward"], "Dense_1": turned}}
     corridor = CorridorParams(rewards=jnp.array([[0.0, 1.0], [1.0, 0.0]]), last=1)
     config = replace(TINY, num_steps=64, num_epochs=4, num_minibatches=4, total_steps=128 * 20)
-    spec = AgentSpec("ppo", config, PPOHyperparameters())
-    training = SyntheticTraining(bandit, Corridor(cells=2), corridor, spec)
-
-    def returns(reward_weights, key):
-        hyperparameters = PPOHyperparameters(learning_rate=0.02)
-        return training.returns(reward_weights, hyperparameters, key, 4, mode=True).mean()
-
-    population = map_population(returns, 8, (None, 0))
-    keys = jax.random.split(jax.random.key(0), 8)
-    np.testing.assert_array_equal(population(good, keys), 2.0)
-    np.testing.assert_array_equal(population(bad, keys), 0.0)
+    spec = AgentSpec("ppo", config, PPOHyperparameters(learning_rate=0.02))
+    place = Place("corridor", Corridor(cells=2), corridor)
+    for weights, best in ((good, 2.0), (bad, 0.0)):
+        returns = judge(spec, bandit, weights, place, 0, num_agents=8, num_episodes=4, mode=True)
+        np.testing.assert_array_equal(returns["mode_actions"], best)
 
 
 def worth(name, sampled=True, **size):
     """[N] returns of PPO agents of a bandit of the zoo, on seeds that were not reported."""
     metadata = bandit_metadata(name)
     target, physics = name.removeprefix(PREFIX), metadata["config"].get("backend")
-    env, env_params = make(target, **({} if physics is None else {"backend": physics}))
     bandit, params = make(name)
-    spec = bandit_agent("ppo", target, sampled)
-    training = SyntheticTraining(bandit, env, env_params, spec)
-    returns = judge(training, params.weights, seed=123_456, mode=False, **size)
+    place, spec = Place.named(target, physics), bandit_agent("ppo", target, sampled)
+    returns = judge(spec, bandit, params.weights, place, seed=123_456, mode=False, **size)
     return returns["sampled_actions"]
 
 
@@ -189,48 +182,26 @@ def test_environment_steps_of_a_candidate(discovered):
     assert (steps.training, steps.evaluation) == (3 * 2 * 16, 3 * 2 * 500)
 
 
-def test_judging_takes_new_agents_for_another_seed(discovered):
+def test_judging_is_of_the_same_agents_whatever_their_actions_and_of_others_for_another_seed(
+    discovered, monkeypatch
+):
     problem, outcome = discovered
-    training = problem.trainings["ppo"]
-    a, b, c = (
-        judge(training, outcome.mean, seed, num_agents=5, num_episodes=2) for seed in (1, 1, 2)
-    )
-    assert set(a) == {"sampled_actions", "mode_actions"}
-    for actions, returns in a.items():
-        assert returns.shape == (5,)
-        np.testing.assert_array_equal(returns, b[actions])
-        assert (returns != c[actions]).any() and len(set(returns)) > 1
-
-
-@pytest.mark.slow
-def test_judging_trains_once_and_evaluates_twice(discovered, monkeypatch):
-    problem, outcome = discovered
-    bandit, spec = problem.bandit, problem.trainings["ppo"].spec
-    training = SyntheticTraining(bandit, problem.env, problem.env_params, spec)
-    calls = []
-
-    def counted(name):
-        method = getattr(training, name)
-
-        def call(*arguments):
-            calls.append(name)
-            return method(*arguments)
-
-        monkeypatch.setattr(training, name, call)
-
-    counted("train")
-    counted("evaluate")
-    both = judge(training, outcome.mean, 1, num_agents=5, num_episodes=2)
-    assert calls == ["train", "evaluate", "evaluate"]
-    # Other agents in a program that is there already: nothing is traced again.
-    judge(training, outcome.mean, 2, num_agents=5, num_episodes=2)
-    assert len(calls) == 3
-    # The two evaluations are of the same agents: one alone says the same.
+    place = Place("CartPole-v1", problem.env, problem.env_params)
+    arguments = (problem.specs["ppo"], problem.bandit, outcome.mean, place)
+    size = {"num_agents": 5, "num_episodes": 2}
+    both = judge(*arguments, 1, **size)
+    assert set(both) == {"sampled_actions", "mode_actions"}
+    assert (both["sampled_actions"] != both["mode_actions"]).any()
     for mode, name in ((False, "sampled_actions"), (True, "mode_actions")):
-        alone = judge(training, outcome.mean, 1, num_agents=5, num_episodes=2, mode=mode)
+        alone = judge(*arguments, 1, mode=mode, **size)
         assert alone.keys() == {name}
         np.testing.assert_array_equal(alone[name], both[name])
-    assert (both["sampled_actions"] != both["mode_actions"]).any()
+    # Other agents, in a program that is there already: nothing is traced again.
+    monkeypatch.delattr("scb.measurement.train_and_judge")
+    other = judge(*arguments, 2, **size)
+    for actions, returns in other.items():
+        assert returns.shape == (5,)
+        assert (returns != both[actions]).any() and len(set(returns)) > 1
 
 
 # -- several algorithms
@@ -379,7 +350,7 @@ def test_an_empty_list_stands_for_the_papers_algorithms(environment):
     problem = BanditDiscovery(replace(CONFIG, environment=environment, algorithms=()))
     expected = algorithms_for(problem.env.action_space(problem.env_params))
     assert problem.config.algorithms == expected
-    assert tuple(problem.trainings) == expected
+    assert tuple(problem.specs) == expected
 
 
 # -- curricula
@@ -412,25 +383,33 @@ def test_a_curriculum_is_one_program_whose_horizon_is_traced():
     assert judged["fitness"] >= 8
 
 
-def test_the_papers_curriculum_raises_mountaincars_limit():
+def test_the_papers_curriculum_raises_mountaincars_limit(monkeypatch):
     # MountainCar pays -1 a step until the goal. Who always pushes left never gets there: -200 within
     # its own limit, -1000 within the curriculum's longest episodes, -600 half-way.
     curriculum = paper_curriculum("MountainCar-v0")
     problem = BanditDiscovery(replace(CONFIG, environment="MountainCar-v0", curriculum=curriculum))
     assert problem.steps().evaluation == 3 * 2 * 1000
-    training = problem.trainings["ppo"]
-    assert isinstance(training.agent, PPO)
+    agent = problem.specs["ppo"].agent(problem.bandit)
     weights = problem.bandit.init_weights(jax.random.key(0))
-    state = training.agent.init(
-        jax.random.key(1), PPOHyperparameters(), problem.bandit.params(weights)
-    )
+    state = agent.init(jax.random.key(1), PPOHyperparameters(), problem.bandit.params(weights))
     zeros = jax.tree.map(jnp.zeros_like, state.params["policy"])
     state = state.replace(params={**state.params, "policy": zeros})
+    judges = []
+
+    def record(agent, hyperparameters, key, params, of_it):
+        judges.append(of_it["return"]._replace(mode=True))
+        return None, {"return": Episodes(jnp.zeros(2), jnp.zeros(2))}
+
+    monkeypatch.setattr("scb.discovery.train_and_judge", record)
     key = jax.random.key(2)
+    problem.evaluate(weights, key, jnp.int32(0))
+    problem.evaluate_mean(weights, key)
+    along, mean = judges
+    assert along.limit == 1000
     for limit in (1000, 600, 200):
-        returns = training.evaluate(state, key, 2, True, jnp.int32(limit), curriculum.longest)
-        np.testing.assert_array_equal(returns, -float(limit))
-    np.testing.assert_array_equal(training.evaluate(state, key, 2, True), -200.0)
+        found = along._replace(limit=jnp.int32(limit))(agent, state, key)
+        np.testing.assert_array_equal(found.returns, -float(limit))
+    np.testing.assert_array_equal(mean(agent, state, key).returns, -200.0)
 
 
 def test_a_curriculum_must_end_within_the_environments_limit():
@@ -589,8 +568,8 @@ def test_a_bandit_fits_the_environments_of_its_shapes_only():
 def test_hyperparameters_are_drawn_from_the_papers_lists_or_fixed():
     sampled, fixed = (
         BanditDiscovery(replace(CONFIG, fixed_hyperparameters=fixed))
-        .trainings["ppo"]
-        .spec.sample(jax.random.key(0), 5)
+        .specs["ppo"]
+        .sample(jax.random.key(0), 5)
         for fixed in (False, True)
     )
     np.testing.assert_array_equal(fixed.learning_rate, np.full(5, 5e-3, np.float32))
@@ -603,24 +582,24 @@ def test_hyperparameters_are_drawn_from_the_papers_lists_or_fixed():
 def test_own_lists_take_the_place_of_the_papers():
     lists = {"ppo": {"learning_rate": (0.25,), "discount": (0.5, 0.75)}}
     problem = BanditDiscovery(replace(ALL, lists=lists))
-    own = problem.trainings["ppo"].spec.sample(jax.random.key(0), 4)
+    own = problem.specs["ppo"].sample(jax.random.key(0), 4)
     np.testing.assert_array_equal(own.learning_rate, np.full(4, 0.25))
     assert sorted(own.discount.tolist()) == [0.5, 0.5, 0.75, 0.75]
     # What the lists leave out keeps its default, and an algorithm that they leave out the paper's.
     np.testing.assert_array_equal(own.gae_lambda, np.full(4, np.float32(0.95)))
     paper = bandit_agent("dqn", "CartPole-v1")
-    assert problem.trainings["dqn"].spec.lists == paper.lists
+    assert problem.specs["dqn"].lists == paper.lists
 
 
 def test_the_inner_loop_is_the_papers_where_no_agent_is_given():
     problem = BanditDiscovery(replace(CONFIG, environment="Pendulum-v1", configs={}))
-    training = problem.trainings["ppo"]
-    assert training.spec == bandit_agent("ppo", "Pendulum-v1")
-    assert training.agent.config == PPOConfig(activation="relu")
+    spec = problem.specs["ppo"]
+    assert spec == bandit_agent("ppo", "Pendulum-v1")
+    assert spec.config == PPOConfig(activation="relu")
     # 10 000 steps each, and 2 episodes of Pendulum's 200.
     assert problem.steps().training == 3 * 10_000
     assert problem.steps().evaluation == 3 * 2 * 200
-    assert 0.01 not in training.spec.lists["learning_rate"]
+    assert 0.01 not in spec.lists["learning_rate"]
 
 
 @pytest.mark.parametrize(

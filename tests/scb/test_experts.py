@@ -175,12 +175,12 @@ class Ranked:
     """Agents that earn what their key draws: no number for some."""
 
     def __init__(self, failing):
-        self.failing = failing
+        self.failing, self.env = failing, None
 
     def train(self, key, hyperparameters, env_params):
         return jax.random.uniform(key)
 
-    def evaluate(self, state, key, num_episodes, env_params, mode):
+    def evaluate(self, state, key, num_episodes, *_):
         returns = jnp.where(state > self.failing, jnp.nan, state)
         return SimpleNamespace(returns=jnp.full(num_episodes, returns))
 
