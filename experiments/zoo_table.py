@@ -29,8 +29,8 @@ from experiments.zoo_table_page import (
     TARGETS,
     cell,
     environment_rank,
+    facts,
     figure,
-    markdown,
     pairs,
     place,
 )
@@ -272,7 +272,7 @@ EXPERIMENT = Experiment(
     title="The bandits, by environment and algorithm",
     measure=measure,
     draw=figure,
-    markdown=markdown,
+    facts=facts,
     options=Options,
 )
 

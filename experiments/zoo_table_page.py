@@ -1,7 +1,6 @@
 """The page and the figure of `experiments.zoo_table`, and what the paper states beside it."""
 
 import math
-import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -91,58 +90,29 @@ def place(entry: Mapping[str, Any]) -> tuple[Any, ...]:
     )
 
 
-def markdown(report: Mapping[str, Any]) -> str:
-    """The page with the table, the differences and the figure."""
+def facts(report: Mapping[str, Any]) -> dict[str, Any]:
+    """The table's rows, and what must be said of its entries."""
     entries = report["entries"]
-    kinds = {entry["bandit"] for entry in entries}
-    lines = [
-        "# The bandits, by environment and algorithm",
-        "",
-        *(f"`{command}`\n" for command in report["commands"]),
-        *textwrap.wrap(
-            f"{_protocol_text(entries)} Interquartile means with 95 % bootstrap intervals over agents.",
-            width=118,
-        ),
-        "",
-        "*Ours* are the bandits of this repository"
-        + (
-            ", *published* those that Liesen et al. (2024) released, measured here with the same"
-            if "published" in kinds
-            else "."
-        ),
-        *(["agents on the same seeds."] if "published" in kinds else []),
-        "*Paper* is the figure that Liesen et al. (2024) state for theirs, with their own agents. *Target* is the",
-        "return aimed at, and whether ours reaches it with the most likely actions / with sampled ones.",
-        *(
-            [
-                "The released bandits of Brax were found on *generalized* physics: in another, their rows say how they",
-                "carry over, not what they are worth at home.",
-            ]
-            if any(
-                entry["bandit"] == "published" and entry["backend"] not in (None, "generalized")
-                for entry in entries
-            )
-            else []
-        ),
-        "",
-        "| environment | algorithm | ours, most likely actions | ours, sampled | published, most likely actions "
-        "| published, sampled | paper | target |",
-        "| --- | --- | --- | --- | --- | --- | --- | --- |",
-    ]
+    rows = []
     for (name, algorithm), pair in pairs(entries).items():
         entry = next(iter(pair.values()))
         environment = entry["environment"]
-        cells = [
-            cell(pair[kind][actions]["iqm"]) if kind in pair else ""
-            for kind in BANDITS
-            for actions in ACTIONS
-        ]
-        paper = PAPER.get(environment, {}).get(algorithm)
-        if entry["backend"] not in (None, "generalized"):
-            paper = None  # theirs are of the generalized physics
-        target = _target_cell(environment, pair.get("ours"))
-        cells += ["" if paper is None else _number(paper), target]
-        lines.append(f"| {name} | {algorithm.upper()} | {' | '.join(cells)} |")
+        # What the paper states is of the generalized physics.
+        stated = PAPER if entry["backend"] in (None, "generalized") else {}
+        paper = stated.get(environment, {}).get(algorithm)
+        rows.append(
+            [
+                name,
+                algorithm.upper(),
+                *(
+                    cell(pair[kind][actions]["iqm"]) if kind in pair else ""
+                    for kind in BANDITS
+                    for actions in ACTIONS
+                ),
+                "" if paper is None else _number(paper),
+                _target_cell(environment, pair.get("ours")),
+            ]
+        )
     failed = [
         f"{entry['algorithm'].upper()} on {label(entry)} ({entry['bandit']}, {ACTIONS[actions]}): "
         f"{entry[actions]['failed']} of {entry['agents']}"
@@ -150,38 +120,23 @@ def markdown(report: Mapping[str, Any]) -> str:
         for actions in ACTIONS
         if entry[actions]["failed"]
     ]
-    if failed:
-        lines += ["", "Agents without a finite return, which count as the worst one: "]
-        lines[-1] += "; ".join(failed) + "."
-    if report.get("differences"):
-        lines += [
-            "",
-            "## Ours − published, paired by seed",
-            "",
-            "| environment | algorithm | most likely actions | sampled actions |",
-            "| --- | --- | --- | --- |",
-        ]
-        for row in report["differences"]:
-            cells = [cell(row.get(actions), signed=True) for actions in ACTIONS]
-            lines.append(
-                f"| {row['environment']} | {row['algorithm'].upper()} | {' | '.join(cells)} |"
-            )
-    lines += [
-        "",
-        "![Returns in the environment of agents trained in the bandits](figures/zoo_table.png)",
-        "",
-        "The dotted lines are the return that Liesen et al. (2024) state for SAC trained on the environment itself.",
-        "",
-        f"Measured on {report['machine']['cores']} cores of {_processor(report['machine'])}. "
-        "Versions and every agent's return: [data/zoo_table.json](data/zoo_table.json).",
-        "",
+    differences = [
+        [row["environment"], row["algorithm"].upper()]
+        + [cell(row.get(actions), signed=True) for actions in ACTIONS]
+        for row in report["differences"]
     ]
-    return "\n".join(lines)
-
-
-def _processor(machine: Mapping[str, Any]) -> str:
-    name = machine["processor"]
-    return f"an {name}" if name[:1] in "AEIO" else f"a {name}"
+    kinds = {entry["bandit"] for entry in entries}
+    moved = any(
+        x["bandit"] == "published" and x["backend"] not in (None, "generalized") for x in entries
+    )
+    return {
+        "protocol": _protocol_text(entries),
+        "rows": rows,
+        "failed": failed,
+        "against": differences,
+        "published": "published" in kinds,
+        "moved": moved,
+    }
 
 
 def _protocol_text(entries: Sequence[Mapping[str, Any]]) -> str:

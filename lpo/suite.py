@@ -70,6 +70,8 @@ class SuiteScores:
         value = value - times_reference * value[0]
         low, high = np.percentile(drawn - times_reference * drawn[:, :1], [2.5, 97.5], axis=0)
         size = int(self.scores[0].size)
+        if self.scores.shape[2] == 1:  # one seed says nothing of its spread
+            return [Estimate(float(v), None, None, size) for v in value]
         return [
             Estimate(float(v), float(a), float(b), size)
             for v, a, b in zip(value, low, high, strict=True)

@@ -62,7 +62,7 @@ PENDULUM = report(
 
 
 def test_a_row_holds_the_measured_the_papers_and_the_target():
-    cells = row_of(zoo_table_page.markdown(PENDULUM), "Pendulum-v1", "TD3")
+    cells = row_of(zoo_table.EXPERIMENT.page(PENDULUM), "Pendulum-v1", "TD3")
     values = [cell.split(" [")[0] for cell in cells[2:6]]
     assert values == ["−160.0", "−180.0", "−200.0", "−210.0"]
     # -160 is above the target of -170, -180 is not.
@@ -70,7 +70,7 @@ def test_a_row_holds_the_measured_the_papers_and_the_target():
 
 
 def test_the_difference_is_paired_and_signed():
-    text = zoo_table_page.markdown(PENDULUM).split("## Ours − published")[1]
+    text = zoo_table.EXPERIMENT.page(PENDULUM).split("## Ours − published")[1]
     cells = row_of(text, "Pendulum-v1", "TD3")
     # -160 - -200 = 40 and -180 - -210 = 30.
     assert [cell.split(" [")[0] for cell in cells[2:]] == ["+40.00", "+30.00"]
@@ -89,13 +89,13 @@ def test_an_agent_without_a_finite_return_counts_as_the_worst_and_is_told():
     assert broken["iqm"]["value"] == pytest.approx(-3.5)
     assert broken["agents"] == [-4.0, None, -3.0, -2.0]
     made = entry("Pendulum-v1", "ppo", "ours", [np.nan, -4, -3, -2], [-1, -2, -3, -4])
-    text = zoo_table_page.markdown(report(made))
+    text = zoo_table.EXPERIMENT.page(report(made))
     assert "PPO on Pendulum-v1 (ours, most likely actions): 1 of 4" in text
 
 
 def test_the_page_says_how_many_episodes_and_which_physics():
     hopper = entry("hopper", "ppo", "ours", [1, 2, 3], [1, 2, 3], episodes=5, backend="generalized")
-    text = zoo_table_page.markdown(report(hopper, *PENDULUM["entries"]))
+    text = zoo_table.EXPERIMENT.page(report(hopper, *PENDULUM["entries"]))
     prose = " ".join(text.split())
     assert "Classic control: hyperparameters drawn from the paper's lists, 50 episodes" in prose
     assert "Brax (generalized physics): the paper's fixed hyperparameters, 5 episodes" in prose
@@ -182,7 +182,7 @@ def test_a_measurement_is_what_judging_gives_and_is_not_repeated(tiny, tmp_path,
         assert made[actions]["iqm"]["low"] == pytest.approx(estimate(returns).low, abs=1e-3)
     assert (made["training_steps"], made["seed"], made["backend"]) == (16, 10_000, None)
     assert str(tmp_path) not in json.dumps(stored)
-    assert (tmp_path / "zoo_table.md").read_text() == zoo_table_page.markdown(stored)
+    assert (tmp_path / "zoo_table.md").read_text() == zoo_table.EXPERIMENT.page(stored)
     assert (tmp_path / "figures" / "zoo_table.png").stat().st_size > 10_000
 
     calls = []
@@ -218,7 +218,7 @@ def test_only_rendering_measures_nothing(tmp_path, monkeypatch):
     out.write_text(json.dumps(PENDULUM))
     arguments = ["--only-render", "--out", str(out), "--docs", str(tmp_path)]
     assert zoo_table.EXPERIMENT.main(arguments) == 0
-    assert (tmp_path / "zoo_table.md").read_text() == zoo_table_page.markdown(PENDULUM)
+    assert (tmp_path / "zoo_table.md").read_text() == zoo_table.EXPERIMENT.page(PENDULUM)
 
 
 def test_rendering_without_a_report_says_to_measure_first(tmp_path, capsys):
@@ -295,7 +295,7 @@ def test_a_bandit_stands_in_the_table_once_for_every_physics():
         for physics, x in (("generalized", 1.0), ("spring", 5.0))
         for kind in ("ours", "published")
     ]
-    text = zoo_table_page.markdown(report(*both))
+    text = zoo_table.EXPERIMENT.page(report(*both))
     rows = [line for line in text.splitlines() if line.startswith("| hopper")]
     assert [row.split(" | ")[0] for row in rows[:2]] == [
         "| hopper (generalized)",

@@ -53,6 +53,13 @@ def test_zero_is_random_and_one_is_the_reference():
     assert scores.sources[1] == "the best objective here"
 
 
+def test_one_seed_has_no_interval():
+    one = suite_scores(
+        {"CartPole-v1": comparison("CartPole-v1", ppo=[260.0], dpo=[500.0])}, {"CartPole-v1": 20.0}
+    )
+    assert {(x.low, x.high) for x in (*one.aggregate(), *one.differences())} == {(None, None)}
+
+
 def test_published_brax_returns_are_of_one_physics():
     here = [curves("hopper", "ppo", [600.0, 700.0], backend="spring")]
     there = [curves("hopper", "ppo", [600.0, 700.0], backend="generalized")]
