@@ -106,51 +106,25 @@ def recommendation(report: Mapping[str, Any]) -> str:
     return said.replace(" -", " \u2212")
 
 
-def markdown(report: Mapping[str, Any]) -> str:
-    """The page with the tables."""
-    lines = [
-        "# Which bandit regime ranks objectives as the environment does",
-        "",
-        f"`{report['command']}`",
-        "",
-        "Every objective of the family trains PPO on the environment and in each regime of a bandit. The table "
-        "gives Spearman's correlation between a regime's fitness and the environment's final return (IQM), with "
-        "95 % bootstrap intervals over agents. Drawing agents again adds their scatter once more to what is ranked, so "
-        "an interval of few agents leans downwards and may even lie below its estimate. A regime differs from the "
-        "default (reward noise 5, 200 contexts, the environment's own number of iterations, epochs, minibatches and "
-        "learning rate) in what its name says.",
-        "",
-        recommendation(report),
-    ]
-    for name, stage in report["stages"].items():
-        family = ", ".join(
-            f"{objective} {value:.0f}".replace(" -", " \u2212", 1)
-            for objective, value in stage["outcome_iqm"].items()
-        )
-        lines += [
-            "",
-            f"## {stage['environment']}: {stage['role']}",
-            "",
-            f"Seeds {stage['first_seed']} to {stage['first_seed'] + stage['agents'] - 1}. "
-            + (f"Return after {stage['steps']} steps" if stage["steps"] else "Final return")
-            + f" (IQM): {family}.",
-            "",
-            f"![Correlations with {stage['environment']}](figures/{figure_name(name)}.png)",
-            "",
-            "| regime | " + " | ".join(LABELS) + " |",
-            "| --- |" + " --- |" * len(LABELS),
-            *(
-                f"| {regime_label(row, stage['environment'])} | "
-                + " | ".join(
-                    correlation_text(row["alignment"][f]).replace("-", "\u2212") for f in LABELS
-                )
-                + " |"
-                for row in stage["regimes"]
-            ),
+def facts(report: Mapping[str, Any]) -> dict[str, Any]:
+    """Every stage's table."""
+    tables = {
+        name: [
+            [
+                regime_label(row, stage["environment"]),
+                *(correlation_text(row["alignment"][f]).replace("-", "\u2212") for f in LABELS),
+            ]
+            for row in stage["regimes"]
         ]
-    machine = next(iter(report["stages"].values()))["machine"]
-    lines += ["", f"Measured on {machine['cores']} cores, {machine['processor']}.", ""]
-    return "\n".join(lines)
+        for name, stage in report["stages"].items()
+    }
+    return {
+        "recommendation": recommendation(report),
+        "tables": tables,
+        "fitnesses": list(LABELS),
+        "files": {name: figure_name(name) for name in tables},
+        "measured": next(iter(report["stages"].values()))["machine"],
+    }
 
 
 def same_drift(one: Objective, other: Objective) -> bool:
@@ -266,7 +240,7 @@ EXPERIMENT = Experiment(
     title="Which bandit regime ranks objectives as the environment does",
     measure=measure,
     draw=draw,
-    markdown=markdown,
+    facts=facts,
     options=Options,
     keys=("stages",),
 )

@@ -178,65 +178,33 @@ def _place(run: Mapping[str, Any]) -> tuple[Any, ...]:
     return (rank, name, STARTS.index(run["start"]), run["seed"], run["name"])
 
 
-def markdown(report: Mapping[str, Any]) -> str:
-    """The page with the table and the figure."""
-    runs = report["runs"]
-    lines = [
-        "# What discovering a bandit costs",
-        "",
-        "`python -m experiments.discovery_cost RUN_FOLDER ...`, on runs of `scb discover`. A *warm* start fits the",
-        "bandit to an expert first, a *random* one begins with random weights, as in the paper.",
-        "",
-        "The return is the interquartile mean (where a run logged none, the mean) over the agents that judge the",
-        "search distribution's mean, every few generations on the same seeds; their own steps are not counted.",
-        "Training steps are steps of the bandit, evaluation steps those of the environment (episodes that",
-        "end early count in full), and a warm start's are those of its expert.",
-        "The total counts all three. *To the target* says when that return first stood at the target or above. It is",
-        "noisy: what a bandit is worth is measured on other seeds.",
-        "",
-        "| environment | start | seed | generations | warm start | training | evaluation | total steps | minutes "
-        "| target | to the target: generations | minutes | steps | return at the end |",
-        "| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |",
-    ]
-    for run in runs:
+def facts(report: Mapping[str, Any]) -> dict[str, Any]:
+    """The table's rows, and what a reader must know about these runs."""
+    rows = []
+    for run in report["runs"]:
         steps, reached, target = run["steps"], run["reached"], run["target"]
         unfinished = run["planned_generations"] not in (None, run["generations"])
-        generations = f"{run['generations']}" + (
-            f" of {run['planned_generations']}" if unfinished else ""
-        )
-        if target is None:
-            to_target = ["", "", ""]
-        elif reached is None:
-            to_target = ["not reached", "", ""]
-        else:
-            to_target = [
-                str(reached["generation"]),
-                f"{reached['minutes']:.1f}",
-                _count(reached["steps"]),
+        of_all = f" of {run['planned_generations']}" if unfinished else ""
+        to_target = ["" if target is None else "not reached", "", ""]
+        if reached is not None:
+            minutes = f"{reached['minutes']:.1f}"
+            to_target = [str(reached["generation"]), minutes, _count(reached["steps"])]
+        warm = steps["warm_start"]
+        rows.append(
+            [
+                run["environment"],
+                run["start"],
+                str(run["seed"]),
+                f"{run['generations']}{of_all}",
+                "not recorded" if warm is None else _count(warm),
+                *(_count(steps[kind]) for kind in ("training", "evaluation", "total")),
+                f"{run['minutes']:.1f}",
+                "" if target is None else _number(target),
+                *to_target,
+                _end(run),
             ]
-        cells = [
-            run["environment"],
-            run["start"],
-            str(run["seed"]),
-            generations,
-            "not recorded" if steps["warm_start"] is None else _count(steps["warm_start"]),
-            _count(steps["training"]),
-            _count(steps["evaluation"]),
-            _count(steps["total"]),
-            f"{run['minutes']:.1f}",
-            "" if target is None else _number(target),
-            *to_target,
-            _end(run),
-        ]
-        lines.append(f"| {' | '.join(cells)} |")
-    lines += ["", *_notes(report)]
-    lines += [
-        "![Return of the search distribution's mean against minutes and environment steps](figures/discovery_cost.png)",
-        "",
-        "The points of the curves: [data/discovery_cost.json](data/discovery_cost.json).",
-        "",
-    ]
-    return "\n".join(lines)
+        )
+    return {"rows": rows, "notes": _notes(report)}
 
 
 def _notes(report: Mapping[str, Any]) -> list[str]:
@@ -267,7 +235,7 @@ def _notes(report: Mapping[str, Any]) -> list[str]:
     if report["left_out"]:
         left_out = "; ".join(f"{left['name']}, since {left['why']}" for left in report["left_out"])
         notes.append(f"Left out: {left_out}.")
-    return [line for note in notes for line in (note, "")]
+    return notes
 
 
 def _end(run: Mapping[str, Any]) -> str:
@@ -379,7 +347,7 @@ EXPERIMENT = Experiment(
     title="What discovering a bandit costs",
     measure=measure,
     draw=figure,
-    markdown=markdown,
+    facts=facts,
     options=Options,
     keys=("runs",),
 )

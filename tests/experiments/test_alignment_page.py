@@ -54,7 +54,7 @@ def test_a_reports_command_says_what_is_measured_and_not_where_it_is_written():
 def test_the_committed_page_is_that_of_the_committed_report():
     docs = Path(alignment.__file__).parents[1] / "docs"
     report = json.loads((docs / "data" / "alignment.json").read_text())
-    assert (docs / "alignment.md").read_text() == alignment.markdown(report)
+    assert (docs / "alignment.md").read_text() == alignment.EXPERIMENT.page(report)
 
 
 def test_what_is_held_out_is_not_in_the_family_under_another_name(tmp_path, capsys):

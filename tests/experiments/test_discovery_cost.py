@@ -63,7 +63,7 @@ def test_the_target_is_reached_at_the_first_judgement_above_it(tmp_path):
     [run] = discovery_cost.collect([run_folder(tmp_path / "a")])["runs"]
     # Pendulum's target is -170; -165 at generation 2 is the first above it.
     assert run["reached"] == {"generation": 2, "minutes": 1.5, "steps": 220, "mean": -165.0}
-    cells = cells_of(discovery_cost.markdown({"runs": [run], "left_out": []}), "warm")
+    cells = cells_of(discovery_cost.EXPERIMENT.page({"runs": [run], "left_out": []}), "warm")
     assert cells[9:13] == ["−170", "2", "1.5", "220"]
     assert cells[13] == "−150 (PPO −151, SAC −149)"
 
@@ -71,7 +71,7 @@ def test_the_target_is_reached_at_the_first_judgement_above_it(tmp_path):
 def test_the_end_shows_interquartile_means_where_they_are_logged(tmp_path):
     [run] = discovery_cost.collect([run_folder(tmp_path / "a")])["runs"]
     run["algorithms"] = {"ppo": -150.0, "ppo_iqm": -140.0}
-    cells = cells_of(discovery_cost.markdown({"runs": [run], "left_out": []}), "warm")
+    cells = cells_of(discovery_cost.EXPERIMENT.page({"runs": [run], "left_out": []}), "warm")
     assert cells[13] == "−150 (IQM: PPO −140)"
 
 
@@ -84,7 +84,7 @@ def test_a_run_that_never_gets_there_says_so(tmp_path):
     folder = run_folder(tmp_path / "a", judged={0: -400.0}, final=-300.0)
     report = discovery_cost.collect([folder])
     assert report["runs"][0]["reached"] is None
-    assert "not reached" in cells_of(discovery_cost.markdown(report), "warm")
+    assert "not reached" in cells_of(discovery_cost.EXPERIMENT.page(report), "warm")
 
 
 def test_a_warm_start_is_paid_for_where_it_is_recorded(tmp_path):
@@ -96,7 +96,7 @@ def test_a_warm_start_is_paid_for_where_it_is_recorded(tmp_path):
     assert first["points"][-1] == [4, 4.5, 1440, -150.0]
     assert (first["minutes"], first["steps"]["total"]) == (4.5, 1440)
     assert second["steps"]["warm_start"] is None
-    text = discovery_cost.markdown(report)
+    text = discovery_cost.EXPERIMENT.page(report)
     assert "not recorded" in text
     assert "leave out the warm start's own" in text
 
@@ -121,7 +121,9 @@ def test_runs_that_start_elsewhere_are_left_out_and_named(tmp_path):
     report = discovery_cost.collect([kept, continued, mdp])
     assert [run["name"] for run in report["runs"]] == ["kept"]
     assert [x["name"] for x in report["left_out"]] == ["continued", "mdp"]
-    assert "continued, since it continues from another bandit" in discovery_cost.markdown(report)
+    assert "continued, since it continues from another bandit" in discovery_cost.EXPERIMENT.page(
+        report
+    )
     with pytest.raises(UserError, match="no run starts warm or random"):
         discovery_cost.collect([continued])
 
@@ -138,7 +140,7 @@ def test_a_run_in_progress_is_read_up_to_its_last_whole_line(tmp_path):
     [run] = report["runs"]
     assert run["generations"] == 2
     assert run["points"] == [[0, 0.0, 0, -400.0]]
-    assert "2 of 4" in cells_of(discovery_cost.markdown(report), "warm")
+    assert "2 of 4" in cells_of(discovery_cost.EXPERIMENT.page(report), "warm")
 
 
 def test_settings_that_differ_are_told(tmp_path):
@@ -146,7 +148,7 @@ def test_settings_that_differ_are_told(tmp_path):
         run_folder(tmp_path / "a"),
         run_folder(tmp_path / "b", "random", population_size=64),
     ]
-    text = discovery_cost.markdown(discovery_cost.collect(folders))
+    text = discovery_cost.EXPERIMENT.page(discovery_cost.collect(folders))
     assert "The runs of Pendulum-v1 differ in population size: 32, 64." in text
 
 
@@ -179,7 +181,7 @@ def test_the_command_writes_what_it_can_render_again(tmp_path, capsys):
     assert str(tmp_path) not in out.read_text()
     page, image = docs / "discovery_cost.md", docs / "figures" / "discovery_cost.png"
     before = page.read_text(), image.read_bytes()
-    assert before[0] == discovery_cost.markdown(stored)
+    assert before[0] == discovery_cost.EXPERIMENT.page(stored)
     page.unlink()
     assert discovery_cost.EXPERIMENT.main(["--only-render", *places]) == 0
     assert (page.read_text(), image.read_bytes()) == before
