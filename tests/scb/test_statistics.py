@@ -2,12 +2,11 @@ import json
 
 import numpy as np
 import pytest
+import scipy.stats
 
 from scb.errors import UserError
 from scb.statistics import (
     Estimate,
-    Interval,
-    bootstrap_interval,
     estimate,
     iqm,
     normalized_score,
@@ -37,45 +36,58 @@ def test_iqm_reduces_the_axis_it_is_told():
 
 
 def test_constant_runs_have_an_interval_of_width_zero():
-    assert bootstrap_interval([7.0] * 10) == Interval(7.0, 7.0)
+    assert estimate([7.0] * 10) == Estimate(7.0, 7.0, 7.0, 10)
 
 
 def test_a_single_run_has_a_value_but_no_interval():
-    assert bootstrap_interval([7.0]) == Interval(None, None)
     assert estimate([7.0]) == Estimate(7.0, None, None, 1)
 
 
 def test_interval_of_two_runs_is_their_range():
     # Resamples of {0, 1} have means 0, 1/2, 1 with probability 1/4, 1/2, 1/4: the outer 2.5 % on
     # either side lie inside the quarters at 0 and at 1.
-    assert bootstrap_interval([0.0, 1.0]) == Interval(0.0, 1.0)
+    assert estimate([0.0, 1.0]) == Estimate(0.5, 0.0, 1.0, 2)
 
 
 def test_interval_of_a_mean_agrees_with_the_normal_approximation():
     # The mean of 400 numbers with standard deviation s: +- 1.96 s / sqrt(400).
     x = np.random.default_rng(0).normal(3.0, 2.0, 400)
     half_width = 1.96 * x.std() / 20
-    interval = bootstrap_interval(x, statistic=np.mean)
-    np.testing.assert_allclose(interval, (x.mean() - half_width, x.mean() + half_width), atol=0.02)
+    found = estimate(x, statistic=np.mean)
+    np.testing.assert_allclose(
+        (found.low, found.high), (x.mean() - half_width, x.mean() + half_width), atol=0.02
+    )
 
 
 def test_higher_confidence_gives_a_wider_interval():
     x = np.arange(20.0)
-    narrow, wide = bootstrap_interval(x, confidence=0.5), bootstrap_interval(x, confidence=0.99)
+    narrow, wide = estimate(x, confidence=0.5), estimate(x, confidence=0.99)
     assert wide.low < narrow.low < iqm(x) < narrow.high < wide.high
 
 
-def test_the_same_seed_gives_the_same_interval():
-    x = np.random.default_rng(1).normal(size=10)
-    assert bootstrap_interval(x, seed=3) == bootstrap_interval(x, seed=3)
-    assert bootstrap_interval(x, seed=3) != bootstrap_interval(x, seed=4)
+def test_intervals_are_those_of_scipy():
+    x, y = np.random.default_rng(1).normal(size=(2, 12))
+    settings = {"method": "percentile", "n_resamples": 10_000, "paired": True}
+
+    def difference(x, y, axis):
+        return iqm(x, axis=axis) - iqm(y, axis=axis)
+
+    for found, samples, statistic in (
+        (estimate(x), (x,), iqm),
+        (paired_difference(x, y), (x, y), difference),
+    ):
+        rng = np.random.default_rng(0)
+        low, high = scipy.stats.bootstrap(
+            samples, statistic, rng=rng, **settings
+        ).confidence_interval
+        np.testing.assert_allclose((found.low, found.high), (low, high), rtol=1e-12)
 
 
 def test_the_interval_does_not_depend_on_how_resamples_are_batched(monkeypatch):
     x = np.random.default_rng(1).normal(size=10)
-    whole = bootstrap_interval(x)
+    whole = estimate(x)
     monkeypatch.setattr("scb.statistics._NUMBERS_PER_BATCH", 70)
-    assert bootstrap_interval(x) == whole
+    assert estimate(x) == whole
 
 
 def test_paired_difference_is_the_difference_of_the_two_iqms():
@@ -136,7 +148,6 @@ def test_spearman_of_a_constant_is_undefined():
     "call",
     [
         iqm,
-        bootstrap_interval,
         estimate,
         lambda x: paired_difference([0.0, 0.0, 0.0], x),
         lambda x: normalized_score(x, 0.0, 1.0),
@@ -156,7 +167,7 @@ def test_runs_must_be_a_vector_and_confidence_a_probability():
     with pytest.raises(UserError, match="x is empty"):
         estimate([])
     with pytest.raises(UserError, match="confidence is 95"):
-        bootstrap_interval([1.0, 2.0], confidence=95)
+        estimate([1.0, 2.0], confidence=95)
 
 
 @pytest.mark.parametrize(
