@@ -24,8 +24,8 @@ from matplotlib.ticker import EngFormatter, LogLocator, NullFormatter, StrMethod
 
 from experiments.claims import OF_THE_WAY, TENTH, Claim
 from experiments.harness import Experiment, Preset, Report, Save
+from experiments.searches import objective_of_run
 from lpo.comparison import compare
-from lpo.learning import objective_of_run
 from lpo.objectives import Objective, load_objective
 from scb import plotting
 from scb.agents.spec import AgentSpec, environment_agent
@@ -347,9 +347,7 @@ class _Learned:
 
     @cached_property
     def objective(self) -> Objective:
-
-        config = {"command": "meta-train", "seed": self.seed, **self.settings}
-        found = objective_of_run(config, self.folder)
+        found = objective_of_run({"seed": self.seed, **self.settings}, self.folder)
         return replace(found, name=f"LPO ({self.source}) {self.seed}")
 
 

@@ -14,8 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments.harness import Experiment, Save
-from lpo.meta_training import MetaTraining, MetaTrainingConfig
-from lpo.pipeline import environment_problem
+from lpo.meta_training import MetaTraining, MetaTrainingConfig, environment_problem
 from scb.evolution import map_population
 from scb.keys import root_key
 from scb.runs import Stopwatch

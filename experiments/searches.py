@@ -10,6 +10,9 @@ from typing import Any
 import numpy as np
 
 from experiments.rendering import text
+from lpo.commands import MetaTrain
+from lpo.objectives import Objective, load_objective
+from scb.command_line import Output
 from scb.curriculum import CurriculumConfig, paper_curriculum
 from scb.discovery import BanditDiscovery, DiscoveryConfig, discover
 from scb.errors import UserError
@@ -76,6 +79,24 @@ def curriculum_of(environment: str, shape: str, generations: int) -> CurriculumC
             f"the paper has no curriculum for {environment}: its shape must be {NONE!r}."
         )
     return replace(curriculum, shape=shape)
+
+
+def meta_training(settings: Mapping[str, Any]) -> MetaTrain:
+    """The command `lpo meta-train` with flags, by name; True for a flag without a value."""
+    words = [
+        f"--{name.replace('_', '-')}" + ("" if value is True else f"={value}")
+        for name, value in settings.items()
+    ]
+    return MetaTrain.parse(words)
+
+
+def objective_of_run(settings: Mapping[str, Any], folder: Path) -> Objective:
+    """The objective of a run folder of that command: read, or learned first, or its run resumed."""
+    path = folder / "objective.npz"
+    if path.with_suffix(".json").exists():  # it is written last
+        return load_objective(path)
+    resume = folder if (folder / "config.json").exists() else None
+    return replace(meta_training(settings), output=Output(folder, resume)).objective()
 
 
 def search(config: DiscoveryConfig, folder: str | Path) -> tuple[BanditDiscovery, Outcome]:

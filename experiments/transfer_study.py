@@ -22,8 +22,8 @@ from matplotlib.ticker import MaxNLocator
 
 from experiments.claims import FAILS, HOLDS, UNDECIDED, Claim, judge
 from experiments.harness import Experiment, Report, Save
+from experiments.searches import meta_training, objective_of_run
 from lpo.comparison import compare
-from lpo.learning import command_of, objective_of_run
 from lpo.objectives import load_objective
 from scb.agents.spec import environment_agent
 from scb.errors import UserError, unknown_name
@@ -86,9 +86,8 @@ EVALUATIONS = (
 def settings_of(
     variation: str, seed: int, generations: int, population_size: int
 ) -> dict[str, Any]:
-    """The settings of `lpo meta-train` for a variation."""
+    """The flags of `lpo meta-train` for a variation."""
     return {
-        "command": "meta-train",
         "seed": seed,
         "population_size": population_size,
         "generations": generations,
@@ -256,7 +255,7 @@ def _learn(options: Options, name: str, seed: int, entry: dict[str, Any]) -> Any
     """A variation's objective of one search, and into the entry what it took."""
     settings = settings_of(name, seed, options.generations, options.population_size)
     objective = objective_of_run(settings, options.runs / f"{name.replace(' ', '-')}-{seed}")
-    entry["command"] = command_of("lpo", {**settings, "seed": None})
+    entry["command"] = meta_training({**settings, "seed": 0}).command
     cost = objective.metadata["cost"]
     entry["seconds"] = cost["seconds"]
     if "generation" in cost:

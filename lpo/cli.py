@@ -11,8 +11,8 @@ def _commands() -> dict[str, Any]:
     from lpo import commands
 
     return {
-        "run": commands.run,
-        "meta-train": commands.meta_train_command,
+        "run": commands.RunAll,
+        "meta-train": commands.MetaTrain,
         "train": commands.train,
         "evaluate": commands.evaluate,
         "align": commands.align,

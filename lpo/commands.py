@@ -6,34 +6,80 @@ import json
 import shlex
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
-from typing import Any
+from types import MappingProxyType
+from typing import Annotated, Any
 
 import numpy as np
 import tyro
 from rich.table import Table
 
-from lpo import figures, learning
+from lpo import figures
 from lpo.alignment import Regime, correlation_text, known_drifts, measure_alignment
 from lpo.certificate import certify
 from lpo.comparison import Comparison, check_names, compare
 from lpo.distill import DistillConfig, distill
+from lpo.drifts import LearnedDrift, learned_drift
 from lpo.fitness import LABELS
+from lpo.meta_training import (
+    TEMPORAL_HORIZONS,
+    VALIDATION_AGENTS,
+    MetaTraining,
+    MetaTrainingConfig,
+    learn_objective,
+)
 from lpo.objectives import Objective, load_objective, save_objective
 from lpo.pipeline import PRESETS as RUN_PRESETS
-from lpo.pipeline import check_settings, run_pipeline
+from lpo.pipeline import PipelineConfig, check_pipeline, run_pipeline
 from lpo.suite import run_suite
 from lpo.suite import suite as suite_environments
 from scb import plotting
 from scb.agents.spec import environment_agent
 from scb.artefacts import machine_description, package_versions
+from scb.command_line import LongRun, Output, listed
 from scb.console import console
 from scb.environments.registry import environment_spec
 from scb.errors import UserError, at_least
 from scb.measurement import Rows
 from scb.runs import Run, make_folder, read_config, write_json
 from scb.statistics import estimate
+
+
+def _meta_training(
+    population: int, generations: int, given: Mapping[str, str]
+) -> MetaTrainingConfig:
+    """A preset of meta-training."""
+    if "environment" in given and "tasks" in given:
+        raise UserError(
+            f"the environment {given['environment']} and the tasks {given['tasks']} are both given: name all in "
+            "the tasks."
+        )
+    named = given.get("tasks", given.get("environment"))
+    tasks = MetaTrainingConfig.tasks if named is None else listed(named, "tasks")
+    temporal = {"temporal": True} if "temporal" in given else {}
+    default = MetaTrainingConfig(
+        tasks=tasks,
+        drift=learned_drift(given.get("drift", LearnedDrift.name), **temporal),
+        horizons=TEMPORAL_HORIZONS if temporal else (),
+        validation="validate" in given,
+    )
+    evolution = replace(
+        default.evolution,
+        population_size=population,
+        num_generations=generations,
+        # Returns of different tasks have different scales.
+        combine="mean" if len(tasks) == 1 else "ranks",
+    )
+    if default.validation:
+        evolution = replace(evolution, mean_evaluations=VALIDATION_AGENTS)
+    return replace(default, evolution=evolution)
+
+
+def _constant(config: PipelineConfig, given: Mapping[str, str]) -> PipelineConfig:
+    """A preset of which no flag decides more than itself."""
+    return config
 
 
 def seed_list(count: int, first: int, counted: str = "seeds") -> list[int]:
@@ -43,151 +89,82 @@ def seed_list(count: int, first: int, counted: str = "seeds") -> list[int]:
     return list(range(first, first + count))
 
 
-def run(
-    preset: str | None = None,
-    seed: int | None = None,
-    out: Path = Path("runs/quick"),
-    resume: Path | None = None,
-    objective: str | None = None,
-) -> None:
+@dataclass(frozen=True, kw_only=True)
+class RunAll(LongRun):
     """The whole path: learn an objective on the Pendulum bandit, train PPO with it, judge it.
 
     Meta-trains a drift on the shipped bandit, then trains PPO with its own clip, with DPO and with
     the learned drift on Pendulum and on Brax Hopper, on the same seeds, and writes report.html,
     figures and results.json.
 
-    Args:
+    Attributes:
       preset: quick (eight minutes on two cores) or paper (the paper's sizes; hours).
-      seed: decides everything; the seeds that report are apart from those that learn.
-      out: folder to write; must be new or empty.
-      resume: a folder that an earlier, interrupted `lpo run` wrote: do what is missing there.
-      objective: take this objective (a zoo name or file.npz) instead of learning one.
     """
-    settings = learning.settle(
-        {"command": "run", "seed": seed, "objective": objective}, RUN_PRESETS, preset, resume
+
+    program = "lpo run"
+    presets = MappingProxyType(
+        {name: partial(_constant, config) for name, config in RUN_PRESETS.items()}
     )
-    settings["seed"] = settings.get("seed") or 0
-    if resume is None:
-        check_settings(settings)  # a mistake must not leave a folder behind
-    folder = Run.open(resume or out, settings, resume=resume is not None)
-    # Not as typed: resuming goes on with these settings, and this is what starts them afresh.
-    chosen = {name: settings[name] for name in ("preset", "seed", "objective")}
-    flags = [f"--{name}={value}" for name, value in chosen.items() if value is not None]
-    report = run_pipeline(folder, settings, shlex.join(["lpo", "run", *flags]))
-    console().print(f"report: {report}", soft_wrap=True)
+
+    config: Annotated[PipelineConfig, tyro.conf.arg(name="")] = RUN_PRESETS["quick"]
+    output: Output = field(default_factory=lambda: Output(Path("runs/quick")))
+
+    def run(self) -> None:
+        check_pipeline(self.config)  # a mistake must not leave a folder behind
+        report = run_pipeline(self.open(), self.config, self.preset, self.command)
+        console().print(f"report: {report}", soft_wrap=True)
 
 
-def meta_train_command(
-    environment: str | None = None,
-    tasks: str | None = None,
-    preset: str | None = None,
-    seed: int | None = None,
-    out: Path = Path("runs/meta-train"),
-    resume: Path | None = None,
-    fitness: str | None = None,
-    reward_noise: float | None = None,
-    drift: str | None = None,
-    base: str | None = None,
-    xi: float | None = None,
-    gate: float | None = None,
-    temporal: bool = False,
-    horizons: str | None = None,
-    hyperparameters: str | None = None,
-    combine: str | None = None,
-    strategy: str | None = None,
-    population_size: int | None = None,
-    generations: int | None = None,
-    agents_per_candidate: int | None = None,
-    sigma: float | None = None,
-    learning_rate: float | None = None,
-    contexts: int | None = None,
-    evaluation_episodes: int | None = None,
-    validate: bool = False,
-    mean_evaluations: int | None = None,
-    evaluate_mean_every: int | None = None,
-    backend: str | None = None,
-    wandb: str | None = None,
-) -> None:
+@dataclass(frozen=True, kw_only=True)
+class MetaTrain(LongRun):
     """Learn an objective: evolve a drift on a bandit, or on an environment.
 
-    Args:
-      environment: where the inner loop trains: Synthetic-Pendulum-v1, Pendulum-v1, hopper, ...
-      tasks: several of them at once, separated by commas; observations and actions may differ.
+    Attributes:
       preset: quick (30 generations of 32) or paper (512 of 64); single flags override it.
-      seed: decides everything.
-      out: folder to write; must be new or empty.
-      resume: a run folder to continue; its settings apply, and a flag that contradicts them is an
-        error.
-      fitness: return (of the trained agent where it was trained, without noise), return-sampled (with
-        sampled actions rather than the most likely ones), area (the mean over the training), or
-        transfer (return of the bandit-trained agent in the bandit's evaluation environment).
-      reward_noise: noise on the bandit's reward, in its standard deviations. Without it the drift
-        overfits the bandit.
-      drift: the family that is learned: network (Lu et al., 2022; the default) or another of
-        `lpo.drifts`. The next four are settings of a network.
-      base: ppo (the network corrects PPO's clip) or none.
-      xi: half-width of the drift's dead zone.
-      gate: width of the region around ratio 1 where the network is faded out, in nats; 0 for none.
-      temporal: let the drift change over an agent's training; inner agents then train for random
-        numbers of updates.
-      horizons: how long inner agents train, as fractions of the setting's number of updates, such
-        as 0.25,0.5,1; one is drawn for each generation. With --temporal 0.25,0.5,1,2 if left out.
-      hyperparameters: values that inner agents draw theirs from, such as
-        "learning_rate=0.0003,0.001 policy_output_scale=1,0.01".
-      combine: how a candidate's agents and tasks count: mean, or ranks (the mean over them of its
-        rank among the candidates; the default for several tasks).
-      strategy: any of evosax's, by name (Open_ES, SNES, CMA_ES, ...).
-      population_size: candidates a generation.
-      generations: how many.
-      agents_per_candidate: inner agents whose mean is a candidate's fitness.
-      sigma: standard deviation of the search distribution.
-      learning_rate: of the outer loop's Adam.
-      contexts: contexts that a batch of the bandit holds.
-      evaluation_episodes: of each inner agent.
-      validate: judge the search distribution's mean by agents trained with it in the evaluation
-        environment, and keep the mean that was judged best, rather than the final one.
-      mean_evaluations: agents that judge the mean; with --validate 16 if left out.
-      evaluate_mean_every: generations between those judgements.
-      backend: Brax physics, for Brax environments.
-      wandb: project to log to, with the extra `wandb`.
+      family: what is learned: network, or another family of drifts that learns.
     """
-    settings = learning.settle(
-        {
-            "command": "meta-train",
-            "environment": environment,
-            "tasks": tasks,
-            "seed": seed,
-            "fitness": fitness,
-            "reward_noise": reward_noise,
-            "drift": drift,
-            "base": base,
-            "xi": xi,
-            "gate": gate,
-            "temporal": temporal or None,
-            "horizons": horizons,
-            "hyperparameters": hyperparameters,
-            "combine": combine,
-            "strategy": strategy,
-            "population_size": population_size,
-            "generations": generations,
-            "agents_per_candidate": agents_per_candidate,
-            "sigma": sigma,
-            "learning_rate": learning_rate,
-            "contexts": contexts,
-            "evaluation_episodes": evaluation_episodes,
-            "validate": validate or None,
-            "mean_evaluations": mean_evaluations,
-            "evaluate_mean_every": evaluate_mean_every,
-            "backend": backend,
-        },
-        learning.PRESETS,
-        preset,
-        resume,
+
+    program = "lpo meta-train"
+    presets = MappingProxyType(
+        {"quick": partial(_meta_training, 32, 30), "paper": partial(_meta_training, 64, 512)}
     )
-    path, certificate = learning.learn_objective(settings, resume or out, resume is not None, wandb)
-    printer = console()
-    printer.print(f"objective: {path}", soft_wrap=True)
-    printer.print(f"it {certificate}")
+    deciding = ("tasks", "environment", "drift", "temporal", "validate")
+
+    config: Annotated[MetaTrainingConfig, tyro.conf.arg(name="inner loop")] = field(
+        default_factory=MetaTrainingConfig
+    )
+    family: Annotated[str, tyro.conf.arg(name="drift")] = LearnedDrift.name
+    output: Output = field(default_factory=lambda: Output(Path("runs/meta-train")))
+
+    @classmethod
+    def decided(cls, config: MetaTrainingConfig) -> dict[str, str]:
+        temporal = {"temporal": ""} if getattr(config.drift, "temporal", False) else {}
+        validate = {"validate": ""} if config.validation else {}
+        return {"tasks": ",".join(config.tasks), "drift": config.drift.name, **temporal, **validate}
+
+    def run(self) -> None:
+        objective = self.objective()
+        folder = self.output.resume or self.output.out
+        console().print(f"objective: {folder / 'objective.npz'}", soft_wrap=True)
+        console().print(f"it {certify(objective.drift, objective.parameters)}")
+
+    def objective(self) -> Objective:
+        """What the run folder holds, or learns."""
+        problem = MetaTraining(
+            self.config
+        )  # before the folder, which a mistake must not leave behind
+        run, config = self.open(), self.config
+        objective = learn_objective(problem, run, self.command)
+        curve = figures.meta_training_curve(
+            run.metrics(),
+            ", ".join(config.judged_in),
+            config.fitness,
+            config.evolution.population_size,
+            config.evolution.mean_evaluations,
+            ", ".join(config.homes) if config.validation else None,
+        )
+        plotting.save(curve, run.folder / "figures" / "meta_training.png")
+        return objective
 
 
 def train(

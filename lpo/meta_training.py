@@ -12,27 +12,48 @@ makes it rank objectives almost as the environment does.
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from functools import partial
+from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+import tyro
 from jax.typing import ArrayLike
 
 from lpo.drifts import Drift, LearnedDrift
 from lpo.fitness import FITNESSES, Fitness
+from lpo.objectives import Objective, load_objective, save_objective
 from scb.agents.ppo import PPOConfig, PPOHyperparameters
 from scb.agents.spec import AgentSpec, check_lists, environment_agent
+from scb.command_line import listed, numbers, text
 from scb.environments.registry import environment_spec, families
 from scb.environments.spec import EnvironmentSpec, Made
+from scb.environments.zoo import bandit_metadata
 from scb.errors import UserError, at_least, unknown_name
 from scb.evolution import EnvironmentSteps, EvolutionConfig, Outcome, evolve
 from scb.keys import named_key, root_key, split_key
+from scb.lists import read_values, write_values
 from scb.measurement import Judge, spaced, train_and_judge
-from scb.runs import Run
+from scb.runs import Run, config_dict
+from scb.seeds import VALIDATING
+from scb.statistics import estimate
 
 # Agents that judge a mean on the environment, where each costs a training there.
 VALIDATION_AGENTS = 16
 POINTS = 5  # of the curve that the area is under
+
+
+# A temporally-aware drift meets trainings from a quarter to twice as long as the setting's own.
+TEMPORAL_HORIZONS = (0.25, 0.5, 1.0, 2.0)
+
+
+def _read_horizons(words: str) -> tuple[float, ...]:
+    return () if words == "None" else numbers(words, "horizons")
+
+
+def _write_horizons(horizons: tuple[float, ...]) -> str:
+    return ",".join(map(str, horizons)) or "None"
 
 
 @dataclass(frozen=True)
@@ -40,55 +61,60 @@ class MetaTrainingConfig:
     """What to learn an objective on, and how.
 
     Attributes:
-      tasks: where the inner loop trains: bandits ("Synthetic-Pendulum-v1"), or any environments.
-        Of several, whose returns have different scales, `evolution.combine` says how they count.
-      drift: the learned drift's family.
-      initial_scale: of the drift's random start, so that the search begins near what it corrects.
-      fitness: one of `lpo.fitness.FITNESSES`, by name. "return": of the trained agent where it was
-        trained, without reward noise; "area": the mean of that over the training; "transfer": in
-        the bandit's evaluation environment.
+      tasks: where the inner loop trains: bandits (Synthetic-Pendulum-v1) or any environments
+        (Pendulum-v1, hopper, ...), separated by commas; observations and actions may differ.
+      fitness: return (of the trained agent where it was trained, without noise), return-sampled (with
+        sampled actions rather than the most likely ones), area (the mean over the training), or
+        transfer (return of the bandit-trained agent in the bandit's evaluation environment).
       agent: PPO's static configuration; None takes `task_agent`'s.
-      contexts: size of a batch on a bandit.
-      horizons: how long inner agents train, as fractions of the setting's number of updates; one is
-        drawn for each generation. Empty: always in full. A temporally-aware drift learns here that
-        the fraction of training done is what matters.
-      hyperparameters: {PPO's hyperparameter: values that inner agents' are drawn from}; the rest are
-        those of the (evaluation) environment's own setting. By default the policy's initialisation is
-        drawn: with one alone, an objective learns to make up for its weakness.
-      reward_noise: standard deviation of the noise on a bandit's reward, in standard deviations of
-        that reward over random contexts and actions. Real environments have noise of their own and
-        take none.
+      contexts: that a batch of a bandit holds.
+      horizons: how long inner agents train, as fractions of the setting's number of updates, such as
+        0.25,0.5,1; one is drawn for each generation. None: always in full. A temporally-aware drift
+        learns here that the fraction of training done is what matters.
+      hyperparameters: values that inner agents draw PPO's hyperparameters from, such as
+        "learning_rate=0.0003,0.001 policy_output_scale=1,0.01"; the rest are those of the (evaluation)
+        environment's own setting. With one initialisation of the policy alone, an objective learns to
+        make up for its weakness.
+      reward_noise: noise on a bandit's reward, in standard deviations of that reward over random
+        contexts and actions. Without it the drift overfits the bandit. Environments have noise of
+        their own and take none.
       agents_per_candidate: inner agents whose mean is a candidate's fitness.
       evaluation_episodes: of each inner agent; None takes 50 where they are of one step, else 20.
       validation: judge the mean of the search distribution by agents trained with it in the tasks'
-        evaluation environments, on the settings of those, rather than by fitness; several count by
-        their normalised scores (`lpo.suite`). The longer a search
-        on a bandit, the more it learns about the bandit alone; the best judged mean
-        (`Outcome.best_mean`) is then where it carries over best. Takes environment steps, which
-        the artefact's cost counts; the search itself still sees none of them.
-      backend: Brax physics, where the environment is Brax's (with "transfer": the evaluation
+        evaluation environments, on the settings of those, and keep the mean that was judged best,
+        rather than the final one. The longer a search on a bandit, the more it learns about the bandit
+        alone. Takes environment steps, of which the search itself sees none.
+      backend: Brax physics, where the environment is Brax's (with transfer: the evaluation
         environment).
-      evolution: the outer loop's.
+      initial_scale: of the drift's random start, so that the search begins near what it corrects.
+      drift: the settings of what is learned.
+      evolution: of the candidates.
     """
 
-    tasks: tuple[str, ...] = ("Synthetic-Pendulum-v1",)
-    drift: Drift = field(default_factory=LearnedDrift)
-    initial_scale: float = 0.1
+    tasks: Annotated[
+        tuple[str, ...],
+        tyro.conf.arg(aliases=("--environment",)),
+        text(partial(listed, what="tasks"), ",".join, "NAME,NAME"),
+    ] = ("Synthetic-Pendulum-v1",)
     fitness: str = "return"
-    agent: PPOConfig | None = None
+    agent: tyro.conf.Suppress[PPOConfig | None] = None
     contexts: int = 200
-    horizons: tuple[float, ...] = ()
-    hyperparameters: Mapping[str, tuple[float, ...]] = field(
-        default_factory=lambda: {"policy_output_scale": (1.0, 0.01)}
-    )
+    horizons: Annotated[tuple[float, ...], text(_read_horizons, _write_horizons, "A,B,C")] = ()
+    hyperparameters: Annotated[
+        Mapping[str, tuple[float, ...]], text(read_values, write_values, "'NAME=A,B NAME=A'")
+    ] = field(default_factory=lambda: {"policy_output_scale": (1.0, 0.01)})
     reward_noise: float = 5.0
     agents_per_candidate: int = 4
     evaluation_episodes: int | None = None
-    validation: bool = False
+    validation: Annotated[bool, tyro.conf.arg(name="validate")] = False
     backend: str | None = None
-    evolution: EvolutionConfig = field(
-        default_factory=lambda: EvolutionConfig(
-            strategy="Open_ES", population_size=32, sigma=0.03, learning_rate=0.01
+    initial_scale: float = 0.1
+    drift: Annotated[Drift, tyro.conf.arg(prefix_name=False)] = field(default_factory=LearnedDrift)
+    evolution: Annotated[EvolutionConfig, tyro.conf.arg(name="outer loop", prefix_name=False)] = (
+        field(
+            default_factory=lambda: EvolutionConfig(
+                strategy="Open_ES", population_size=32, sigma=0.03, learning_rate=0.01
+            )
         )
     )
 
@@ -355,6 +381,53 @@ def meta_train(config: MetaTrainingConfig, run: Run | None = None, quiet: bool =
     return evolve(MetaTraining(config), config.evolution, run, quiet)
 
 
-def chosen_mean(config: MetaTrainingConfig, outcome: Outcome) -> Any:
-    """The weights that a search ends with: the mean judged best where it was validated, else the last."""
-    return outcome.best_mean if config.validation else outcome.mean
+def learn_objective(
+    problem: MetaTraining, run: Run, command: str, file: str = "objective.npz"
+) -> Objective:
+    """The objective of a run folder: read where it is there already, else learned, or its learning resumed.
+
+    It is saved with its certificate and its story.
+
+    Args:
+      command: that repeats the run.
+      file: of the objective in the folder.
+    """
+    path, config = run.folder / file, problem.config
+    if not path.with_suffix(".json").exists():  # it is written last
+        outcome = evolve(problem, config.evolution, run)
+        run.close()
+        mean = outcome.best_mean if config.validation else outcome.mean
+        save_objective(path, config.drift, mean, _story(problem, outcome, mean, command))
+    return load_objective(path)
+
+
+def environment_problem(config: MetaTrainingConfig) -> MetaTraining:
+    """The same meta-training on the bandits' evaluation environments themselves."""
+    return MetaTraining(replace(config, tasks=config.homes, fitness="return", agent=None))
+
+
+def _story(problem: MetaTraining, outcome: Outcome, mean: Any, command: str) -> dict[str, Any]:
+    """What a learned objective's .json says of its meta-training."""
+    evolution: EvolutionConfig = problem.config.evolution
+    judged = [
+        {"generation": line["generation"], "fitness": value}
+        for line in outcome.metrics
+        for key, value in line.items()
+        if key in ("mean/fitness", "final_mean/fitness")
+    ]
+    end = outcome.validate(mean)["fitness"]
+    config: dict[str, Any] = {"meta_training": config_dict(problem.config)}
+    bandits = [name for name in problem.tasks if environment_spec(name).is_bandit]
+    if bandits:
+        # The name alone does not say which weights it stood for.
+        config["bandit_sha256"] = {name: bandit_metadata(name)["sha256"] for name in bandits}
+    return {
+        "config": config,
+        "seeds": {"meta_training": evolution.seed, "validation": VALIDATING.start},
+        "results": {
+            "mean_fitness": judged,
+            "validation": estimate(end).as_dict() if np.isfinite(end).all() else None,
+        },
+        "cost": outcome.cost(problem, evolution, best=problem.config.validation),
+        "command": command,
+    }

@@ -3,128 +3,158 @@
 Every stage leaves a file in the run folder; a resumed run does what is missing.
 """
 
-import json
 from collections.abc import Mapping
-from dataclasses import asdict, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
+import tyro
 from rich.console import Console
 
 from lpo import drift_figures, figures, report
 from lpo.certificate import certify
 from lpo.comparison import Comparison, check_names, compare
-from lpo.meta_training import VALIDATION_AGENTS, MetaTraining, MetaTrainingConfig, chosen_mean
-from lpo.objectives import Objective, load_objective, save_objective
+from lpo.meta_training import (
+    VALIDATION_AGENTS,
+    MetaTraining,
+    MetaTrainingConfig,
+    environment_problem,
+    learn_objective,
+)
+from lpo.objectives import Objective, load_objective
 from scb import plotting
 from scb.agents.spec import environment_agent
 from scb.artefacts import machine_description, package_versions
-from scb.environments.registry import environment_spec, make
-from scb.environments.zoo import bandit_metadata
-from scb.evolution import EvolutionConfig, Outcome, evolve
+from scb.environments.registry import make
+from scb.evolution import EnvironmentSteps
 from scb.measurement import Rows
-from scb.runs import Run, Stopwatch, write_json
-from scb.seeds import VALIDATING, reporting
-from scb.statistics import estimate
+from scb.runs import Run, Stopwatch, config_dict, write_json
+from scb.seeds import reporting
 
-PRESETS: dict[str, dict[str, Any]] = {
-    "tiny": {
-        "population_size": 4,
-        "generations": 2,
-        "agents_per_candidate": 1,
-        "evaluations": [
-            {"environment": "Pendulum-v1", "backend": None, "seeds": 2, "steps": 10_000},
-        ],
-    },
-    "quick": {
-        "population_size": 32,
-        "generations": 30,
-        "agents_per_candidate": 4,
-        "evaluations": [
-            {"environment": "Pendulum-v1", "backend": None, "seeds": 10, "steps": 150_000},
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Where, and how long, agents are trained with the objectives that are compared."""
+
+    environment: str
+    backend: str | None
+    seeds: int
+    steps: int
+    points: int = 15
+    episodes: int = 20
+
+
+@dataclass(frozen=True)
+class PipelineConfig:
+    """What `lpo run` does.
+
+    Attributes:
+      seed: decides everything; the seeds that report are apart from those that learn.
+      objective: take this objective (a zoo name or file.npz) instead of learning one.
+      search: how the objective is learned.
+      evaluations: where objectives are compared.
+    """
+
+    seed: int = 0
+    objective: str | None = None
+    search: tyro.conf.Suppress[MetaTrainingConfig] = field(default_factory=MetaTrainingConfig)
+    evaluations: tyro.conf.Suppress[tuple[Evaluation, ...]] = ()
+
+    def __post_init__(self) -> None:
+        _ = self.meta_training
+
+    @property
+    def meta_training(self) -> MetaTrainingConfig:
+        """The search with the seed."""
+        return replace(self.search, evolution=replace(self.search.evolution, seed=self.seed))
+
+
+def _search(
+    population: int, generations: int, agents: int = 4, **others: Any
+) -> MetaTrainingConfig:
+    default = MetaTrainingConfig(
+        agents_per_candidate=agents, validation="mean_evaluations" in others
+    )
+    evolution = replace(default.evolution, population_size=population, num_generations=generations)
+    return replace(default, evolution=replace(evolution, **others))
+
+
+PRESETS = {
+    "tiny": PipelineConfig(
+        search=_search(4, 2, agents=1),
+        evaluations=(Evaluation("Pendulum-v1", None, seeds=2, steps=10_000),),
+    ),
+    "quick": PipelineConfig(
+        search=_search(32, 30),
+        evaluations=(
+            Evaluation("Pendulum-v1", None, seeds=10, steps=150_000),
             # Ten episodes of up to 1000 steps at ten points: more would take as long as the training.
-            {
-                "environment": "hopper",
-                "backend": "spring",
-                "seeds": 4,
-                "steps": 500_000,
-                "points": 10,
-                "episodes": 10,
-            },
-        ],
-    },
-    "paper": {
-        "population_size": 64,
-        "generations": 512,
-        "agents_per_candidate": 4,
+            Evaluation("hopper", "spring", seeds=4, steps=500_000, points=10, episodes=10),
+        ),
+    ),
+    "paper": PipelineConfig(
         # So long a search overfits the bandit: the mean that was judged best on Pendulum is kept.
-        "validate": True,
-        "evaluations": [
-            {"environment": "Pendulum-v1", "backend": None, "seeds": 20, "steps": 150_000},
-            {
-                "environment": "hopper",
-                "backend": "generalized",
-                "seeds": 10,
-                "steps": 5 * 2**20,
-            },
-        ],
-    },
+        search=_search(64, 512, mean_evaluations=VALIDATION_AGENTS),
+        evaluations=(
+            Evaluation("Pendulum-v1", None, seeds=20, steps=150_000),
+            Evaluation("hopper", "generalized", seeds=10, steps=5 * 2**20),
+        ),
+    ),
 }
 
 
-def run_pipeline(run: Run, settings: Mapping[str, Any], command: str) -> Path:
+def run_pipeline(run: Run, config: PipelineConfig, preset: str, command: str) -> Path:
     """Runs every stage that the folder lacks.
 
     Args:
       run: the open run folder.
-      settings: a preset's values, "seed", "preset" and "objective".
-      command: as it was typed, for the report.
+      config: what to do.
+      preset: whose it is, for the report.
+      command: that repeats the run, for the report.
 
     Returns:
       The path of report.html.
     """
     console = Console(stderr=True)
     watch = Stopwatch()
-    folder = run.folder
-    config = pipeline_config(settings)
+    folder, search = run.folder, config.meta_training
     meta: dict[str, Any] = {}
-    if settings["objective"] is None:
+    if config.objective is None:
         console.print(
-            f"[1/3] learning an objective on {', '.join(config.tasks)}: "
-            f"{config.evolution.num_generations} generations of "
-            f"{config.evolution.population_size}"
+            f"[1/3] learning an objective on {', '.join(search.tasks)}: "
+            f"{search.evolution.num_generations} generations of "
+            f"{search.evolution.population_size}"
         )
-        objective, meta = _learn(run, config, settings, command)
+        problem = MetaTraining(search)
+        objective = learn_objective(problem, run, command, "lpo.npz")
+        meta = _told(problem, run)
     else:
-        objective = load_objective(settings["objective"])
+        objective = load_objective(config.objective)
     certificate = certify(objective.drift, objective.parameters)
     objectives = _with_references(objective)
 
     comparisons: dict[str, Comparison] = {}
     rows = Rows(folder / "rows.jsonl")
-    for evaluation in settings["evaluations"]:
-        console.print(
-            f"[2/3] training PPO with {len(objectives)} objectives on {evaluation['environment']}"
-        )
-        name = evaluation["environment"]
+    for evaluation in config.evaluations:
+        name = evaluation.environment
+        console.print(f"[2/3] training PPO with {len(objectives)} objectives on {name}")
         comparisons[name] = compare(
             name,
             objectives,
-            reporting_seeds(settings["seed"], evaluation["seeds"]),
-            environment_agent("ppo", name).with_steps(evaluation["steps"]),
-            evaluation["backend"],
-            evaluation.get("points", 15),
-            evaluation.get("episodes", 20),
+            reporting_seeds(config.seed, evaluation.seeds),
+            environment_agent("ppo", name).with_steps(evaluation.steps),
+            evaluation.backend,
+            evaluation.points,
+            evaluation.episodes,
             rows=rows,
             tell=console.print,
         )
 
     console.print("[3/3] figures and report")
-    paths = _figures(folder, config, objectives, comparisons, meta)
+    paths = _figures(folder, search, objectives, comparisons, meta)
     results = {
         "schema_version": 1,
-        "preset": settings["preset"],
+        "preset": preset,
         "command": command,
         "versions": package_versions(),
         "machine": machine_description(),
@@ -138,18 +168,13 @@ def run_pipeline(run: Run, settings: Mapping[str, Any], command: str) -> Path:
     return report.write_report(folder, results, paths)
 
 
-def check_settings(settings: Mapping[str, Any]) -> None:
-    """Raises the UserError that `run_pipeline` would, without doing anything.
-
-    Args:
-      settings: as for `run_pipeline`.
-    """
-    config = pipeline_config(settings)
-    if settings["objective"] is None:
-        for name in config.tasks:
+def check_pipeline(config: PipelineConfig) -> None:
+    """Raises the UserError that `run_pipeline` would, without doing anything."""
+    if config.objective is None:
+        for name in config.meta_training.tasks:
             make(name)
     else:
-        _with_references(load_objective(settings["objective"]))
+        _with_references(load_objective(config.objective))
 
 
 def reporting_seeds(seed: int, count: int) -> list[int]:
@@ -163,98 +188,27 @@ def _with_references(objective: Objective) -> list[Objective]:
     return objectives
 
 
-def pipeline_config(settings: Mapping[str, Any]) -> MetaTrainingConfig:
-    """The meta-training of a preset."""
-    default = MetaTrainingConfig()
-    evolution = replace(
-        default.evolution,
-        population_size=settings["population_size"],
-        num_generations=settings["generations"],
-        seed=settings["seed"],
-    )
-    validate = bool(settings.get("validate"))
-    if validate:
-        evolution = replace(evolution, mean_evaluations=VALIDATION_AGENTS)
-    return replace(
-        default,
-        evolution=evolution,
-        agents_per_candidate=settings["agents_per_candidate"],
-        validation=validate,
-    )
-
-
-def _learn(
-    run: Run, config: MetaTrainingConfig, settings: Mapping[str, Any], command: str
-) -> tuple[Objective, dict[str, Any]]:
-    problem = MetaTraining(config)
-    path = run.folder / "lpo.npz"
-    if not path.with_suffix(".json").exists():  # it is written last
-        outcome = evolve(problem, config.evolution, run)
-        run.close()
-        save_objective(
-            path,
-            config.drift,
-            chosen_mean(config, outcome),
-            meta_training_artefact(problem, outcome, dict(settings), command),
-        )
+def _told(problem: MetaTraining, run: Run) -> dict[str, Any]:
+    """What the report says of the meta-training."""
+    config = problem.config
     evaluations = config.evolution.num_generations * config.evolution.population_size
-    steps = problem.steps()
-    on_environment = environment_problem(config).steps()
-    meta = {
+
+    def of_search(steps: EnvironmentSteps) -> dict[str, int]:
+        return {
+            name: evaluations * getattr(steps, name) for name in ("training", "evaluation", "total")
+        }
+
+    return {
         "environment": ", ".join(config.tasks),
         "evaluation_environment": ", ".join(config.homes),
         "fitness": config.fitness,
-        "config": _plain(config),
+        "config": config_dict(config),
         "seconds": round(run.seconds(), 1),
         "generations": config.evolution.num_generations,
-        "steps": {
-            name: evaluations * getattr(steps, name) for name in ("training", "evaluation", "total")
-        },
-        "environment_steps": {
-            name: evaluations * getattr(on_environment, name)
-            for name in ("training", "evaluation", "total")
-        },
+        "steps": of_search(problem.steps()),
+        "environment_steps": of_search(environment_problem(config).steps()),
         "metrics": run.metrics(),
     }
-    return load_objective(path), meta
-
-
-def environment_problem(config: MetaTrainingConfig) -> MetaTraining:
-    """The same meta-training on the bandits' evaluation environments themselves."""
-    return MetaTraining(replace(config, tasks=config.homes, fitness="return", agent=None))
-
-
-def meta_training_artefact(
-    problem: MetaTraining, outcome: Outcome, settings: Mapping[str, Any], command: str
-) -> dict[str, Any]:
-    """What a learned objective's .json says of its meta-training."""
-    evolution: EvolutionConfig = problem.config.evolution
-    judged = [
-        {"generation": line["generation"], "fitness": value}
-        for line in outcome.metrics
-        for key, value in line.items()
-        if key in ("mean/fitness", "final_mean/fitness")
-    ]
-    end = outcome.validate(chosen_mean(problem.config, outcome))["fitness"]
-    config = {"meta_training": _plain(problem.config), "settings": dict(settings)}
-    bandits = [name for name in problem.tasks if environment_spec(name).is_bandit]
-    if bandits:
-        # The name alone does not say which weights it stood for.
-        config["bandit_sha256"] = {name: bandit_metadata(name)["sha256"] for name in bandits}
-    return {
-        "config": config,
-        "seeds": {"meta_training": evolution.seed, "validation": VALIDATING.start},
-        "results": {
-            "mean_fitness": judged,
-            "validation": estimate(end).as_dict() if np.isfinite(end).all() else None,
-        },
-        "cost": outcome.cost(problem, evolution, best=problem.config.validation),
-        "command": command,
-    }
-
-
-def _plain(config: Any) -> Any:
-    return json.loads(json.dumps(asdict(config)))
 
 
 def _figures(

@@ -91,8 +91,12 @@ class Output:
 class LongRun:
     """A command that leaves a run folder: a configuration, which the folder stores, from a preset and flags.
 
-    A subclass has the fields `config` and `output`, `program`, the names of program and command, and
-    `presets`, which make a configuration, for the environment where one was named.
+    A subclass has the fields `config` and `output`, and for the class:
+
+    Attributes:
+      program: the names of program and command.
+      presets: {name: (deciding flags that were given, by name) -> configuration}.
+      deciding: flags that other settings' defaults depend on. A flag without a value is "".
     """
 
     config: Any
@@ -100,7 +104,13 @@ class LongRun:
     preset: str = "quick"
 
     program: ClassVar[str]
-    presets: ClassVar[Mapping[str, Callable[[str | None], Any]]]
+    presets: ClassVar[Mapping[str, Callable[[Mapping[str, str]], Any]]]
+    deciding: ClassVar[tuple[str, ...]] = ()
+
+    @classmethod
+    def decided(cls, config: Any) -> dict[str, str]:
+        """The deciding flags that a configuration has."""
+        return {}
 
     def run(self) -> None:
         raise NotImplementedError
@@ -108,15 +118,14 @@ class LongRun:
     @classmethod
     def parse(cls, arguments: Sequence[str]) -> Self:
         """The command with these flags: those that a resumed run was started with, over its preset, come first."""
-        folder = _given(arguments).get("resume")
+        folder = _given(arguments, "resume").get("resume")
         if folder is not None:
             arguments = [*cls._stored(folder), *arguments]
-        given = _given(arguments)
+        given = _given(arguments, "preset", *cls.deciding)
         preset = given.get("preset", "quick")
         if preset not in cls.presets:
             raise unknown_name("preset", preset, cls.presets)
-        config = cls.presets[preset](given.get("environment"))
-        default = cls(config=config, preset=preset)  # type: ignore[call-arg]
+        default = cls(config=cls.presets[preset](given), preset=preset)  # type: ignore[call-arg]
         return tyro.cli(cls, default=default, prog=cls.program, args=arguments, config=_STYLE)
 
     @classmethod
@@ -136,8 +145,13 @@ class LongRun:
 
     @property
     def command(self) -> str:
-        """What starts the same run afresh, however it was typed or resumed."""
-        return command_of(self.program, self.config, self.presets[self.preset], self.preset)
+        """What starts the same run afresh, however it was typed or resumed: what differs from the preset."""
+        preset, decided = self.presets[self.preset], self.decided(self.config)
+        without = self.decided(preset({}))
+        words = [] if self.preset == "quick" else [f"--preset={self.preset}"]
+        words += [_word(k, v) for k, v in decided.items() if v != without.get(k)]
+        words += flags(self.config, preset(decided))
+        return shlex.join([*self.program.split(), *words])
 
     def open(self) -> Run:
         """The run folder, new or resumed."""
@@ -146,19 +160,6 @@ class LongRun:
         return Run.open(
             output.resume or output.out, stored, output.resume is not None, output.wandb
         )
-
-
-def command_of(
-    program: str, config: Any, preset: Callable[[str | None], Any], name: str = "quick"
-) -> str:
-    """The command that asks for a configuration: what differs from the preset of that name."""
-    words = [] if name == "quick" else [f"--preset={name}"]
-    default = preset(None)
-    environment = getattr(config, "environment", None)
-    if environment is not None and environment != default.environment:
-        words.append(f"--environment={environment}")
-        default = preset(environment)
-    return shlex.join([*program.split(), *words, *flags(config, default)])
 
 
 def call(
@@ -181,9 +182,13 @@ def call(
         tyro.cli(command, prog=f"{program} {name}", args=arguments[1:], config=_STYLE)
 
 
-def _given(arguments: Sequence[str]) -> dict[str, str]:
-    """What the default values depend on, and is therefore read first."""
+def _given(arguments: Sequence[str], *names: str) -> dict[str, str]:
+    """Flags by name, read before tyro does, and "" for one without a value."""
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    for name in ("preset", "resume", "environment"):
-        parser.add_argument(f"--{name}", nargs="?")
+    for name in names:
+        parser.add_argument(f"--{name}", nargs="?", const="")
     return {k: v for k, v in vars(parser.parse_known_args(arguments)[0]).items() if v is not None}
+
+
+def _word(name: str, value: str) -> str:
+    return f"--{name}={value}" if value else f"--{name}"

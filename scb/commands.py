@@ -36,7 +36,7 @@ from scb.seeds import VALIDATING
 from scb.statistics import estimate
 
 
-def _quick(environment: str | None) -> DiscoveryConfig:
+def _quick(given: Mapping[str, str]) -> DiscoveryConfig:
     """Half an hour on two cores: PPO in every candidate, agents compared by rank."""
     return DiscoveryConfig(
         evaluation_episodes=12,
@@ -60,9 +60,9 @@ _PAPER_GENERATIONS = {
 }
 
 
-def _paper(environment: str | None) -> DiscoveryConfig:
+def _paper(given: Mapping[str, str]) -> DiscoveryConfig:
     """The paper's tables, curricula among them, for an environment."""
-    name = environment or DiscoveryConfig.environment
+    name = given.get("environment") or DiscoveryConfig.environment
     family = environment_spec(name).family
     column = _PAPER_OUTER_LOOP.get(name) or _PAPER_OUTER_LOOP.get(family)
     population, rollouts, seeds, mode = column or _PAPER_OUTER_LOOP_ELSEWHERE
@@ -110,12 +110,17 @@ class Discover(LongRun):
 
     program = "scb discover"
     presets = MappingProxyType({"quick": _quick, "paper": _paper})
+    deciding = ("environment",)
 
     config: Annotated[DiscoveryConfig, tyro.conf.arg(name="")] = field(
-        default_factory=lambda: _quick(None)
+        default_factory=lambda: _quick({})
     )
     judgement: Judgement = field(default_factory=Judgement)
     output: Output = field(default_factory=lambda: Output(Path("runs/discover")))
+
+    @classmethod
+    def decided(cls, config: DiscoveryConfig) -> dict[str, str]:
+        return {"environment": config.environment}
 
     def run(self) -> None:
         # The problem first: where a name is wrong, no folder is left behind to be in the next try's way.

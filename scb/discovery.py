@@ -109,7 +109,7 @@ class DiscoveryConfig:
         can lead it away again).
       bandit: the networks and the latent.
       warm_start: how the expert is found and the bandit fitted to it.
-      evolution: the outer loop's.
+      evolution: of the candidates.
     """
 
     environment: str = "Pendulum-v1"

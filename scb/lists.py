@@ -1,7 +1,7 @@
 """Lists of hyperparameters to draw from, as the command line writes them."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +9,7 @@ import numpy as np
 
 from scb.agents.spec import tables_of
 from scb.agents.tables import Lists
+from scb.command_line import numbers
 from scb.errors import UserError
 
 # Of 32 bits, which is what an agent calculates with.
@@ -55,6 +56,25 @@ def read_lists(words: str) -> dict[str, Lists]:
 def write_lists(lists: Mapping[str, Lists]) -> str:
     """What `read_lists` reads."""
     return json.dumps(lists)
+
+
+def read_values(words: str) -> dict[str, tuple[float, ...]]:
+    """{hyperparameter: values} from "learning_rate=0.0003,0.001 policy_output_scale=1,0.01"."""
+    values = {}
+    for part in words.split():
+        name, equals, listed = part.partition("=")
+        if not equals:
+            raise UserError(
+                f"hyperparameters {words!r} have the part {part!r}, which is no NAME=VALUE,VALUE: write such as "
+                "learning_rate=0.0003,0.001."
+            )
+        values[name] = numbers(listed, name)
+    return values
+
+
+def write_values(values: Mapping[str, Sequence[float]]) -> str:
+    """What `read_values` reads."""
+    return " ".join(f"{name}={','.join(map(str, listed))}" for name, listed in values.items())
 
 
 def _is_filled(lists: Any) -> bool:

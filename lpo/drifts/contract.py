@@ -4,7 +4,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
-from typing import Any, ClassVar, Literal, Self, TypeAlias
+from typing import Any, ClassVar, Self, TypeAlias
 
 import chex
 import jax
@@ -17,8 +17,7 @@ from scb.keys import root_key
 
 # Any: an array of JAX, NumPy or PyTorch; `xp` below is its library.
 Array: TypeAlias = Any
-Base: TypeAlias = Literal["ppo", "none"]
-BASES: tuple[Base, ...] = ("ppo", "none")
+BASES = ("ppo", "none")
 
 
 class Drift(ABC):
@@ -111,7 +110,7 @@ class CorrectedDrift(Drift):
 
     always_holds: ClassVar[bool] = True
 
-    base: Base = "ppo"
+    base: str = "ppo"
     clip: float = 0.2
     xi: float = 1e-6
     gate: float = 0.1

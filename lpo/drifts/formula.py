@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lpo.drifts.contract import Array, Base, CorrectedDrift
+from lpo.drifts.contract import Array, CorrectedDrift
 from scb.agents.ppo import MAX_LOG_RATIO
 from scb.errors import UserError
 
@@ -277,7 +277,7 @@ class ClosedFormDrift(CorrectedDrift):
     name: ClassVar[str] = "formula"
 
     expression: str = field(kw_only=False)
-    base: Base = "none"
+    base: str = "none"
     gate: float = 0.0
 
     def __post_init__(self) -> None:

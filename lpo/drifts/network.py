@@ -36,7 +36,6 @@ class LearnedDrift(CorrectedDrift):
     has a bias.
 
     Attributes:
-      base, clip, xi, gate: as `CorrectedDrift`'s, the correction being the network.
       hidden_size: of the one tanh layer.
       temporal: let the drift change over an agent's training: its features come a second time scaled by
         the fraction of training done (Jackson et al., 2024, TA-LPO).

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from experiments import lpo_on_bandits as module
+from experiments.searches import meta_training
 from lpo.comparison import Comparison, LearningCurves
 from lpo.objectives import load_objective
 from scb.errors import UserError
@@ -192,11 +193,9 @@ def test_a_report_of_other_searches_is_refused(tiny, tmp_path):
 
 
 def test_the_settings_of_every_preset_are_those_of_the_command():
-    from lpo.learning import meta_training_config
-
     for preset in module.PRESETS.values():
         for search in preset["searches"].values():
-            config = meta_training_config(search["settings"])
+            config = meta_training(search["settings"]).config
             assert config.validation
             assert config.evolution.num_generations == search["settings"]["generations"]
     assert module.PRESETS["paper"]["hopper"]["steps"] == 5_242_880

@@ -37,7 +37,7 @@ def test_a_search_that_has_ended_is_read_and_not_run_again(tmp_path, small_agent
 
 def test_the_papers_sizes_are_those_of_its_preset():
     for name, size in searches.PAPER_SIZES.items():
-        paper = Discover.presets["paper"](name)
+        paper = Discover.presets["paper"]({"environment": name})
         assert size == {
             "generations": paper.evolution.num_generations,
             "population_size": paper.evolution.population_size,

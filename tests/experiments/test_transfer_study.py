@@ -6,14 +6,14 @@ from pathlib import Path
 import pytest
 
 from experiments import transfer_study as module
-from lpo.learning import meta_training_config
+from experiments.searches import meta_training
 
 DOCS = Path(__file__).parents[2] / "docs"
 
 
 def test_every_variation_is_a_meta_training_that_differs_from_the_default():
     configs = {
-        name: meta_training_config(module.settings_of(name, 0, 30, 32))
+        name: meta_training(module.settings_of(name, 0, 30, 32)).config
         for name in module.VARIATIONS
     }
     default = configs.pop("default")

@@ -5,7 +5,7 @@ import os
 import shlex
 import subprocess
 import sys
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import jax
@@ -16,17 +16,20 @@ from gymnax.environments import spaces
 
 import lpo
 import scb.cli
-from lpo import cli, commands, learning
+from lpo import cli, commands
+from lpo.commands import MetaTrain, RunAll
 from lpo.comparison import Comparison, LearningCurves
-from lpo.drifts import ClosedFormDrift, NoDrift
+from lpo.drifts import DRIFTS, ClosedFormDrift, NoDrift
 from lpo.fitness import LABELS
-from lpo.meta_training import MetaTrainingConfig
+from lpo.meta_training import TEMPORAL_HORIZONS, MetaTrainingConfig
 from lpo.objectives import Objective, closed_form, load_objective
 from scb.agents.ppo import PPOHyperparameters
 from scb.agents.spec import AgentSpec
 from scb.environments.synthetic import BanditConfig, SyntheticBandit
 from scb.environments.zoo import save_bandit
 from scb.errors import UserError
+from scb.evolution import evolve
+from scb.runs import config_dict
 from tests.recording import recorded_seeds
 
 PROGRAMS = {"lpo": cli.main, "scb": scb.cli.main}
@@ -80,6 +83,7 @@ def refused(capsys, working_folder, one_sentence):
         ("meta-train --preset papre", "unknown preset 'papre': did you mean paper"),
         ("meta-train --fitness retrun", "unknown fitness 'retrun': did you mean return"),
         ("meta-train --base pop", "unknown drift base 'pop': did you mean ppo"),
+        ("meta-train --drift mirror --temporal", "the drift mirror has no temporal"),
     ],
 )
 def test_an_unknown_name_is_answered_by_near_ones(refused, arguments, message):
@@ -140,20 +144,6 @@ def test_what_does_not_go_together_is_refused(refused, arguments, message):
     assert message in refused(*arguments.split())
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ("train --bandit Synthetic-Pendulm-v1", "unknown bandit 'Synthetic-Pendulm-v1'"),
-        ("train --agents 0", "agents is 0: it must be at least 1"),
-        ("discover --init expret", "unknown initialisation 'expret': did you mean expert"),
-        ("discover --population-size 1", "population_size is 1"),
-        ("discover --preset quik", "unknown preset 'quik': did you mean quick"),
-    ],
-)
-def test_the_other_program_refuses_alike(refused, arguments, message):
-    assert message in refused(*arguments.split(), program="scb")
-
-
 # -- artefacts that do not fit ------------------------------------------------------------------
 
 
@@ -209,7 +199,7 @@ def no_training(monkeypatch):
     def refuse(*arguments, **named):
         raise AssertionError("this must fail before any training")
 
-    monkeypatch.setattr(learning, "evolve", refuse)
+    monkeypatch.setattr("lpo.meta_training.evolve", refuse)
     monkeypatch.setattr(commands, "run_pipeline", refuse)
     monkeypatch.setattr("scb.measurement._program_of", refuse)
 
@@ -257,7 +247,7 @@ def interrupted(working_folder, monkeypatch, capsys) -> Path:
     def interrupt(*arguments):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(learning, "evolve", interrupt)
+    monkeypatch.setattr("lpo.meta_training.evolve", interrupt)
     arguments = ["--population-size", "4", "--reward-noise", "2", "--out", "started"]
     assert cli.main(["meta-train", *arguments]) == 130
     error = capsys.readouterr().err
@@ -268,10 +258,10 @@ def interrupted(working_folder, monkeypatch, capsys) -> Path:
 @pytest.mark.parametrize(
     ("flags", "difference"),
     [
-        (["--population-size", "6"], "population_size (4 there, 6 now)"),
-        (["--reward-noise", "0"], "reward_noise (2.0 there, 0.0 now)"),
-        (["--seed", "5"], "seed (None there, 5 now)"),
-        (["--preset", "paper"], "preset ('quick' there, 'paper' now)"),
+        (["--population-size", "6"], "config.evolution.population_size (4 there, 6 now)"),
+        (["--reward-noise", "0"], "config.reward_noise (2.0 there, 0.0 now)"),
+        (["--seed", "5"], "config.evolution.seed (0 there, 5 now)"),
+        (["--preset", "paper"], "config.evolution.num_generations (30 there, 512 now)"),
     ],
 )
 def test_a_resumed_run_keeps_its_settings(refused, interrupted, flags, difference):
@@ -281,7 +271,18 @@ def test_a_resumed_run_keeps_its_settings(refused, interrupted, flags, differenc
 
 def test_a_run_of_another_command_is_not_resumed(refused, interrupted):
     message = refused("run", "--resume", interrupted)
-    assert "its config differs at " in message
+    assert "it was started with lpo meta-train --reward-noise=2.0 --population-size=4." in message
+
+
+# As `lpo meta-train` wrote it until random keys were mended.
+OLD = {"command": "meta-train", "environment": None, "seed": 3, "preset": "quick", "temporal": None}
+
+
+def test_a_run_of_an_earlier_version_is_not_resumed(refused, working_folder):
+    (working_folder / "config.json").write_text(json.dumps(OLD))
+    for command in ("meta-train", "run"):
+        message = refused(command, "--resume", working_folder)
+        assert "an earlier version started it, whose random numbers this one does not" in message
 
 
 def test_a_resumed_run_takes_the_stored_settings(interrupted, monkeypatch):
@@ -291,7 +292,7 @@ def test_a_resumed_run_takes_the_stored_settings(interrupted, monkeypatch):
         seen.append((config.population_size, problem.config.reward_noise, run.resumed))
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(learning, "evolve", record)
+    monkeypatch.setattr("lpo.meta_training.evolve", record)
     assert cli.main(["meta-train", "--resume", str(interrupted)]) == 130
     # The same flags again are no contradiction.
     repeated = ["--population-size", "4", "--resume", str(interrupted)]
@@ -372,14 +373,6 @@ def python(working_folder):
         )
 
     return run
-
-
-def test_a_process_exits_with_two_and_shows_no_traceback(python):
-    finished = python("-m", "lpo.cli", "train", "--environment", "Pendulm-v1")
-    assert finished.returncode == 2
-    assert finished.stdout == ""
-    assert finished.stderr.startswith("lpo: unknown environment 'Pendulm-v1': did you mean ")
-    assert finished.stderr.count("\n") == 1
 
 
 CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
@@ -582,22 +575,17 @@ def test_files_of_one_name_are_told_apart_by_what_was_typed(
 def test_meta_train_writes_an_objective_that_loads(
     monkeypatch, working_folder, tiny_agent, tiny_drift, capsys
 ):
-    from scb.evolution import evolve
-
-    configured = learning.meta_training_config
-
-    def small(settings):
-        config = configured(settings)
-        evolution = replace(config.evolution, mean_evaluations=2)
-        return replace(config, agent=tiny_agent, drift=tiny_drift, evolution=evolution)
-
-    monkeypatch.setattr(learning, "meta_training_config", small)
-    monkeypatch.setattr(learning, "evolve", evolve)
+    quick = MetaTrain.presets["quick"]
+    presets = {"quick": lambda given: replace(quick(given), agent=tiny_agent)}
+    monkeypatch.setattr(MetaTrain, "presets", presets)
+    monkeypatch.setattr("lpo.meta_training.evolve", evolve)
     flags = {
         "population-size": 2,
         "generations": 2,
         "agents-per-candidate": 1,
         "evaluation-episodes": 2,
+        "mean-evaluations": 2,
+        "hidden-size": 4,
         "fitness": "transfer",
         "seed": 4,
         "out": "learned",
@@ -612,9 +600,8 @@ def test_meta_train_writes_an_objective_that_loads(
 
     objective = load_objective(working_folder / "learned" / "objective.npz")
     assert objective.drift == tiny_drift
-    settings = objective.metadata["config"]["settings"]
-    assert (settings["preset"], settings["population_size"], settings["seed"]) == ("quick", 2, 4)
-    assert objective.metadata["config"]["meta_training"]["fitness"] == "transfer"
+    config = objective.metadata["config"]["meta_training"]
+    assert (config["fitness"], config["evolution"]["seed"]) == ("transfer", 4)
     # 2 generations x 2 candidates x 1 agent x 3 batches of 8 contexts; 2 episodes of 200 steps.
     assert objective.metadata["cost"]["environment_steps_training"] == 96
     assert objective.metadata["cost"]["environment_steps_evaluation"] == 1600
@@ -622,65 +609,81 @@ def test_meta_train_writes_an_objective_that_loads(
     assert figure.read_bytes().startswith(b"\x89PNG")
 
     # The command that the artefact holds asks for the same again.
-    def interrupt(*arguments):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(learning, "evolve", interrupt)
-    program, *again = shlex.split(objective.metadata["command"])
-    assert program == "lpo"
-    assert cli.main([*again, "--out", "again"]) == 130
-    configs = [working_folder / name / "config.json" for name in ("learned", "again")]
-    assert configs[0].read_bytes() == configs[1].read_bytes()
+    again = MetaTrain.parse(shlex.split(objective.metadata["command"])[2:]).config
+    assert config_dict(again) == config
+    stored = json.loads((working_folder / "learned" / "config.json").read_text())
+    assert stored == {"command": objective.metadata["command"], "config": config}
 
 
-def test_flags_of_meta_train_reach_the_configuration():
-    flags = {
-        "environment": "Pendulum-v1",
-        "fitness": "area",
-        "reward_noise": 1.5,
-        "base": "none",
-        "strategy": "SNES",
-        "population_size": 6,
-        "generations": 7,
-        "agents_per_candidate": 3,
-        "sigma": 0.2,
-        "learning_rate": 0.3,
-        "contexts": 40,
-        "evaluation_episodes": 8,
-        "backend": "spring",
-        "seed": 9,
-    }
-    config = learning.meta_training_config(flags)
-    evolution = config.evolution
-    assert (config.tasks, config.fitness) == (("Pendulum-v1",), "area")
-    assert (config.reward_noise, config.drift.base, config.contexts) == (1.5, "none", 40)
-    assert (config.agents_per_candidate, config.evaluation_episodes) == (3, 8)
-    assert (config.backend, evolution.strategy, evolution.seed) == ("spring", "SNES", 9)
-    assert (evolution.population_size, evolution.num_generations) == (6, 7)
-    assert (evolution.sigma, evolution.learning_rate) == (0.2, 0.3)
-    # And what is left out keeps its default.
-    default = MetaTrainingConfig()
-    unset = learning.meta_training_config(dict.fromkeys(flags))
-    assert replace(unset, evolution=default.evolution) == default
-    for name in ("strategy", "sigma", "learning_rate", "mean_evaluations"):
-        assert getattr(unset.evolution, name) == getattr(default.evolution, name)
+def asked_for(words=""):
+    """The configuration that flags of `lpo meta-train` ask for."""
+    return MetaTrain.parse(shlex.split(words)).config
 
 
-def test_lists_of_meta_train_reach_the_configuration():
-    config = learning.meta_training_config(
-        {"tasks": "Synthetic-Pendulum-v1, Synthetic-CartPole-v1", "horizons": "0.5,2"}
-    )
-    assert config.tasks == ("Synthetic-Pendulum-v1", "Synthetic-CartPole-v1")
-    assert config.horizons == (0.5, 2.0)
+EVERY_FLAG = """--preset=paper --tasks=Synthetic-CartPole-v1,Pendulum-v1 --drift=network --temporal --validate
+--fitness=return-sampled --contexts=40 --horizons=0.5,2.0 '--hyperparameters=learning_rate=0.1,0.2 gae_lambda=0.5'
+--reward-noise=1.5 --agents-per-candidate=3 --evaluation-episodes=8 --backend=spring --initial-scale=0.3
+--base=none --clip=0.3 --xi=0.001 --gate=0.2 --hidden-size=8 --strategy=SNES --population-size=6 --generations=7
+--sigma=0.2 --sigma-decay=0.9 --sigma-limit=0.1 --learning-rate=0.3 --learning-rate-decay=0.8
+--learning-rate-limit=0.2 --combine=mean --mean-evaluations=5 --evaluate-mean-every=4 --checkpoint-every=3 --seed=9"""
+
+
+def test_every_flag_of_meta_train_reaches_the_configuration_and_its_command():
+    words = [word for word in shlex.split(EVERY_FLAG) if word != "--drift=network"]
+    command = MetaTrain.parse(words)
+    assert sorted(shlex.split(command.command)) == sorted(["lpo", "meta-train", *words])
+    # That is every field but what only a program sets; of two tasks "ranks" is what combines otherwise.
+    config, paper = config_dict(command.config), config_dict(asked_for("--preset paper"))
+    same = {name for name, value in paper.items() if value == config[name]}
+    for group in ("drift", "evolution"):
+        same |= {name for name, value in paper[group].items() if value == config[group][name]}
+    assert same == {"agent", "combine"}
+    # What is left out keeps its default: the preset quick is the library's but for the generations.
+    quick, default = asked_for(), MetaTrainingConfig()
+    assert MetaTrain.parse([]).command == "lpo meta-train"
+    assert quick == replace(default, evolution=replace(default.evolution, num_generations=30))
+
+
+def test_defaults_that_depend_on_other_flags():
+    both = asked_for("--tasks 'Synthetic-Pendulum-v1, Synthetic-CartPole-v1'")
+    assert both.tasks == ("Synthetic-Pendulum-v1", "Synthetic-CartPole-v1")
     # Returns of different tasks have different scales.
-    assert config.evolution.combine == "ranks"
-    judged = learning.meta_training_config({"validate": True, "evaluate_mean_every": 5})
+    assert (both.evolution.combine, asked_for().evolution.combine) == ("ranks", "mean")
+    assert asked_for("--environment Pendulum-v1").tasks == ("Pendulum-v1",)
+    judged = asked_for("--validate")
     assert (judged.validation, judged.evolution.mean_evaluations) == (True, 16)
-    assert judged.evolution.evaluate_mean_every == 5
-    temporal = learning.meta_training_config({"temporal": True})
-    assert temporal.drift.temporal
-    assert temporal.horizons == learning.TEMPORAL_HORIZONS
-    assert temporal.evolution.combine == "mean"
+    temporal = asked_for("--temporal")
+    assert temporal.drift.temporal and temporal.horizons == TEMPORAL_HORIZONS
+    assert asked_for("--temporal --horizons None").horizons == ()
+    for words in (
+        "--drift mirror",
+        "--temporal --horizons=None",
+        "--validate --mean-evaluations=64",
+    ):
+        command = MetaTrain.parse(shlex.split(words))
+        assert asked_for(command.command.removeprefix("lpo meta-train")) == command.config
+    assert asked_for("--drift mirror").drift.name == "mirror"
+
+
+@pytest.mark.parametrize("drift", [name for name, drift in DRIFTS.items() if drift.learned])
+def test_help_explains_every_flag_of_meta_train_in_groups(drift, capsys):
+    config = MetaTrain.parse(["--drift", drift]).config
+    explained = "".join(str(kind.__doc__) for kind in (*type(config.drift).__mro__, type(config)))
+    for field in (*fields(config), *fields(config.drift)):
+        assert f"\n      {field.name}: " in explained, field.name
+    with pytest.raises(SystemExit):
+        cli.main(["meta-train", "--drift", drift, "--help"])
+    shown = capsys.readouterr().out
+    for group in ("inner loop", "drift", "outer loop", "output"):
+        assert f"{group} options" in shown
+
+
+def test_a_run_of_everything_takes_its_seed_and_its_preset():
+    command = RunAll.parse(["--preset", "paper", "--seed", "3"])
+    assert command.command == "lpo run --preset=paper --seed=3"
+    search = command.config.meta_training
+    assert (search.evolution.seed, search.validation) == (3, True)
+    assert (search.evolution.population_size, search.evolution.num_generations) == (64, 512)
 
 
 def test_align_measures_every_combination_and_stores_it(monkeypatch, working_folder, capsys):
@@ -715,7 +718,7 @@ def test_align_measures_every_combination_and_stores_it(monkeypatch, working_fol
 
 def test_inner_agents_hyperparameters_are_read_from_one_line(one_sentence):
     def config(text):
-        return learning.meta_training_config({"hyperparameters": text})
+        return asked_for("" if text is None else f"'--hyperparameters={text}'")
 
     lists = config("learning_rate=0.0003,0.001 policy_output_scale=1").hyperparameters
     assert lists == {"learning_rate": (0.0003, 0.001), "policy_output_scale": (1.0,)}

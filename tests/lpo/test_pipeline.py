@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from lpo import cli, pipeline
+from lpo.commands import RunAll
 from lpo.comparison import Comparison, LearningCurves
 from lpo.objectives import load_objective
 from scb.agents.ppo import PPOConfig, PPOHyperparameters
@@ -19,21 +20,17 @@ from tests.recording import recorded_seeds
 @pytest.fixture(scope="module", autouse=True)
 def small(tiny_agent, tiny_drift):
     """The preset "tiny" with smaller networks, fewer contexts and steps than any preset has."""
-    on_bandit, on_environment = pipeline.pipeline_config, pipeline.environment_agent
-
-    def config(settings):
-        default = on_bandit(settings)
-        return replace(
-            default,
-            agent=tiny_agent,
-            drift=tiny_drift,
-            fitness="transfer",
-            evaluation_episodes=2,
-            evolution=replace(default.evolution, population_size=2, mean_evaluations=2),
-        )
+    tiny = pipeline.PRESETS["tiny"]
+    search = replace(
+        tiny.search,
+        agent=tiny_agent,
+        drift=tiny_drift,
+        fitness="transfer",
+        evaluation_episodes=2,
+        evolution=replace(tiny.search.evolution, population_size=2, mean_evaluations=2),
+    )
 
     def spec(algorithm, environment):
-        on_environment(algorithm, environment)
         agent = PPOConfig(
             num_envs=2,
             num_steps=8,
@@ -44,10 +41,11 @@ def small(tiny_agent, tiny_drift):
         )
         return AgentSpec(algorithm, agent, PPOHyperparameters())
 
+    evaluations = (replace(tiny.evaluations[0], steps=32),)
+    config = replace(tiny, search=search, evaluations=evaluations)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pipeline, "pipeline_config", config)
+        patch.setattr(RunAll, "presets", {"tiny": lambda given: config})
         patch.setattr(pipeline, "environment_agent", spec)
-        patch.setitem(pipeline.PRESETS["tiny"]["evaluations"][0], "steps", 32)
         yield
 
 
@@ -156,7 +154,7 @@ def test_resuming_redoes_the_missing_stage_and_no_other(folder, monkeypatch):
     def refuse(*arguments, **named):
         raise AssertionError("this stage was done already")
 
-    monkeypatch.setattr(pipeline, "evolve", refuse)
+    monkeypatch.setattr("lpo.meta_training.evolve", refuse)
     monkeypatch.setattr("scb.measurement._program_of", refuse)
     assert cli.main(["run", "--resume", str(folder)]) == 0
 
@@ -196,7 +194,7 @@ def test_a_given_objective_is_judged_and_not_learned(tmp_path, objective_file, m
     def refuse(*arguments, **named):
         raise AssertionError("there is nothing to learn")
 
-    monkeypatch.setattr(pipeline, "evolve", refuse)
+    monkeypatch.setattr("lpo.meta_training.evolve", refuse)
     monkeypatch.setattr(pipeline, "compare", fake_comparison)
     out = tmp_path / "run"
     arguments = ["--preset", "tiny", "--objective", str(objective_file), "--out", str(out)]
@@ -205,7 +203,7 @@ def test_a_given_objective_is_judged_and_not_learned(tmp_path, objective_file, m
     assert found["objective"]["name"] == "tiny"
     assert found["meta_training"] == {}
     assert found["comparisons"]["Pendulum-v1"]["paired_differences"].keys() == {"dpo", "tiny"}
-    assert found["command"] == f"lpo run --preset=tiny --seed=0 --objective={objective_file}"
+    assert found["command"] == f"lpo run --preset=tiny --objective={objective_file}"
     assert not (out / "figures" / "meta_training.png").exists()
 
 
@@ -223,8 +221,8 @@ def fake_comparison(environment, objectives, seeds, *_, **named):
 @pytest.mark.parametrize("preset", pipeline.PRESETS)
 def test_seeds_that_judge_are_not_those_that_learn(preset):
     # Learning takes the seed itself; and runs of neighbouring seeds are judged by different agents.
-    for evaluation in pipeline.PRESETS[preset]["evaluations"]:
-        first = pipeline.reporting_seeds(0, evaluation["seeds"])
-        second = pipeline.reporting_seeds(1, evaluation["seeds"])
+    for evaluation in pipeline.PRESETS[preset].evaluations:
+        first = pipeline.reporting_seeds(0, evaluation.seeds)
+        second = pipeline.reporting_seeds(1, evaluation.seeds)
         assert min(first) == 10_000
         assert not set(first) & set(second)
