@@ -10,7 +10,7 @@ measured alone.
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,17 +18,14 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-import scb
 from experiments import zoo_table, zoo_table_page
 from experiments.claims import Claim
 from experiments.harness import Experiment, Preset, Report, Save
-from scb import plotting
-from scb.agents.spec import bandit_agent, environment_agent
+from scb import measurement, plotting
+from scb.agents.spec import AgentSpec, bandit_agent, environment_agent
 from scb.environments.registry import environment_spec
 from scb.environments.zoo import bandit_metadata, open_bandit
-from scb.evolution import map_population
 from scb.importer import PUBLISHED_BANDITS, published_bandit
-from scb.keys import root_key, split_key
 from scb.seeds import REPORTING
 from scb.statistics import estimate
 
@@ -88,8 +85,6 @@ def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None
 def _in_bandit(
     kind: str, environment: str, backend: str | None, algorithm: str, plan: Mapping[str, Any]
 ) -> dict[str, Any]:
-
-    env, env_params = scb.make(environment, backend)
     if kind == OURS:
         bandit = open_bandit(environment_spec(environment).bandit)
         digest = bandit_metadata(bandit.name)["sha256"]
@@ -99,75 +94,42 @@ def _in_bandit(
         bandit = published_bandit(folder / f"{name}.npz")
         digest = zoo_table.arrays_digest(folder / f"{name}.npz")
     spec = bandit_agent(algorithm, environment)
-    curves = _curves(
-        spec.agent(bandit),
-        spec.hyperparameters,
-        bandit.default_params,
-        env,
-        env_params,
-        plan["bandit_agents"],
-        plan,
-    )
-    return {"sha256": digest, **curves}
+    name = task(kind, environment, backend)
+    train_in = measurement.Place(name, bandit, bandit.default_params)
+    judge_in = measurement.Place.named(environment, backend)
+    return {"sha256": digest, **_curves(spec, train_in, judge_in, plan["bandit_agents"], plan)}
 
 
 def _in_environment(
     environment: str, backend: str | None, algorithm: str, plan: Mapping[str, Any]
 ) -> dict[str, Any]:
-
-    env, env_params = scb.make(environment, backend)
     spec = environment_agent(algorithm, environment).with_steps(plan["environment_steps"])
-    return _curves(
-        spec.agent(env),
-        spec.hyperparameters,
-        spec.training_params(env_params),
-        env,
-        env_params,
-        plan["environment_agents"],
-        plan,
-    )
+    place = measurement.Place.named(environment, backend)
+    return _curves(spec, place, place, plan["environment_agents"], plan)
 
 
 def _curves(
-    agent: Any,
-    hyperparameters: Any,
-    trained_in: Any,
-    env: Any,
-    env_params: Any,
+    spec: AgentSpec,
+    train_in: measurement.Place,
+    judge_in: measurement.Place,
     number: int,
     plan: Mapping[str, Any],
 ) -> dict[str, Any]:
     """{"steps": [P + 1], "returns": [N, P + 1], "seconds"}: `number` agents, most likely actions."""
-    every, iterations = evaluation_steps(agent.config.num_iterations, plan["points"])
-    # Evaluations are evenly spaced, for which a few iterations may be added at the end.
-    steps = agent.config.steps_after(iterations)
-    agent = replace(agent, config=replace(agent.config, total_steps=steps))
-
-    def evaluation(state: Any, key: Any) -> Any:
-        episodes = agent.evaluate(state, key, plan["episodes"], env, env_params, mode=True)
-        return episodes.returns.mean()
-
-    def train(key: Any) -> Any:
-        return agent.train_with_evaluations(key, hyperparameters, trained_in, evaluation, every)[1]
-
     start = time.monotonic()
-    keys = split_key(root_key(REPORTING.start), number)
-    returns = np.asarray(map_population(train, number, (0,))(keys))
+    agents = measurement.Agents.drawn_from(spec, REPORTING.start, number)
+    size = {"points": plan["points"], "episodes": plan["episodes"]}
+    rows = measurement.measure(spec, train_in, judge_in, agents, **size)
     seconds = time.monotonic() - start
+    returns = measurement.pivot(rows, "agent", "step")
     # What is no number counts as the agent before its training.
     usable = np.isfinite(returns)
     return {
-        "steps": [agent.config.steps_after(n) for n in range(0, iterations + 1, every)],
+        "steps": list(dict.fromkeys(row["step"] for row in rows)),
         "returns": np.round(np.where(usable, returns, returns[:, :1]), 1).tolist(),
         "failed": int((~usable).any(axis=1).sum()),
         "seconds": round(seconds, 1),
     }
-
-
-def evaluation_steps(iterations: int, points: int) -> tuple[int, int]:
-    """(iterations between evaluations, iterations in all): at most `points` evaluations after the first."""
-    every = -(-iterations // points)
-    return every, -(-iterations // every) * every
 
 
 def finals(curves: Mapping[str, Any]) -> np.ndarray:

@@ -6,7 +6,7 @@ intervals.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -83,6 +83,31 @@ class Comparison:
     """Learning curves of several objectives on one environment, the first of them the reference."""
 
     curves: list[LearningCurves]
+
+    @classmethod
+    def joined(cls, parts: Sequence[Mapping[str, Any]]) -> "Comparison":
+        """One comparison of several that were measured apart, on seeds of their own: what `as_dict` wrote of each.
+
+        Raises:
+          UserError: they differ in more than their seeds, or share some.
+        """
+        read = [[LearningCurves.from_dict(x) for x in part["curves"]] for part in parts]
+        joined = []
+        for curves in zip(*read, strict=True):
+            first = curves[0]
+            alike = {
+                (x.steps.tobytes(), repr(replace(x, steps=None, returns=None, seeds=[])))
+                for x in curves
+            }
+            seeds = [seed for x in curves for seed in x.seeds]
+            if len(alike) > 1 or len(set(seeds)) < len(seeds):
+                raise UserError(
+                    f"comparisons of {first.objective} in {first.environment} differ in more than their seeds "
+                    f"({seeds}), or share some: join what was measured alike on others."
+                )
+            returns = np.concatenate([x.returns for x in curves])
+            joined.append(replace(first, seeds=seeds, returns=returns))
+        return cls(joined)
 
     def differences(self) -> dict[str, Estimate]:
         """{objective: paired difference of final IQM to the reference}, positive where it is better."""

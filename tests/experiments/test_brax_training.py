@@ -25,14 +25,6 @@ def report():
     }
 
 
-def test_evaluations_are_evenly_spaced():
-    assert experiment.evaluation_steps(20, 10) == (2, 20)
-    assert experiment.evaluation_steps(9000, 10) == (900, 9000)
-    every, total = experiment.evaluation_steps(489, 10)
-    assert total % every == 0 and total // every <= 10 and 489 <= total < 1.1 * 489
-    assert experiment.evaluation_steps(3, 10) == (1, 3)
-
-
 def test_steps_to_match_are_of_the_first_evaluation_that_reaches_the_level():
     found = curves([0, 10, 20], [0.0, 5.0, 9.0], [0.0, 9.0, 2.0], [0.0, 1.0, 2.0])
     assert experiment.steps_to_match(found, 8.0) == [20, 10, None]
