@@ -1,5 +1,7 @@
 """How much of a bandit's reward depends on each entry of the observation."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 
@@ -7,6 +9,7 @@ from scb.environments.synthetic import BanditParams, SyntheticBandit
 from scb.keys import split_key
 
 
+@partial(jax.jit, static_argnames=("bandit", "num_values"))
 def reward_variance(
     bandit: SyntheticBandit,
     observations: jax.Array,
@@ -46,7 +49,6 @@ def reward_variance(
     reward = jax.vmap(bandit.mean_reward, in_axes=(0, 0, None))
     picked = jax.random.randint(key_value, (number, num_values), 0, number)
 
-    @jax.jit
     def entry_variance(entry: jax.Array) -> jax.Array:
         def varied(value: jax.Array) -> jax.Array:
             return reward(independent.at[:, entry].set(value), actions, params)

@@ -44,8 +44,8 @@ def bandit_states(
 ) -> np.ndarray:
     """[number, O] contexts."""
     params = bandit.default_params if params is None else params
-    contexts, _ = jax.vmap(bandit.reset_env, in_axes=(0, None))(split_key(key, number), params)
-    return np.asarray(contexts)
+    draw = jax.jit(jax.vmap(lambda key: bandit.reset_env(key, params)[0]))
+    return np.asarray(draw(split_key(key, number)))
 
 
 def follow(

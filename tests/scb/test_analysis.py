@@ -28,7 +28,7 @@ def tent(observation_size: int = 3, size: int = 1) -> SyntheticBandit:
         kernel[0, 2 * i : 2 * i + 2] = (-1.0, 1.0)
         kernel[observation_size + i, 2 * i : 2 * i + 2] = (1.0, -1.0)
     bandit = SyntheticBandit(observation_size, space, BanditConfig(hidden, "relu"))
-    weights = bandit.init_weights(jax.random.key(0))
+    weights = jax.jit(bandit.init_weights)(jax.random.key(0))
     weights["reward"] = {
         "Dense_0": {"kernel": kernel, "bias": np.zeros(hidden, np.float32)},
         "Dense_1": {"kernel": -np.ones((hidden, 1), np.float32), "bias": np.zeros(1, np.float32)},
@@ -49,14 +49,11 @@ def test_optimal_action_of_a_known_reward(method, size):
 def test_gradient_is_no_worse_than_the_grid_in_a_discovered_bandit():
     bandit = open_bandit("Synthetic-Pendulum-v1")
     contexts = jnp.asarray(bandit_states(bandit, jax.random.key(1), 200))
-    rewards = {
-        method: jax.vmap(bandit.mean_reward, in_axes=(0, 0, None))(
-            contexts,
-            jax.jit(jax.vmap(optimal_actions(bandit, method=method)))(contexts),
-            bandit.default_params,
-        )
-        for method in ("gradient", "grid")
-    }
+    rewards = {}
+    for method in ("gradient", "grid"):
+        best = jax.jit(jax.vmap(optimal_actions(bandit, method=method)))(contexts)
+        reward = jax.jit(jax.vmap(bandit.mean_reward, (0, 0, None)))
+        rewards[method] = reward(contexts, best, bandit.default_params)
     spread = float(np.std(rewards["grid"]))
     assert float(np.min(rewards["gradient"] - rewards["grid"])) > -0.02 * spread
 
@@ -64,12 +61,14 @@ def test_gradient_is_no_worse_than_the_grid_in_a_discovered_bandit():
 def test_discrete_optimum_is_the_argmax_over_all_actions():
     bandit = open_bandit("Synthetic-Acrobot-v1")
     contexts = jnp.asarray(bandit_states(bandit, jax.random.key(1), 50))
-    every = jax.vmap(
-        lambda a: jax.vmap(bandit.mean_reward, in_axes=(0, None, None))(
-            contexts, a, bandit.default_params
-        )
-    )(jnp.arange(3))
-    best = jax.vmap(optimal_actions(bandit))(contexts)
+
+    @jax.jit
+    def reward(action):
+        mean_reward = jax.vmap(bandit.mean_reward, (0, None, None))
+        return mean_reward(contexts, action, bandit.default_params)
+
+    every = [reward(action) for action in range(3)]
+    best = jax.jit(jax.vmap(optimal_actions(bandit)))(contexts)
     np.testing.assert_array_equal(best, np.argmax(every, axis=0))
 
 
@@ -120,7 +119,7 @@ def test_follow_earns_what_evaluate_earns():
         return (observation[2] > 0).astype(jnp.int32)
 
     followed = follow(env, env_params, policy, jax.random.key(0), 64)
-    evaluated = evaluate(env, env_params, policy, jax.random.key(1), 64)
+    evaluated = jax.jit(lambda key: evaluate(env, env_params, policy, key, 64))(jax.random.key(1))
     lengths = followed.active.sum(axis=1)
     assert followed.active[:, 0].all() and not followed.active[:, -1].any()
     np.testing.assert_array_equal(followed.returns(), lengths)
