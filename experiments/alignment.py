@@ -30,7 +30,6 @@ from lpo.alignment import (
     known_drifts,
     measure_alignment,
     other_drifts,
-    regime_label,
 )
 from lpo.fitness import LABELS
 from lpo.objectives import Objective, load_objective
@@ -111,7 +110,7 @@ def facts(report: Mapping[str, Any]) -> dict[str, Any]:
     tables = {
         name: [
             [
-                regime_label(row, stage["environment"]),
+                figures.regime_label(row, stage["environment"]),
                 *(correlation_text(row["alignment"][f]).replace("-", "\u2212") for f in LABELS),
             ]
             for row in stage["regimes"]

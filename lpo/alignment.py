@@ -380,15 +380,6 @@ def measure_alignment(
     return report
 
 
-def regime_label(row: Mapping[str, Any], environment: str) -> str:
-    """A measured regime's name, which says the bandit wherever that is another environment's."""
-    bandit = row["bandit"]
-    if bandit != Regime().bandit or bandit == environment_spec(environment).bandit:
-        return str(row["name"])
-    rest = "" if row["name"] == "default" else f", {row['name']}"
-    return f"bandit {bandit}{rest}"
-
-
 def correlation_text(correlation: Mapping[str, float | None]) -> str:
     """Such as "0.93 [0.81, 0.98]"."""
     interval = f"[{correlation['low']:.2f}, {correlation['high']:.2f}]"

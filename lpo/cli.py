@@ -8,10 +8,10 @@ from scb.cli import run_program
 
 
 def _commands() -> dict[str, Any]:
-    from lpo import commands
+    from lpo import commands, pipeline
 
     return {
-        "run": commands.RunAll,
+        "run": pipeline.RunAll,
         "meta-train": commands.MetaTrain,
         "train": commands.train,
         "evaluate": commands.evaluate,

@@ -31,8 +31,6 @@ from lpo.meta_training import (
     learn_objective,
 )
 from lpo.objectives import Objective, load_objective, save_objective
-from lpo.pipeline import PRESETS as RUN_PRESETS
-from lpo.pipeline import PipelineConfig, check_pipeline, run_pipeline
 from lpo.suite import run_suite
 from lpo.suite import suite as suite_environments
 from scb import plotting
@@ -77,42 +75,11 @@ def _meta_training(
     return replace(default, evolution=evolution)
 
 
-def _constant(config: PipelineConfig, given: Mapping[str, str]) -> PipelineConfig:
-    """A preset of which no flag decides more than itself."""
-    return config
-
-
 def seed_list(count: int, first: int, counted: str = "seeds") -> list[int]:
     """`count` consecutive seeds; a UserError, which says what is `counted`, for none or a negative one."""
     at_least(1, **{counted: count})
     at_least(0, seed=first)
     return list(range(first, first + count))
-
-
-@dataclass(frozen=True, kw_only=True)
-class RunAll(LongRun):
-    """The whole path: learn an objective on the Pendulum bandit, train PPO with it, judge it.
-
-    Meta-trains a drift on the shipped bandit, then trains PPO with its own clip, with DPO and with
-    the learned drift on Pendulum and on Brax Hopper, on the same seeds, and writes report.html,
-    figures and results.json.
-
-    Attributes:
-      preset: quick (eight minutes on two cores) or paper (the paper's sizes; hours).
-    """
-
-    program = "lpo run"
-    presets = MappingProxyType(
-        {name: partial(_constant, config) for name, config in RUN_PRESETS.items()}
-    )
-
-    config: Annotated[PipelineConfig, tyro.conf.arg(name="")] = RUN_PRESETS["quick"]
-    output: Output = field(default_factory=lambda: Output(Path("runs/quick")))
-
-    def run(self) -> None:
-        check_pipeline(self.config)  # a mistake must not leave a folder behind
-        report = run_pipeline(self.open(), self.config, self.preset, self.command)
-        console().print(f"report: {report}", soft_wrap=True)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -16,7 +16,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, MaxNLocator, NullFormatter
 from numpy.typing import NDArray
 
-from lpo.alignment import regime_label
+from lpo.meta_training import MetaTrainingConfig
+from scb.environments.registry import environment_spec
 from scb.errors import UserError
 from scb.plotting import (
     BLACK,
@@ -32,6 +33,7 @@ from scb.plotting import (
     figure_style,
     figure_title,
     legend_below,
+    ratio_text,
 )
 from scb.statistics import estimate, iqm
 
@@ -380,20 +382,13 @@ def alignment_heatmap(report: Mapping[str, Any]) -> Figure:
     return figure
 
 
-def ratio_text(bandit: float, environment: float) -> str:
-    """How a bandit's steps compare with an environment's, in words: "120 times fewer"."""
-    if bandit <= 0 or environment <= 0:
-        return ""
-    if bandit == environment:
-        return "the same"
-    ratio = max(bandit, environment) / min(bandit, environment)
-    number = thousands(ratio) if ratio >= 10 else f"{ratio:.2g}"
-    return f"{number} times {'fewer' if bandit < environment else 'more'}"
-
-
-def thousands(x: float) -> str:
-    """A count with its digits in groups of three, which no line break parts."""
-    return f"{x:,.0f}".replace(",", "\N{NARROW NO-BREAK SPACE}")
+def regime_label(row: Mapping[str, Any], environment: str) -> str:
+    """A measured regime's name, which says the bandit wherever that is another environment's."""
+    bandit = row["bandit"]
+    if (bandit,) != MetaTrainingConfig.tasks or bandit == environment_spec(environment).bandit:
+        return str(row["name"])
+    rest = "" if row["name"] == "default" else f", {row['name']}"
+    return f"bandit {bandit}{rest}"
 
 
 def _curve(axes: Axes, curve: "LearningCurves", look: Look) -> None:

@@ -5,8 +5,10 @@ Every stage leaves a file in the run folder; a resumed run does what is missing.
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
-from typing import Any
+from types import MappingProxyType
+from typing import Annotated, Any
 
 import tyro
 from rich.console import Console
@@ -25,6 +27,8 @@ from lpo.objectives import Objective, load_objective
 from scb import plotting
 from scb.agents.spec import environment_agent
 from scb.artefacts import machine_description, package_versions
+from scb.command_line import LongRun, Output
+from scb.console import console
 from scb.environments.registry import make
 from scb.evolution import EnvironmentSteps
 from scb.measurement import Rows
@@ -240,3 +244,34 @@ def _figures(
         paths[name].parent.mkdir(exist_ok=True)
         plotting.save(figure, paths[name])
     return paths
+
+
+def _constant(config: PipelineConfig, given: Mapping[str, str]) -> PipelineConfig:
+    """A preset of which no flag decides more than itself."""
+    return config
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunAll(LongRun):
+    """The whole path: learn an objective on the Pendulum bandit, train PPO with it, judge it.
+
+    Meta-trains a drift on the shipped bandit, then trains PPO with its own clip, with DPO and with
+    the learned drift on Pendulum and on Brax Hopper, on the same seeds, and writes report.html,
+    figures and results.json.
+
+    Attributes:
+      preset: quick (eight minutes on two cores) or paper (the paper's sizes; hours).
+    """
+
+    program = "lpo run"
+    presets = MappingProxyType(
+        {name: partial(_constant, config) for name, config in PRESETS.items()}
+    )
+
+    config: Annotated[PipelineConfig, tyro.conf.arg(name="")] = PRESETS["quick"]
+    output: Output = field(default_factory=lambda: Output(Path("runs/quick")))
+
+    def run(self) -> None:
+        check_pipeline(self.config)  # a mistake must not leave a folder behind
+        report = run_pipeline(self.open(), self.config, self.preset, self.command)
+        console().print(f"report: {report}", soft_wrap=True)

@@ -1,4 +1,4 @@
-"""The report of a run: one HTML file that needs nothing else, and the same table as Markdown.
+"""The report of a run: one HTML file that needs nothing else.
 
 The page opens with the one number that matters, says in words what its interval allows to say, and
 goes on to what is needed to doubt it: protocol, cost, certificate, seeds, versions and the command.
@@ -15,11 +15,11 @@ from typing import TYPE_CHECKING, Any, Literal
 import jinja2
 
 from lpo.certificate import LARGEST_KINK, Certificate
-from lpo.figures import ratio_text, thousands
 from scb.errors import UserError
+from scb.plotting import ratio_text, thousands
 
 if TYPE_CHECKING:
-    from lpo.comparison import Comparison
+    pass
 
 SCHEMA_VERSION = 1
 
@@ -67,17 +67,6 @@ def headline(results: Mapping[str, Any]) -> Headline:
         if name in comparison["paired_differences"]:
             return _sentence(name, environment, comparison)
     return Headline("not compared", f"{name} was compared with no other objective.")
-
-
-def markdown_table(comparison: "Comparison") -> str:
-    """The comparison as a Markdown table, one row an objective, ending in a newline."""
-    data = comparison.as_dict()
-    rows = [tuple(_columns(data["reference"]).values())]
-    rows += [tuple(row["cells"].values()) for row in _rows(data, learned=None)]
-    lines = ["| " + " | ".join(cell.replace("|", "\\|") for cell in row) + " |" for row in rows]
-    # Names to the left, numbers to the right.
-    lines.insert(1, "| --- |" + " ---: |" * 4 + " --- |" * (len(rows[0]) - 5))
-    return "\n".join(lines) + "\n"
 
 
 def write_report(folder: Path, results: Mapping[str, Any], figures: Mapping[str, Path]) -> Path:

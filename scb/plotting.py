@@ -146,3 +146,19 @@ def save(figure: Figure, path: str | Path, dpi: int = DPI) -> Path:
     with figure_style():
         figure.savefig(path, format="png", dpi=dpi, metadata={"Software": None})
     return path
+
+
+def ratio_text(bandit: float, environment: float) -> str:
+    """How a bandit's steps compare with an environment's, in words: "120 times fewer"."""
+    if bandit <= 0 or environment <= 0:
+        return ""
+    if bandit == environment:
+        return "the same"
+    ratio = max(bandit, environment) / min(bandit, environment)
+    number = thousands(ratio) if ratio >= 10 else f"{ratio:.2g}"
+    return f"{number} times {'fewer' if bandit < environment else 'more'}"
+
+
+def thousands(x: float) -> str:
+    """A count with its digits in groups of three, which no line break parts."""
+    return f"{x:,.0f}".replace(",", "\N{NARROW NO-BREAK SPACE}")

@@ -204,9 +204,9 @@ def test_the_report_holds_every_regime_and_is_drawn(monkeypatch, tmp_path):
 
 def test_a_regime_says_its_bandit_where_that_is_another_environments():
     row = {"name": "default", "bandit": "Synthetic-Pendulum-v1"}
-    assert module.regime_label(row, "Pendulum-v1") == "default"
-    assert module.regime_label(row, "Acrobot-v1") == "bandit Synthetic-Pendulum-v1"
+    assert figures.regime_label(row, "Pendulum-v1") == "default"
+    assert figures.regime_label(row, "Acrobot-v1") == "bandit Synthetic-Pendulum-v1"
     noisy = {"name": "reward noise 1.0", "bandit": "Synthetic-Pendulum-v1"}
-    assert module.regime_label(noisy, "Acrobot-v1").endswith("-v1, reward noise 1.0")
+    assert figures.regime_label(noisy, "Acrobot-v1").endswith("-v1, reward noise 1.0")
     own = {"name": "bandit Synthetic-Acrobot-v1", "bandit": "Synthetic-Acrobot-v1"}
-    assert module.regime_label(own, "Acrobot-v1") == own["name"]
+    assert figures.regime_label(own, "Acrobot-v1") == own["name"]

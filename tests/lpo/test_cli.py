@@ -17,12 +17,13 @@ from gymnax.environments import spaces
 import lpo
 import scb.cli
 from lpo import cli, commands
-from lpo.commands import MetaTrain, RunAll
+from lpo.commands import MetaTrain
 from lpo.comparison import Comparison, LearningCurves
 from lpo.drifts import DRIFTS, ClosedFormDrift, NoDrift
 from lpo.fitness import LABELS
 from lpo.meta_training import TEMPORAL_HORIZONS, MetaTrainingConfig
 from lpo.objectives import Objective, closed_form, load_objective
+from lpo.pipeline import RunAll
 from scb.agents.ppo import PPOHyperparameters
 from scb.agents.spec import AgentSpec
 from scb.environments.synthetic import BanditConfig, SyntheticBandit
@@ -200,7 +201,7 @@ def no_training(monkeypatch):
         raise AssertionError("this must fail before any training")
 
     monkeypatch.setattr("lpo.meta_training.evolve", refuse)
-    monkeypatch.setattr(commands, "run_pipeline", refuse)
+    monkeypatch.setattr("lpo.pipeline.run_pipeline", refuse)
     monkeypatch.setattr("scb.measurement._program_of", refuse)
 
 

@@ -266,7 +266,7 @@ def test_bars_end_at_the_steps_and_the_ratio_is_written_beside_them():
     ],
 )
 def test_the_ratio_says_which_way_it_goes(bandit, environment, text):
-    assert figures.ratio_text(bandit, environment) == text
+    assert plotting.ratio_text(bandit, environment) == text
 
 
 def test_no_steps_are_no_bar():

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from lpo import cli, pipeline
-from lpo.commands import RunAll
 from lpo.comparison import Comparison, LearningCurves
 from lpo.objectives import load_objective
+from lpo.pipeline import RunAll
 from scb.agents.ppo import PPOConfig, PPOHyperparameters
 from scb.agents.spec import AgentSpec
 from scb.measurement import pivot
