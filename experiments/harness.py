@@ -77,7 +77,6 @@ class Experiment:
       keys: what a report holds at least.
       out: the report's place, where it is not docs/data/NAME.json.
       reports: whether it has a report; a tool has none.
-      markdown: report -> the page, where no template makes it.
       dpi: of the figures.
     """
 
@@ -97,7 +96,6 @@ class Experiment:
     keys: Sequence[str] = ()
     out: Path | None = None
     reports: bool = True
-    markdown: Callable[[Report], str] | None = None
     dpi: int = plotting.DPI
 
     def judged(self, report: Report) -> list[Judged]:
@@ -118,8 +116,6 @@ class Experiment:
 
     def page(self, report: Report) -> str:
         """The page in Markdown."""
-        if self.markdown is not None:
-            return self.markdown(report)
         return rendering.template(self.name).render(self.context(report))
 
     def block(self, part: str, report: Report) -> str:
@@ -219,7 +215,7 @@ class Experiment:
                 f"the report of {self.name} is not complete: run python -m experiments.{self.name} "
                 f"--preset {report.get('preset', 'quick')}, which goes on where it was."
             )
-        if self.markdown is not None or rendering.has_template(self.name):
+        if rendering.has_template(self.name):
             (docs / f"{self.name}.md").write_text(self.page(report))
         for name, figure in self.figures(report).items():
             plotting.save(figure, docs / "figures" / f"{name}.png", self.dpi)

@@ -35,7 +35,7 @@ def percent(share: float, places: int = 0) -> str:
 
 def listed(parts: Iterable[str]) -> str:
     """Such as "a, b and c"."""
-    *first, last = parts
+    *first, last = [*parts] or [""]
     return f"{', '.join(first)} and {last}" if first else last
 
 

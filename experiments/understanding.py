@@ -23,6 +23,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from experiments.harness import Experiment, Save
+from experiments.rendering import listed
 from lpo import drift_figures
 from lpo.drifts import ClosedFormDrift
 from lpo.objectives import load_objective, zoo_names
@@ -95,44 +96,22 @@ def read_comparison(path: Path, formulas: Sequence[Mapping[str, Any]] = ()) -> d
         ) from error
 
 
-def markdown(report: Mapping[str, Any]) -> str:
-    """The page: the figure, the table, what it says in words, and the formulas."""
-    rows = report["analyses"]
-    names = list(dict.fromkeys(row["objective"] for row in rows))
-    lines = [
-        "# What the drifts do to an update",
-        "",
-        f"![Drift, gradient of the objective and regions of {_listed(names)}]"
-        "(figures/understanding.png)",
-        "",
-        "`python -m experiments.understanding`. PPO maximises `mean(r·A − f)`, so all that a drift `f(r, A)`",
-        "does is to change the plain surrogate's gradient. The share that is left of it is",
-        "`h = d(r·A − f)/d(log r) / (r·A)`: 1 where nothing is charged, 0 where the update stops, negative where it",
-        "turns round. The table gives each region's share of ratios from 0.5 to 2, uniform in `log r`, and advantages",
-        "from −3 to 3, weighted by the standard normal density; *stops* is the first ratio on the way from 1 where",
-        "`h` falls to 0.05.",
-        "",
-        f"| objective | {' | '.join(REGIONS)} | stops, A = +1 | stops, A = −1 |",
-        f"| --- |{' --- |' * (len(REGIONS) + 2)}",
+def facts(report: Mapping[str, Any]) -> dict[str, Any]:
+    """The table's rows, and what each says in words."""
+    rows = [
+        {
+            "label": _label(row),
+            "cells": [
+                *(_percent(row["fractions"][name]) for name in REGIONS),
+                *(_stop(row["stops"][sign]) for sign in ("+1", "-1")),
+            ],
+            "words": words(row),
+        }
+        for row in report["analyses"]
     ]
-    for row in rows:
-        cells = [
-            _label(row),
-            *(_percent(row["fractions"][name]) for name in REGIONS),
-            *(_stop(row["stops"][sign]) for sign in ("+1", "-1")),
-        ]
-        lines.append(f"| {' | '.join(cells)} |")
-    lines += [
-        "",
-        *(f"- *{name}*: {meaning}.".replace("-0.05", "−0.05") for name, meaning in REGIONS.items()),
-        "",
-    ]
-    for row in rows:
-        lines += [f"**{_label(row)}.** {words(row)}", ""]
-    if report.get("formulas"):
-        lines += _formula_section(report)
-    lines += ["The numbers: [data/understanding.json](data/understanding.json).", ""]
-    return "\n".join(lines)
+    names = list(dict.fromkeys(row["objective"] for row in report["analyses"]))
+    regions = {name: meaning.replace("-0.05", "−0.05") for name, meaning in REGIONS.items()}
+    return {"rows": rows, "names": names, "regions": regions}
 
 
 def words(row: Mapping[str, Any]) -> str:
@@ -150,7 +129,7 @@ def words(row: Mapping[str, Any]) -> str:
         for name in ("cautious", "amplified", "hindered")
         if fractions[name] >= 0.005
     }
-    inside = _listed([f"{name} in {_percent(share)}" for name, share in changed.items()])
+    inside = listed([f"{name} in {_percent(share)}" for name, share in changed.items()])
     sentences.append(
         f"Elsewhere it is {inside} of the grid, and leaves the gradient as it is in "
         f"{_percent(fractions['free'])}."
@@ -180,76 +159,12 @@ def _fate(shares: Mapping[str, float]) -> str:
     shown = [(what, share) for share, what in fates if share >= 0.005]
     if len(shown) == 1:
         return f"{shown[0][0]} everywhere"
-    return _listed([f"{what} in {_percent(share)}" for what, share in shown])
-
-
-def _formula_section(report: Mapping[str, Any]) -> list[str]:
-    lines = ["## As formulas", ""]
-    for formula in report["formulas"]:
-        r2, base, certificate = formula["r2"], formula["base_r2"], formula["certificate"]
-        added = "PPO's clip drift + " if formula["base"] == "ppo" else ""
-        gate = "g·" if formula["gate"] else ""
-        width = f", and `g = 1 − exp(−(log r / {formula['gate']:g})²)`" if gate else ""
-        lines += [
-            f"`{formula['command']}` wrote `{formula['of']}` down as `f = relu({added}{gate}e − ξ)` with",
-            "",
-            "```text",
-            f"e = {formula['expression']}",
-            "```",
-            "",
-            f"where `d = r − 1` and `log_r = log r`{width}.",
-            "On points that the fit has not seen, log-ratios of standard deviation 0.3 and normal advantages,",
-            f"R² is {_r2(r2['drift'])} for the drift and {_r2(r2['slope'])} for its slope `df/d(log r)`;",
-            f"the base alone has {_r2(base['drift'])} and {_r2(base['slope'])}.",
-            f"The mirror-learning conditions {'hold' if certificate['holds'] else 'do NOT hold'} on the "
-            "certificate's grid.",
-            "",
-        ]
-    for comparison in report.get("comparisons", []):
-        seeds = comparison["seeds"]
-        actions = "mode" if comparison["mode_actions"] else "sampled"
-        scale = comparison["policy_output_scale"]
-        start = "" if scale == 1 else f", the policy's last layer times {scale:g} at initialisation"
-        lines += [
-            f"Trained with on {comparison['environment']}{start}, {comparison['steps']} steps, seeds {min(seeds)} to "
-            f"{max(seeds)}, {comparison['episodes']} episodes of {actions} actions; interquartile means with 95 % "
-            "bootstrap intervals:",
-            "",
-            f"| objective | final return | paired difference to {comparison['reference']} |",
-            "| --- | --- | --- |",
-        ]
-        for name, score in comparison["final_iqm"].items():
-            difference = comparison["paired_differences"].get(name)
-            shown = _estimate(difference, signed=True) if difference else ""
-            lines.append(f"| {name} | {_estimate(score)} | {shown} |")
-        lines.append("")
-        for name, difference in comparison["to_original"].items():
-            lines += [
-                f"The formula's difference to the network's, `{name}` − `{difference['of']}`: "
-                f"{_estimate(difference, signed=True)}.",
-                "",
-            ]
-    return lines
-
-
-def _r2(value: float) -> str:
-    return f"{value:.3f}".replace("-", "−")
-
-
-def _estimate(value: Mapping[str, Any], signed: bool = False) -> str:
-    text = f"{value['value']:+.0f}" if signed else f"{value['value']:.0f}"
-    if value.get("low") is not None and value.get("high") is not None:
-        text += f" [{value['low']:.0f}, {value['high']:.0f}]"
-    return text.replace("-", "−")
+    return listed([f"{what} in {_percent(share)}" for what, share in shown])
 
 
 def _label(row: Mapping[str, Any]) -> str:
     name = f"`{row['objective']}`"
     return f"{name} at {100 * row['progress']:g} % of training" if row["temporal"] else name
-
-
-def _listed(parts: Sequence[str]) -> str:
-    return " and ".join([", ".join(parts[:-1]), parts[-1]] if len(parts) > 1 else parts)
 
 
 def _percent(share: float) -> str:
@@ -295,7 +210,7 @@ EXPERIMENT = Experiment(
     title="What the drifts do to an update",
     measure=measure,
     draw=draw,
-    markdown=markdown,
+    facts=facts,
     options=Options,
     # Half the usual resolution: it is a tall figure of smooth maps, which compress badly.
     dpi=100,

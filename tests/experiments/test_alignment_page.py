@@ -1,4 +1,3 @@
-import json
 import shutil
 from pathlib import Path
 
@@ -49,12 +48,6 @@ def test_a_reports_command_says_what_is_measured_and_not_where_it_is_written():
     options = alignment.Options(agents=8, held_out=(Path("a.npz"),), skip_confirmation=True)
     command = "python -m experiments.alignment --agents 8 --held-out a.npz --skip-confirmation"
     assert alignment.command_of(options) == command
-
-
-def test_the_committed_page_is_that_of_the_committed_report():
-    docs = Path(alignment.__file__).parents[1] / "docs"
-    report = json.loads((docs / "data" / "alignment.json").read_text())
-    assert (docs / "alignment.md").read_text() == alignment.EXPERIMENT.page(report)
 
 
 def test_what_is_held_out_is_not_in_the_family_under_another_name(tmp_path, capsys):

@@ -80,8 +80,3 @@ def test_a_references_agents_are_one_set_however_many_searches_it_is_compared_wi
     found = module.difference(report, "ppo", "Pendulum")()
     assert found.value == pytest.approx(-768, abs=1)
     assert found.low == pytest.approx(-906, abs=15) and found.high == pytest.approx(-560, abs=15)
-
-
-def test_the_committed_page_is_that_of_the_committed_report():
-    report = json.loads((DOCS / "data" / "transfer_study.json").read_text())
-    assert (DOCS / "transfer_study.md").read_text() == module.EXPERIMENT.page(report)
