@@ -1,6 +1,6 @@
 """Run folders: what a long computation writes, so that it can be watched, killed and resumed.
 
-runs/NAME/config.json       what was asked for; --resume refuses another
+runs/NAME/config.json       what was asked for, and the command that asks for it; --resume refuses another
 runs/NAME/metrics.jsonl     one line a generation, free of clocks: a resumed run ends with the same
 bytes
 runs/NAME/timing.jsonl      seconds per generation
