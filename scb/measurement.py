@@ -314,7 +314,8 @@ def measure(
                         for kind in actions
                     ],
                 )
-            tell(f"{judge_in.name}: {sum(len(c.done) for c in cells)} of {len(wanted)} agents")
+            said = ", ".join([judge_in.name, *(o.name for o in family if o is not None)])
+            tell(f"{said}: {sum(len(cell.done) for cell in cells)} of {len(wanted)} agents")
         for objective, kept in zip(family, cells, strict=True):
             name = None if objective is None else objective.name
             found[name] = [row for one in agents.names for row in kept.done[one]]

@@ -145,7 +145,7 @@ def test_long_trainings_are_kept_as_they_come(copy, measured, file):
         raise KeyboardInterrupt(line)
 
     # In the order of the objectives: three agents of "ppo" and one of "wide" in two pairs.
-    with pytest.raises(KeyboardInterrupt, match="Synthetic-Pendulum-v1: 2 of 6 agents"):
+    with pytest.raises(KeyboardInterrupt, match="Synthetic-Pendulum-v1, ppo, wide: 2 of 6 agents"):
         measured(copy, side_by_side=2, tell=kill)
     assert len(copy.read_text().splitlines()) == 2 * 4
     np.testing.assert_allclose(
