@@ -13,8 +13,8 @@ def _commands() -> dict[str, Any]:
     return {
         "run": pipeline.RunAll,
         "meta-train": commands.MetaTrain,
-        "train": commands.train,
-        "evaluate": commands.evaluate,
+        "train": commands.Train,
+        "evaluate": commands.Evaluate,
         "align": commands.align,
         "certify": commands.certify_command,
         "distill": commands.distill_command,

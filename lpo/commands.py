@@ -1,16 +1,14 @@
 """What the subcommands of `lpo` do. Their docstrings are the command line's help."""
 
-import inspect
 import itertools
-import json
 import shlex
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 import tyro
@@ -36,12 +34,12 @@ from lpo.suite import suite as suite_environments
 from scb import plotting
 from scb.agents.spec import environment_agent
 from scb.artefacts import machine_description, package_versions
-from scb.command_line import LongRun, Output, listed
+from scb.command_line import LongRun, Output, flags_given, listed
 from scb.console import console
 from scb.environments.registry import environment_spec
 from scb.errors import UserError, at_least
 from scb.measurement import Rows
-from scb.runs import Run, make_folder, read_config, write_json
+from scb.runs import config_dict, make_folder, write_json
 from scb.statistics import estimate
 
 
@@ -134,80 +132,17 @@ class MetaTrain(LongRun):
         return objective
 
 
-def train(
-    environment: str = "Pendulum-v1",
-    objective: str = "ppo",
-    steps: int | None = None,
-    policy_output_scale: float | None = None,
-    seeds: int = 1,
-    seed: int = 0,
-    backend: str | None = None,
-    sampled_actions: bool = False,
-    out: Path | None = None,
-    resume: Path | None = None,
-) -> None:
-    """Train PPO with an objective in an environment, and print how well it ends.
-
-    Args:
-      environment: Pendulum-v1, CartPole-v1, hopper, Synthetic-Pendulum-v1, ...
-      objective: ppo, ppo-0.3 (clip 0.3), dpo, none, a zoo name, or path.npz.
-      steps: environment steps; the environment's own setting where left out.
-      policy_output_scale: factor on the policy's last layer at initialisation; many public PPOs take
-        0.01.
-      seeds: agents to train.
-      seed: the first of their seeds.
-      backend: Brax physics: generalized, positional or spring.
-      sampled_actions: evaluate sampled actions rather than the most likely ones.
-      out: folder for rows.jsonl, comparison.json and curves.png; must be new or empty.
-      resume: a folder that an interrupted command wrote; its settings apply, and a flag that
-        contradicts them is an error.
-    """
-    settings = _settings(
-        train,
-        {
-            "command": "train",
-            "environment": environment,
-            "objective": objective,
-            "steps": steps,
-            "policy_output_scale": policy_output_scale,
-            "seeds": seeds,
-            "seed": seed,
-            "backend": backend,
-            "sampled_actions": sampled_actions,
-        },
-        resume,
-    )
-    comparison = _compare(settings, [load_objective(settings["objective"])], out, resume)
-    (curves,) = comparison.curves
-    for point, returns in zip(curves.steps, curves.returns.T, strict=True):
-        print(f"{point:>9} steps: return {np.mean(returns):.1f}")
-    print(f"final return, IQM: {estimate(curves.final)}")
+def _tell(line: str) -> None:
+    print(line, file=sys.stderr, flush=True)
 
 
-def evaluate(
-    environment: str | None = None,
-    suite: str | None = None,
-    objectives: tuple[str, ...] = ("ppo", "dpo"),
-    steps: int | None = None,
-    policy_output_scale: float | None = None,
-    seeds: int = 10,
-    seed: int = 1000,
-    backend: str | None = None,
-    sampled_actions: bool = False,
-    out: Path | None = None,
-    resume: Path | None = None,
-) -> None:
-    """Compare objectives: train PPO with each on the same seeds, and print final scores with intervals.
+@dataclass(frozen=True)
+class Agents:
+    """Which agents are trained and judged, and how.
 
-    With --out every agent's returns are kept in rows.jsonl as they come, for --resume and for
-    other statistics: pandas.read_json("rows.jsonl", lines=True).
-
-    Args:
-      environment: where to train; Pendulum-v1 where neither this nor a suite is given.
-      suite: train in every environment of classic, minatar, brax or all, and aggregate normalised
-        scores; a folder given as --out that holds a part of them already is completed.
-      objectives: any of ppo, ppo-0.3, dpo, none, zoo names, files; the first is the reference of
-        the differences.
+    Attributes:
+      environment: Pendulum-v1, CartPole-v1, hopper, Synthetic-Pendulum-v1, ...; Pendulum-v1 where
+        nothing says another.
       steps: environment steps; the environment's own setting where left out.
       policy_output_scale: factor on the policy's last layer at initialisation; many public PPOs take
         0.01.
@@ -215,163 +150,214 @@ def evaluate(
       seed: the first of their seeds.
       backend: Brax physics: generalized, positional or spring.
       sampled_actions: evaluate sampled actions rather than the most likely ones.
+    """
+
+    environment: str | None = None
+    steps: int | None = None
+    policy_output_scale: float | None = None
+    seeds: int = 1
+    seed: int = 0
+    backend: str | None = None
+    sampled_actions: bool = False
+
+    def seed_list(self) -> list[int]:
+        return seed_list(self.seeds, self.seed)
+
+
+@dataclass(frozen=True)
+class TrainConfig(Agents):
+    """What `lpo train` does.
+
+    Attributes:
+      objective: ppo, ppo-0.3 (clip 0.3), dpo, none, a zoo name, or path.npz.
+    """
+
+    objective: str = "ppo"
+
+
+@dataclass(frozen=True)
+class EvaluateConfig(Agents):
+    """What `lpo evaluate` does.
+
+    Attributes:
+      suite: train in every environment of classic, minatar, brax or all, and aggregate normalised
+        scores; a folder given as --out that holds a part of them already is completed.
+      objectives: any of ppo, ppo-0.3, dpo, none, zoo names, files; the first is the reference of
+        the differences.
+    """
+
+    seeds: int = 10
+    seed: int = 1000
+    suite: str | None = None
+    objectives: tuple[str, ...] = ("ppo", "dpo")
+
+    def __post_init__(self) -> None:
+        if not self.objectives:
+            raise UserError("no objectives: give at least one, such as --objectives ppo dpo.")
+        if self.suite is not None and self.environment is not None:
+            raise UserError(
+                f"the environment {self.environment} and the suite {self.suite} are both given: leave one out."
+            )
+
+
+@dataclass(frozen=True)
+class Kept:
+    """Where agents' returns are kept as they come.
+
+    Attributes:
       out: folder for rows.jsonl, comparison.json and curves.png; must be new or empty.
       resume: a folder that an interrupted command wrote; its settings apply, and a flag that
         contradicts them is an error.
     """
-    if suite is not None and out is not None and (out / "config.json").exists():
-        out, resume = None, out
-    settings = _settings(
-        evaluate,
-        {
-            "command": "evaluate",
-            "environment": environment,
-            "suite": suite,
-            "objectives": objectives,
-            "steps": steps,
-            "policy_output_scale": policy_output_scale,
-            "seeds": seeds,
-            "seed": seed,
-            "backend": backend,
-            "sampled_actions": sampled_actions,
-        },
-        resume,
-    )
-    if not settings["objectives"]:
-        raise UserError("no objectives: give at least one, such as --objectives ppo dpo.")
-    loaded = _named_apart(settings["objectives"])
-    if settings["suite"] is not None:
-        if settings["environment"] is not None:
-            raise UserError(
-                f"the environment {settings['environment']} and the suite {settings['suite']} are both given: leave "
-                "one out."
+
+    out: Path | None = None
+    resume: Path | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Measuring(LongRun):
+    """A command that trains agents and keeps their rows, in a folder where one is named."""
+
+    output: Kept = field(default_factory=Kept)
+    preset: tyro.conf.Suppress[str] = "quick"
+
+    def opened(self) -> tuple[Path | None, Rows]:
+        """The folder of the results, and the rows in it; without a folder in memory."""
+        if self.output == Kept():
+            return None, Rows()
+        folder = self.open().folder
+        return folder, Rows(folder / "rows.jsonl")
+
+    def compare(self, objectives: Sequence[Objective]) -> Comparison:
+        """Trains with the objectives, and leaves rows, comparison.json and curves.png where a folder is named."""
+        config: Agents = self.config
+        environment, seeds = config.environment or "Pendulum-v1", config.seed_list()
+        spec = (
+            environment_agent("ppo", environment)
+            .with_steps(config.steps)
+            .with_values(policy_output_scale=config.policy_output_scale)
+        )
+        folder, rows = self.opened()
+        comparison = compare(
+            environment,
+            objectives,
+            seeds,
+            spec=spec,
+            backend=config.backend,
+            mode_actions=not config.sampled_actions,
+            rows=rows,
+            tell=_tell,
+        )
+        if folder is not None:
+            write_json(
+                folder / "comparison.json", {**comparison.as_dict(), "versions": package_versions()}
             )
-        _evaluate_suite(settings, loaded, out, resume)
-        return
-    comparison = _compare(settings, loaded, out, resume)
-    table = Table(
-        "objective",
-        "final IQM [95 %]",
-        "area under the curve",
-        f"difference to {settings['objectives'][0]}",
+            plotting.save(figures.learning_curves(comparison.curves), folder / "curves.png")
+        return comparison
+
+
+@dataclass(frozen=True, kw_only=True)
+class Train(Measuring):
+    """Train PPO with an objective in an environment, and print how well it ends."""
+
+    program = "lpo train"
+    presets = MappingProxyType({"quick": lambda given: TrainConfig()})
+
+    config: Annotated[TrainConfig, tyro.conf.arg(name="")] = field(default_factory=TrainConfig)
+
+    def run(self) -> None:
+        (curves,) = self.compare([load_objective(self.config.objective)]).curves
+        for point, returns in zip(curves.steps, curves.returns.T, strict=True):
+            print(f"{point:>9} steps: return {np.mean(returns):.1f}")
+        print(f"final return, IQM: {estimate(curves.final)}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Evaluate(Measuring):
+    """Compare objectives: train PPO with each on the same seeds, and print final scores with intervals.
+
+    With --out every agent's returns are kept in rows.jsonl as they come, for --resume and for
+    other statistics: pandas.read_json("rows.jsonl", lines=True).
+    """
+
+    program = "lpo evaluate"
+    presets = MappingProxyType({"quick": lambda given: EvaluateConfig()})
+
+    config: Annotated[EvaluateConfig, tyro.conf.arg(name="")] = field(
+        default_factory=EvaluateConfig
     )
-    for row in comparison.table():
-        difference = "" if row["difference"] is None else str(row["difference"])
-        table.add_row(row["objective"], str(row["final"]), str(row["area"]), difference)
-    console().print(table)
 
+    @classmethod
+    def parse(cls, arguments: Sequence[str]) -> "Evaluate":
+        given = flags_given(arguments, "suite", "out")
+        if "suite" in given and "out" in given and (Path(given["out"]) / "config.json").exists():
+            arguments = [*arguments, "--resume", given["out"]]
+        return super().parse(arguments)
 
-def _settings(
-    command: Callable[..., None], given: Mapping[str, Any], resume: Path | None
-) -> dict[str, Any]:
-    """A command's flags; with `resume` those that the folder was started with, but for what is given now."""
-    given = json.loads(json.dumps(given))
-    if resume is None:
-        return dict(given)
-    default = {n: x.default for n, x in inspect.signature(command).parameters.items()}
-    default = json.loads(json.dumps(default, default=str))
-    changed = {name: x for name, x in given.items() if x != default.get(name)}
-    stored = read_config(resume)
-    if stored.get("command") != given["command"]:
-        raise UserError(
-            f"cannot resume {resume} with lpo {given['command']}: it is a folder of lpo {stored.get('command')}."
+    def run(self) -> None:
+        objectives = _named_apart(self.config.objectives)
+        if self.config.suite is not None:
+            self.run_suite(self.config.suite, objectives)
+            return
+        table = Table(
+            "objective",
+            "final IQM [95 %]",
+            "area under the curve",
+            f"difference to {self.config.objectives[0]}",
         )
-    return {**stored, **changed}
+        for row in self.compare(objectives).table():
+            difference = "" if row["difference"] is None else str(row["difference"])
+            table.add_row(row["objective"], str(row["final"]), str(row["area"]), difference)
+        console().print(table)
 
-
-def _opened(
-    settings: Mapping[str, Any], out: Path | None, resume: Path | None
-) -> tuple[Path | None, Rows]:
-    """The folder of a command's results, and the rows in it; without a folder in memory."""
-    if out is None and resume is None:
-        return None, Rows()
-    folder = Run.open(resume or out or "", settings, resume=resume is not None).folder
-    return folder, Rows(folder / "rows.jsonl")
-
-
-def _compare(
-    settings: Mapping[str, Any],
-    objectives: Sequence[Objective],
-    out: Path | None,
-    resume: Path | None,
-) -> Comparison:
-    """Trains with the objectives, and leaves rows, comparison.json and curves.png where a folder is named."""
-    environment = settings["environment"] or "Pendulum-v1"
-    spec = (
-        environment_agent("ppo", environment)
-        .with_steps(settings["steps"])
-        .with_values(policy_output_scale=settings["policy_output_scale"])
-    )
-    seeds = seed_list(settings["seeds"], settings["seed"])
-    folder, rows = _opened(settings, out, resume)
-    comparison = compare(
-        environment,
-        objectives,
-        seeds,
-        spec=spec,
-        backend=settings["backend"],
-        mode_actions=not settings["sampled_actions"],
-        rows=rows,
-        tell=_tell,
-    )
-    if folder is not None:
-        write_json(
-            folder / "comparison.json", {**comparison.as_dict(), "versions": package_versions()}
+    def run_suite(self, name: str, objectives: Sequence[Objective]) -> None:
+        config, seeds = self.config, self.config.seed_list()
+        suite_environments(name)
+        folder, rows = self.opened()
+        printer = console()
+        scores, comparisons = run_suite(
+            name,
+            objectives,
+            seeds,
+            config.backend,
+            tell=printer.print,
+            rows=rows,
+            steps=config.steps,
+            policy_output_scale=config.policy_output_scale,
+            mode_actions=not config.sampled_actions,
         )
-        plotting.save(figures.learning_curves(comparison.curves), folder / "curves.png")
-    return comparison
-
-
-def _tell(line: str) -> None:
-    print(line, file=sys.stderr, flush=True)
-
-
-def _evaluate_suite(
-    settings: Mapping[str, Any],
-    objectives: Sequence[Objective],
-    out: Path | None,
-    resume: Path | None,
-) -> None:
-    name, seeds = settings["suite"], seed_list(settings["seeds"], settings["seed"])
-    suite_environments(name)
-    folder, rows = _opened(settings, out, resume)
-    printer = console()
-    scores, comparisons = run_suite(
-        name,
-        objectives,
-        seeds,
-        settings["backend"],
-        tell=printer.print,
-        rows=rows,
-        steps=settings["steps"],
-        policy_output_scale=settings["policy_output_scale"],
-        mode_actions=not settings["sampled_actions"],
-    )
-    reference = objectives[0].name
-    table = Table(
-        "environment",
-        *scores.objectives,
-        title="final return, IQM [95 %]",
-        caption="suite: " + name,
-    )
-    for environment, comparison in comparisons.items():
-        table.add_row(environment, *(str(estimate(c.final)) for c in comparison.curves))
-    printer.print(table)
-    aggregate = Table("objective", "normalised score, IQM [95 %]", f"difference to {reference}")
-    differences = scores.differences()
-    for i, (objective, score) in enumerate(zip(scores.objectives, scores.aggregate(), strict=True)):
-        aggregate.add_row(objective, str(score), str(differences[i]) if i else "")
-    printer.print(aggregate)
-    if scores.left_out:
-        printer.print(f"left out, nobody beat random actions: {', '.join(scores.left_out)}")
-    if folder is not None:
+        reference = objectives[0].name
+        table = Table(
+            "environment",
+            *scores.objectives,
+            title="final return, IQM [95 %]",
+            caption="suite: " + name,
+        )
         for environment, comparison in comparisons.items():
-            path = folder / "comparisons" / f"{environment}.json"
-            path.parent.mkdir(exist_ok=True)
-            write_json(path, comparison.as_dict())
-        content = {**settings, "seeds": seeds, **scores.as_dict(), "versions": package_versions()}
-        write_json(folder / "suite.json", content)
-        plotting.save(figures.suite_scores(scores), folder / "suite.png")
+            table.add_row(environment, *(str(estimate(c.final)) for c in comparison.curves))
+        printer.print(table)
+        aggregate = Table("objective", "normalised score, IQM [95 %]", f"difference to {reference}")
+        differences = scores.differences()
+        for i, (objective, score) in enumerate(
+            zip(scores.objectives, scores.aggregate(), strict=True)
+        ):
+            aggregate.add_row(objective, str(score), str(differences[i]) if i else "")
+        printer.print(aggregate)
+        if scores.left_out:
+            printer.print(f"left out, nobody beat random actions: {', '.join(scores.left_out)}")
+        if folder is not None:
+            for environment, comparison in comparisons.items():
+                path = folder / "comparisons" / f"{environment}.json"
+                path.parent.mkdir(exist_ok=True)
+                write_json(path, comparison.as_dict())
+            content = {
+                **config_dict(config),
+                "seeds": seeds,
+                **scores.as_dict(),
+                "versions": package_versions(),
+            }
+            write_json(folder / "suite.json", content)
+            plotting.save(figures.suite_scores(scores), folder / "suite.png")
 
 
 def align(

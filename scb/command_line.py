@@ -67,6 +67,8 @@ def flags(config: Any, default: Any) -> Iterator[str]:
         name = (named[0] if named else entry.name).replace("_", "-")
         if isinstance(value, bool):
             yield f"--{name}" if value else f"--no-{name}"
+        elif isinstance(value, tuple) and not written:
+            yield from (f"--{name}", *map(str, value))
         else:
             yield f"--{name}={written[0].str_from_instance(value)[0] if written else value}"
 
@@ -100,7 +102,7 @@ class LongRun:
     """
 
     config: Any
-    output: Output
+    output: Any
     preset: str = "quick"
 
     program: ClassVar[str]
@@ -118,10 +120,10 @@ class LongRun:
     @classmethod
     def parse(cls, arguments: Sequence[str]) -> Self:
         """The command with these flags: those that a resumed run was started with, over its preset, come first."""
-        folder = _given(arguments, "resume").get("resume")
+        folder = flags_given(arguments, "resume").get("resume")
         if folder is not None:
             arguments = [*cls._stored(folder), *arguments]
-        given = _given(arguments, "preset", *cls.deciding)
+        given = flags_given(arguments, "preset", *cls.deciding)
         preset = given.get("preset", "quick")
         if preset not in cls.presets:
             raise unknown_name("preset", preset, cls.presets)
@@ -155,11 +157,9 @@ class LongRun:
 
     def open(self) -> Run:
         """The run folder, new or resumed."""
-        output = self.output
+        output, wandb = self.output, getattr(self.output, "wandb", None)
         stored = {"command": self.command, "config": config_dict(self.config)}
-        return Run.open(
-            output.resume or output.out, stored, output.resume is not None, output.wandb
-        )
+        return Run.open(output.resume or output.out, stored, output.resume is not None, wandb)
 
 
 def call(
@@ -182,7 +182,7 @@ def call(
         tyro.cli(command, prog=f"{program} {name}", args=arguments[1:], config=_STYLE)
 
 
-def _given(arguments: Sequence[str], *names: str) -> dict[str, str]:
+def flags_given(arguments: Sequence[str], *names: str) -> dict[str, str]:
     """Flags by name, read before tyro does, and "" for one without a value."""
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     for name in names:

@@ -518,9 +518,12 @@ def test_a_killed_evaluation_resumes_to_the_same_bytes(interrupted_evaluation, w
     [
         (
             ["evaluate", "--seeds=3"],
-            "cannot resume o: its config differs at seeds (2 there, 3 now)",
+            "cannot resume o: its config differs at config.seeds (2 there, 3 now)",
         ),
-        (["train"], "cannot resume o with lpo train: it is a folder of lpo evaluate."),
+        (
+            ["train"],
+            "cannot resume o with lpo train: it was started with lpo evaluate --environment",
+        ),
     ],
 )
 def test_a_resumed_evaluation_keeps_its_settings(

@@ -169,8 +169,12 @@ def test_a_killed_suite_is_completed_to_the_same_scores(tmp_path, tiny_agent, mo
     bandits = {"classic": ("Synthetic-CartPole-v1", "Synthetic-Pendulum-v1")}
     monkeypatch.setattr(suite, "suites", lambda: bandits)
     out = tmp_path / "suite"
-    arguments = {"suite": "classic", "objectives": ("ppo",), "seeds": 2, "out": out}
-    commands.evaluate(**arguments)
+
+    def evaluate(seeds=2):
+        words = ["--suite=classic", "--objectives", "ppo", f"--seeds={seeds}", f"--out={out}"]
+        commands.Evaluate.parse(words).run()
+
+    evaluate()
     assert "normalised score" in capsys.readouterr().out
     first = json.loads((out / "suite.json").read_text())
     assert (first["objectives"], first["seeds"]) == (["ppo"], [1000, 1001])
@@ -179,19 +183,19 @@ def test_a_killed_suite_is_completed_to_the_same_scores(tmp_path, tiny_agent, mo
     rows = (out / "rows.jsonl").read_bytes()
     (out / "rows.jsonl").write_bytes(rows[: len(rows) * 2 // 3])
     (out / "suite.json").unlink()
-    commands.evaluate(**arguments)
+    evaluate()
     assert (out / "rows.jsonl").read_bytes() == rows
     assert json.loads((out / "suite.json").read_text()) == first
 
-    with pytest.raises(UserError, match=r"its config differs at seeds \(2 there, 4 now\)"):
-        commands.evaluate(**{**arguments, "seeds": 4})
+    with pytest.raises(UserError, match=r"its config differs at config.seeds \(2 there, 4 now\)"):
+        evaluate(seeds=4)
 
 
 def test_a_suite_and_an_environment_do_not_go_together():
     with pytest.raises(UserError, match="are both given: leave one out"):
-        commands.evaluate(environment="CartPole-v1", suite="classic")
+        commands.EvaluateConfig(environment="CartPole-v1", suite="classic")
     with pytest.raises(UserError, match="unknown suite 'clasic': did you mean classic"):
-        commands.evaluate(suite="clasic")
+        commands.Evaluate.parse(["--suite=clasic"]).run()
 
 
 def test_scores_are_drawn(tmp_path):
