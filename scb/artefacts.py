@@ -47,8 +47,6 @@ _FIELDS: dict[str, tuple[type, ...]] = {
     "command": (str,),
     "sha256": (str,),
 }
-# `save` fills in these itself.
-_OWN_FIELDS = ("schema_version", "name", "versions", "sha256")
 
 _PACKAGES = ("jax", "jaxlib", "flax", "optax", "evosax", "gymnax", "brax", "numpy", "lpo")
 

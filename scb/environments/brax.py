@@ -112,10 +112,10 @@ class BraxEnvironment(environment.Environment[BraxState, BraxParams]):
                 "physics afresh each time."
             )
         self._name = name
-        self._backend = backend
+        self.backend = backend
         self._num_start_states = num_start_states
-        self._brax = _load(name, backend)
-        start = jax.eval_shape(self._brax.reset, root_key(0))
+        self.brax_env = _load(name, backend)
+        start = jax.eval_shape(self.brax_env.reset, root_key(0))
         self._observation_shape: tuple[int, ...] = start.obs.shape
 
     # jit keys its cache on `self`: two environments made alike share one compiled program.
@@ -126,26 +126,16 @@ class BraxEnvironment(environment.Environment[BraxState, BraxParams]):
         return hash(self._made_from)
 
     def __repr__(self) -> str:
-        return f"BraxEnvironment({self._name!r}, backend={self._backend!r})"
+        return f"BraxEnvironment({self._name!r}, backend={self.backend!r})"
 
     @property
     def _made_from(self) -> tuple[str, str, int | None]:
-        return self._name, self._backend, self._num_start_states
+        return self._name, self.backend, self._num_start_states
 
     @property
     def name(self) -> str:
         """Brax's name, such as "hopper"."""
         return self._name
-
-    @property
-    def brax_env(self) -> "brax.envs.Env":
-        """Brax's own environment."""
-        return self._brax
-
-    @property
-    def backend(self) -> str:
-        """The physics: "generalized", "positional", "spring" or "mjx"."""
-        return self._backend
 
     @property
     def default_params(self) -> BraxParams:
@@ -155,7 +145,7 @@ class BraxEnvironment(environment.Environment[BraxState, BraxParams]):
     @property
     def num_actions(self) -> int:
         """Number of actuators."""
-        return int(self._brax.action_size)
+        return int(self.brax_env.action_size)
 
     def action_space(self, params: BraxParams | None = None) -> spaces.Box:
         """[-1, 1] per actuator; brax scales it to the actuator's own range."""
@@ -174,7 +164,7 @@ class BraxEnvironment(environment.Environment[BraxState, BraxParams]):
         Returns:
           [O] observation, state at time 0.
         """
-        return self._start(self._brax.reset(key))
+        return self._start(self.brax_env.reset(key))
 
     def reset_env(self, key: jax.Array, params: BraxParams) -> tuple[jax.Array, BraxState]:
         """What auto-reset calls at every step: a start state from the pool.
@@ -184,8 +174,8 @@ class BraxEnvironment(environment.Environment[BraxState, BraxParams]):
         from all of the pool.
         """
         if self._num_start_states is None:
-            return self._start(self._brax.reset(key))
-        pool = _start_states(self._name, self._backend, self._num_start_states)
+            return self._start(self.brax_env.reset(key))
+        pool = _start_states(self._name, self.backend, self._num_start_states)
         index = jax.random.randint(key, (), 0, self._num_start_states)
         return self._start(jax.tree.map(lambda leaf: jnp.asarray(leaf)[index], pool))
 
@@ -210,7 +200,7 @@ class BraxEnvironment(environment.Environment[BraxState, BraxParams]):
         chex.assert_shape(action, (self.num_actions,))
         # Brax writes its metrics into the dictionaries that it is given: hand it copies.
         before = jax.tree.map(lambda leaf: leaf, state.brax_state)
-        after = self._brax.step(before, jnp.clip(action, -1.0, 1.0))
+        after = self.brax_env.step(before, jnp.clip(action, -1.0, 1.0))
         # Some environments return Python numbers (reward = 1.0); auto-reset's select and scan want
         # the dtypes of reset.
         after = jax.tree.map(lambda old, new: jnp.asarray(new, old.dtype), state.brax_state, after)
@@ -334,17 +324,5 @@ def _accept_old_clip_keywords(fluid: Any) -> None:
     changes but the name `jp` inside the module `brax.fluid`.
     """
     if fluid.jp is jnp and "a_min" not in inspect.signature(jnp.clip).parameters:
-        fluid.jp = _NumpyWithOldClip("jax.numpy")
-
-
-class _NumpyWithOldClip(types.ModuleType):
-    """`jax.numpy`, whose clip takes its limits by their former names."""
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(jnp, name)
-
-    @staticmethod
-    def clip(
-        x: jax.Array, a_min: jax.Array | float | None = None, a_max: jax.Array | float | None = None
-    ) -> jax.Array:
-        return jnp.clip(x, min=a_min, max=a_max)
+        clip = {"clip": lambda x, a_min=None, a_max=None: jnp.clip(x, a_min, a_max)}
+        fluid.jp = types.SimpleNamespace(**(vars(jnp) | clip))

@@ -6,10 +6,11 @@ context and action; the episode ends there. All weights live in the environment'
 population of bandits is `vmap` over `params` in one program.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Literal, TypeAlias, cast
+from typing import Any, Literal, TypeAlias, TypeVar, cast
 
 import distrax
 import jax
@@ -100,18 +101,82 @@ class BanditConfig:
         at_least(1, self, "hidden_size", "latent_size")
 
 
-class SyntheticBandit(environment.Environment[BanditState, BanditParams]):
-    """A contextual bandit with learned contexts and rewards, as a gymnax 1.x environment.
+_State = TypeVar("_State", bound=environment.EnvState)
+_Params = TypeVar("_Params", bound=environment.EnvParams)
+
+
+class SyntheticEnvironment(environment.Environment[_State, _Params]):
+    """What bandits and MDPs share: the shapes of an evaluation environment, and a learned reward.
 
     Args:
       observation_size: O, the flattened observation size of the evaluation environment.
-      action_space: the evaluation environment's action space. A discrete action enters the reward
-        network one-hot, a continuous one clipped to the bounds.
+      action_space: the evaluation environment's action space. A discrete action enters the
+        networks one-hot, a continuous one clipped to the bounds.
       config: layer size, activation, latent distribution.
-      weights: what `default_params` holds; None for a bandit that is only ever given explicit
-        `params`.
+      weights: what `default_params` holds; None for one that is only ever given explicit `params`.
       name: as registered, e.g. "Synthetic-Pendulum-v1".
     """
+
+    config: BanditConfig
+
+    def __init__(
+        self,
+        observation_size: int,
+        action_space: spaces.Box | spaces.Discrete,
+        config: BanditConfig,
+        weights: Weights | None,
+        name: str,
+    ) -> None:
+        self.config = config
+        self.observation_size = observation_size
+        self._action_space = action_space
+        self._name = name
+        self.discrete = isinstance(action_space, spaces.Discrete)
+        self._action_size = encoded_size(action_space)
+        self.latent_size = config.latent_size or observation_size
+        self._network = partial(
+            TwoLayers, hidden_size=config.hidden_size, activation=config.activation
+        )
+        self._initial_state = self._network(output_size=observation_size)
+        self._reward = self._network(output_size=1)
+        self._weights = weights
+
+    @property
+    def name(self) -> str:
+        return self._name
+
+    @property
+    def num_actions(self) -> int:
+        return self._action_size
+
+    def init_weights(self, key: jax.Array) -> Weights:
+        """Random weights (Flax's default initialisation), the start of the paper's evolution."""
+        raise NotImplementedError
+
+    def weight_shapes(self) -> dict[str, tuple[int, ...]]:
+        """{"reward/Dense_0/kernel": (O + A, hidden), ...}: what an artefact must hold."""
+        shapes = jax.eval_shape(self.init_weights, root_key(0))
+        flat = jax.tree_util.tree_flatten_with_path(shapes)[0]
+        return {"/".join(str(part.key) for part in path): leaf.shape for path, leaf in flat}
+
+    def mean_reward(self, context: jax.Array, action: ArrayLike, params: Any) -> jax.Array:
+        """[O] observation, action -> [] reward without noise: in one-step episodes the Q-function."""
+        inputs = self._inputs(context, action)
+        reward = self._reward.apply({"params": params.weights["reward"]}, inputs)
+        return cast(jax.Array, reward)[0]
+
+    def action_space(self, params: _Params | None = None) -> spaces.Box | spaces.Discrete:
+        return self._action_space
+
+    def observation_space(self, params: _Params | None = None) -> spaces.Box:
+        return spaces.Box(-jnp.inf, jnp.inf, (self.observation_size,), jnp.float32)
+
+    def _inputs(self, observation: jax.Array, action: ArrayLike) -> jax.Array:
+        return jnp.concatenate([observation, encode_action(action, self._action_space)])
+
+
+class SyntheticBandit(SyntheticEnvironment[BanditState, BanditParams]):
+    """A contextual bandit with learned contexts and rewards, as a gymnax 1.x environment."""
 
     one_step = True
 
@@ -123,27 +188,7 @@ class SyntheticBandit(environment.Environment[BanditState, BanditParams]):
         weights: Weights | None = None,
         name: str = "SyntheticBandit",
     ) -> None:
-        self.config = config or BanditConfig()
-        self.observation_size = observation_size
-        self._action_space = action_space
-        self._name = name
-        self.discrete = isinstance(action_space, spaces.Discrete)
-        self._action_size = encoded_size(action_space)
-        self.latent_size = self.config.latent_size or observation_size
-        network = partial(
-            TwoLayers, hidden_size=self.config.hidden_size, activation=self.config.activation
-        )
-        self._initial_state = network(output_size=observation_size)
-        self._reward = network(output_size=1)
-        self._weights = weights
-
-    @property
-    def name(self) -> str:
-        return self._name
-
-    @property
-    def num_actions(self) -> int:
-        return self._action_size
+        super().__init__(observation_size, action_space, config or BanditConfig(), weights, name)
 
     @property
     def default_params(self) -> BanditParams:
@@ -158,7 +203,6 @@ class SyntheticBandit(environment.Environment[BanditState, BanditParams]):
         return BanditParams(weights=weights)
 
     def init_weights(self, key: jax.Array) -> Weights:
-        """Random weights (Flax's default initialisation), the start of the paper's evolution."""
         key_state, key_reward = split_key(key)
         inputs = jnp.zeros(self.observation_size + self._action_size)
         return {
@@ -168,20 +212,10 @@ class SyntheticBandit(environment.Environment[BanditState, BanditParams]):
             "reward": self._reward.init(key_reward, inputs)["params"],
         }
 
-    def weight_shapes(self) -> dict[str, tuple[int, ...]]:
-        """{"reward/Dense_0/kernel": (O + A, hidden), ...}: what an artefact of this bandit must hold."""
-        return shapes_of(self.init_weights)
-
     def context(self, latent: jax.Array, params: BanditParams) -> jax.Array:
         """[L] latent -> [O] observation."""
         context = self._initial_state.apply({"params": params.weights["initial_state"]}, latent)
         return cast(jax.Array, context)
-
-    def mean_reward(self, context: jax.Array, action: ArrayLike, params: BanditParams) -> jax.Array:
-        """[O] context, action -> [] reward without noise: the bandit's Q-function."""
-        inputs = jnp.concatenate([context, encode_action(action, self._action_space)])
-        reward = self._reward.apply({"params": params.weights["reward"]}, inputs)
-        return cast(jax.Array, reward)[0]
 
     def reset_env(self, key: jax.Array, params: BanditParams) -> tuple[jax.Array, BanditState]:
         latent = LATENTS[self.config.latent](key, self.latent_size)
@@ -204,12 +238,6 @@ class SyntheticBandit(environment.Environment[BanditState, BanditParams]):
         # bootstrapping.
         return jnp.bool_(False)
 
-    def action_space(self, params: BanditParams | None = None) -> spaces.Box | spaces.Discrete:
-        return self._action_space
-
-    def observation_space(self, params: BanditParams | None = None) -> spaces.Box:
-        return spaces.Box(-jnp.inf, jnp.inf, (self.observation_size,), jnp.float32)
-
     def sample_rewards(self, params: BanditParams, key: jax.Array, num_samples: int) -> jax.Array:
         """[num_samples] noiseless rewards of random contexts and uniformly random actions."""
 
@@ -229,10 +257,7 @@ class SyntheticBandit(environment.Environment[BanditState, BanditParams]):
 
 def flat_size(shape: tuple[int, ...]) -> int:
     """Number of entries of an array of this shape; 1 for ()."""
-    size = 1
-    for dimension in shape:
-        size *= dimension
-    return size
+    return math.prod(shape)
 
 
 def encoded_size(space: spaces.Box | spaces.Discrete) -> int:
@@ -245,13 +270,6 @@ def encode_action(action: ArrayLike, space: spaces.Box | spaces.Discrete) -> jax
     if isinstance(space, spaces.Discrete):
         return jax.nn.one_hot(action, encoded_size(space))
     return jnp.reshape(jnp.clip(jnp.asarray(action), space.low, space.high), (encoded_size(space),))
-
-
-def shapes_of(init_weights: Callable[[jax.Array], Weights]) -> dict[str, tuple[int, ...]]:
-    """{"reward/Dense_0/kernel": (O + A, hidden), ...} of what `init_weights(key)` returns."""
-    shapes = jax.eval_shape(init_weights, root_key(0))
-    flat = jax.tree_util.tree_flatten_with_path(shapes)[0]
-    return {"/".join(str(part.key) for part in path): leaf.shape for path, leaf in flat}
 
 
 def bandit_for(

@@ -13,7 +13,6 @@ are passed on as they are, and evolution ranks such a candidate last.
 """
 
 from dataclasses import dataclass, field
-from functools import partial
 from typing import Any, cast
 
 import jax
@@ -26,13 +25,10 @@ from scb.environments.synthetic import (
     LATENTS,
     BanditConfig,
     SyntheticBandit,
-    TwoLayers,
+    SyntheticEnvironment,
     Weights,
     bandit_for,
-    encode_action,
-    encoded_size,
     flat_size,
-    shapes_of,
 )
 from scb.errors import UserError, at_least, unknown_name
 from scb.keys import split_key
@@ -83,7 +79,7 @@ class MDPConfig(BanditConfig):
         at_least(1, self, "max_steps")
 
 
-class SyntheticMDP(environment.Environment[MDPState, MDPParams]):
+class SyntheticMDP(SyntheticEnvironment[MDPState, MDPParams]):
     """An MDP with learned dynamics, as a gymnax 1.x environment.
 
     With [s, a] the observation and the action, joined: s' = transition([s, a]), r = reward([s, a]),
@@ -93,12 +89,8 @@ class SyntheticMDP(environment.Environment[MDPState, MDPParams]):
     termination, and the step ends where it began: such a "TI" is the bandit of the same weights.
 
     Args:
-      observation_size: O, the flattened observation size of the evaluation environment.
-      action_space: the evaluation environment's. Actions enter the networks as in a bandit.
-      config: parameterisation, maximum episode length, layer size, activation, latent distribution.
-      weights: what `default_params` holds; None for an MDP that is only ever given explicit
-        `params`.
-      name: as it is to be shown.
+      observation_size, action_space, weights, name: as of `SyntheticEnvironment`.
+      config: parameterisation and maximum episode length too.
       env, env_params: the evaluation environment, in whose start states a "T" starts; None for a
         "TI", which has its own. It starts where the environment's automatic reset does: for Brax, in
         a pool of states (see `BraxEnvironment`).
@@ -107,6 +99,8 @@ class SyntheticMDP(environment.Environment[MDPState, MDPParams]):
       UserError: a "T" without an evaluation environment, a "TI" with one, or an environment with
         observations of another size.
     """
+
+    config: MDPConfig
 
     def __init__(
         self,
@@ -118,24 +112,14 @@ class SyntheticMDP(environment.Environment[MDPState, MDPParams]):
         env: environment.Environment[Any, Any] | None = None,
         env_params: Any = None,
     ) -> None:
-        self.config = config
-        self.observation_size = observation_size
-        self._action_space = action_space
-        self._name = name
-        self.discrete = isinstance(action_space, spaces.Discrete)
-        self._action_size = encoded_size(action_space)
-        self.latent_size = config.latent_size or observation_size
+        super().__init__(observation_size, action_space, config, weights, name)
         self.env = env
         self.env_params = (
             env.default_params if env is not None and env_params is None else env_params
         )
         self._check_start()
-        network = partial(TwoLayers, hidden_size=config.hidden_size, activation=config.activation)
-        self._initial_state = network(output_size=observation_size)
-        self._reward = network(output_size=1)
-        self._transition = network(output_size=observation_size)
-        self._termination = network(output_size=1)
-        self._weights = weights
+        self._transition = self._network(output_size=observation_size)
+        self._termination = self._network(output_size=1)
 
     def _check_start(self) -> None:
         if (self.env is None) == (self.config.parameterization == "T"):
@@ -151,14 +135,6 @@ class SyntheticMDP(environment.Environment[MDPState, MDPParams]):
                     f"{self.name!r} has observations of {self.observation_size} entries and "
                     f"{self.env.name} has {size}: give the evaluation environment it was made for."
                 )
-
-    @property
-    def name(self) -> str:
-        return self._name
-
-    @property
-    def num_actions(self) -> int:
-        return self._action_size
 
     @property
     def one_step(self) -> bool:
@@ -179,7 +155,6 @@ class SyntheticMDP(environment.Environment[MDPState, MDPParams]):
         return MDPParams(weights=weights, max_steps_in_episode=self.config.max_steps)
 
     def init_weights(self, key: jax.Array) -> Weights:
-        """Random weights (Flax's default initialisation), the start of the paper's evolution."""
         key_state, key_reward, key_transition, key_termination = split_key(key, 4)
         inputs = jnp.zeros(self.observation_size + self._action_size)
         weights = {
@@ -191,18 +166,6 @@ class SyntheticMDP(environment.Environment[MDPState, MDPParams]):
             latent = jnp.zeros(self.latent_size)
             weights["initial_state"] = self._initial_state.init(key_state, latent)["params"]
         return weights
-
-    def weight_shapes(self) -> dict[str, tuple[int, ...]]:
-        """{"reward/Dense_0/kernel": (O + A, hidden), ...}: what an artefact of this MDP must hold."""
-        return shapes_of(self.init_weights)
-
-    def mean_reward(
-        self, observation: jax.Array, action: ArrayLike, params: MDPParams
-    ) -> jax.Array:
-        """[O] observation, action -> [] reward; only in one-step episodes also the Q-function."""
-        inputs = self._inputs(observation, action)
-        reward = self._reward.apply({"params": params.weights["reward"]}, inputs)
-        return cast(jax.Array, reward)[0]
 
     def transition(self, observation: jax.Array, action: ArrayLike, params: MDPParams) -> jax.Array:
         """[O] observation, action -> [O] next observation, not bounded in any way."""
@@ -251,15 +214,6 @@ class SyntheticMDP(environment.Environment[MDPState, MDPParams]):
     def is_truncated(self, state: MDPState, params: MDPParams) -> jax.Array:
         """Whether the maximum length alone ended the episode."""
         return (state.time >= self._limit(params)) & ~state.terminated
-
-    def action_space(self, params: MDPParams | None = None) -> spaces.Box | spaces.Discrete:
-        return self._action_space
-
-    def observation_space(self, params: MDPParams | None = None) -> spaces.Box:
-        return spaces.Box(-jnp.inf, jnp.inf, (self.observation_size,), jnp.float32)
-
-    def _inputs(self, observation: jax.Array, action: ArrayLike) -> jax.Array:
-        return jnp.concatenate([observation, encode_action(action, self._action_space)])
 
 
 def synthetic_for(

@@ -208,7 +208,7 @@ class FakeBrax:
 class FakeBraxEnvironment(BraxEnvironment):
     def __init__(self):
         super().__init__(NAME, BACKEND, num_start_states=None)
-        self._brax = FakeBrax()
+        self.brax_env = FakeBrax()
 
 
 def test_without_a_pool_each_episode_starts_from_a_fresh_reset():
