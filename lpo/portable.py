@@ -52,17 +52,7 @@ def drift_function(
       UserError: as `load_objective`.
     """
     objective = _loaded(objective)
-
-    def penalty(log_ratio: ArrayLike, advantage: ArrayLike, progress: ArrayLike) -> jax.Array:
-        log_ratio, advantage = jnp.asarray(log_ratio), jnp.asarray(advantage)
-        dtype = jnp.result_type(log_ratio, advantage, jnp.float32)
-        log_ratio, advantage = log_ratio.astype(dtype), advantage.astype(dtype)
-        _check_shapes(log_ratio, advantage)
-        log_ratio = jnp.clip(log_ratio, -MAX_LOG_RATIO, MAX_LOG_RATIO)
-        progress = jnp.broadcast_to(jnp.asarray(progress, dtype), log_ratio.shape)
-        return objective.drift(objective.parameters, log_ratio, advantage, progress)
-
-    return penalty
+    return partial(_converted, jnp, objective.drift, objective.parameters)
 
 
 def numpy_drift(
@@ -77,15 +67,7 @@ def numpy_drift(
       UserError: as `load_objective`.
     """
     objective = _loaded(objective)
-    drift, parameters = objective.drift, _host_parameters(objective)
-
-    def penalty(log_ratio: ArrayLike, advantage: ArrayLike, progress: ArrayLike) -> np.ndarray:
-        log_ratio, advantage = np.asarray(log_ratio), np.asarray(advantage)
-        dtype = np.result_type(log_ratio, advantage, np.float32)
-        log_ratio, advantage = log_ratio.astype(dtype), advantage.astype(dtype)
-        return np.asarray(_evaluate(np, drift, parameters, log_ratio, advantage, progress))
-
-    return penalty
+    return partial(_converted, np, objective.drift, _host_parameters(objective))
 
 
 def torch_drift(objective: Objective | str | Path) -> "TorchFunction":
@@ -138,13 +120,18 @@ def _loaded(objective: Objective | str | Path) -> Objective:
     return objective if isinstance(objective, Objective) else load_objective(objective)
 
 
-def _check_shapes(log_ratio: Any, advantage: Any) -> None:
-    # [B, 1] against [B] would broadcast to [B, B] and train something else.
-    if log_ratio.shape != advantage.shape:
-        raise UserError(
-            f"log_ratio has shape {tuple(log_ratio.shape)} and advantage {tuple(advantage.shape)}: "
-            "a drift takes two of the same shape."
-        )
+def _converted(
+    xp: Any,
+    drift: Drift,
+    parameters: Any,
+    log_ratio: ArrayLike,
+    advantage: ArrayLike,
+    progress: ArrayLike,
+) -> Any:
+    """`_evaluate` of whatever is like an array, in the floating-point type that it has together."""
+    dtype = xp.result_type(xp.asarray(log_ratio), xp.asarray(advantage), xp.float32)
+    log_ratio, advantage = xp.asarray(log_ratio, dtype), xp.asarray(advantage, dtype)
+    return xp.asarray(_evaluate(xp, drift, parameters, log_ratio, advantage, progress))
 
 
 def _evaluate(
@@ -155,8 +142,15 @@ def _evaluate(
     advantage: Any,
     progress: Any,
 ) -> Any:
-    _check_shapes(log_ratio, advantage)
-    like = partial(xp.asarray, dtype=log_ratio.dtype, device=log_ratio.device)
+    # [B, 1] against [B] would broadcast to [B, B] and train something else.
+    if log_ratio.shape != advantage.shape:
+        raise UserError(
+            f"log_ratio has shape {tuple(log_ratio.shape)} and advantage {tuple(advantage.shape)}: "
+            "a drift takes two of the same shape."
+        )
+    # A traced JAX array is on no device yet.
+    device = getattr(log_ratio, "device", None)
+    like = partial(xp.asarray, dtype=log_ratio.dtype, device=device)
     log_ratio = xp.clip(log_ratio, -MAX_LOG_RATIO, MAX_LOG_RATIO)
     progress = xp.broadcast_to(like(progress), log_ratio.shape)
     return drift(jax.tree.map(like, parameters), log_ratio, advantage, progress, xp)
