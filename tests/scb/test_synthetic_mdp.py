@@ -345,7 +345,7 @@ def test_ppo_trains_in_a_population_of_mdps(parameterization):
     if parameterization == "T":
         for member in weights:
             del member["initial_state"]
-    agent = PPO(mdp, PPOConfig(8, 16, 4, 4, total_steps=4096, hidden_sizes=(8,)))
+    agent = PPO(mdp, PPOConfig(8, 4096, (8,), num_steps=16, num_epochs=4, num_minibatches=4))
     assert not agent.one_step
 
     def trained(params):
