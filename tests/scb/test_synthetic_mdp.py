@@ -276,7 +276,7 @@ def test_a_ti_of_length_one_is_the_bandit(space, latent, promised):
 
 @pytest.mark.slow
 def test_ppo_learns_in_a_ti_of_length_one_as_in_the_bandit():
-    config = PPOConfig(4, 8, 1, 2, total_steps=32, hidden_sizes=(4,))
+    config = PPOConfig(4, 32, (4,), num_steps=8, num_epochs=1, num_minibatches=2)
     hyperparameters = PPOHyperparameters()
     agents = []
     for env, params in bandit_and_mdp(BOX):
