@@ -34,13 +34,15 @@ from lpo.suite import suite as suite_environments
 from scb import plotting
 from scb.agents.spec import environment_agent
 from scb.artefacts import machine_description, package_versions
-from scb.command_line import LongRun, Output, flags_given, listed
+from scb.command_line import LongRun, Output, flags, flags_given, listed
 from scb.console import console
 from scb.environments.registry import environment_spec
 from scb.errors import UserError, at_least
 from scb.measurement import Rows
 from scb.runs import config_dict, make_folder, write_json
 from scb.statistics import estimate
+
+_DISTILL = DistillConfig()
 
 
 def _meta_training(
@@ -436,10 +438,7 @@ def align(
 
 def distill_command(
     objective: tyro.conf.Positional[str],
-    samples: int = 1000,
-    population_size: int = 1000,
-    generations: int = 20,
-    seed: int = 0,
+    config: Annotated[DistillConfig, tyro.conf.arg(name="")] = _DISTILL,
     out: Path = Path("runs/distill"),
 ) -> None:
     """Write a learned objective down as a formula: symbolic regression with gplearn (extra `distill`).
@@ -449,21 +448,13 @@ def distill_command(
 
     Args:
       objective: a zoo name or path.npz.
-      samples: points of the fit.
-      population_size: of the genetic programming.
-      generations: of the genetic programming.
-      seed: decides everything.
+      config: how the formula is looked for.
       out: folder for closed_form.npz and closed_form.json; must be new or empty.
     """
     loaded = load_objective(objective)
-    config = DistillConfig(
-        samples=samples, population_size=population_size, generations=generations, seed=seed
-    )
     _make_folder(out)
     found = distill(loaded, config)
-    settings = {"samples": samples, "population-size": population_size}
-    settings |= {"generations": generations, "seed": seed}
-    flags = [f"--{name}={value}" for name, value in settings.items()]
+    words = [Path(objective).name, *flags(config, _DISTILL)]
     path, certificate = save_objective(
         out / "closed_form.npz",
         found.drift,
@@ -474,11 +465,11 @@ def distill_command(
                 "of": loaded.name,
                 "of_sha256": loaded.metadata.get("sha256"),
             },
-            "seeds": {"distill": seed},
+            "seeds": {"distill": config.seed},
             "results": {"r2": found.r2, "base_r2": found.base_r2, "front": found.front},
             "cost": {"seconds": round(found.seconds, 1), "machine": machine_description()},
             # A file goes by its name: the folder it lay in is this machine's.
-            "command": shlex.join(["lpo", "distill", Path(objective).name, *flags]),
+            "command": shlex.join(["lpo", "distill", *words]),
         },
     )
     print(f"expression: {found.drift.expression}")

@@ -57,7 +57,8 @@ class DistillConfig:
 
     Attributes:
       samples: points that the fit sees; as many again, which it doesn't, judge the result.
-      population_size, generations: of the genetic programming.
+      population_size: of the genetic programming.
+      generations: of the genetic programming.
       parsimony: fitness (R²) that a program pays for each of its nodes.
       candidates: formulas whose numbers are set by least squares, the best of each length.
       grown: the best of these, to which further terms are added one by one.

@@ -22,7 +22,7 @@ from lpo.comparison import Comparison, LearningCurves
 from lpo.drifts import DRIFTS, ClosedFormDrift, NoDrift
 from lpo.fitness import LABELS
 from lpo.meta_training import TEMPORAL_HORIZONS, MetaTrainingConfig
-from lpo.objectives import Objective, closed_form, load_objective
+from lpo.objectives import Objective, closed_form, load_objective, zoo_names
 from lpo.pipeline import RunAll
 from scb.agents.ppo import PPOHyperparameters
 from scb.agents.spec import AgentSpec
@@ -646,6 +646,17 @@ def test_every_flag_of_meta_train_reaches_the_configuration_and_its_command():
     quick, default = asked_for(), MetaTrainingConfig()
     assert MetaTrain.parse([]).command == "lpo meta-train"
     assert quick == replace(default, evolution=replace(default.evolution, num_generations=30))
+
+
+@pytest.mark.parametrize("name", zoo_names())
+def test_the_command_of_every_zoo_entry_asks_for_what_its_json_holds(name):
+    metadata = load_objective(name).metadata
+    config = config_dict(asked_for(metadata["command"].removeprefix("lpo meta-train")))
+    stored = metadata["config"]["meta_training"]
+    assert config["evolution"] == stored["evolution"]
+    # An entry from before drifts had gates, or tasks were several, lacks what says so.
+    for key in ("tasks", "fitness", "contexts", "horizons", "reward_noise", "validation"):
+        assert config[key] == stored.get(key, config[key]), key
 
 
 def test_defaults_that_depend_on_other_flags():

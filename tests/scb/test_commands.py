@@ -218,6 +218,17 @@ def test_the_command_that_a_configuration_is_written_as_asks_for_it_again():
     assert Discover.parse(["--preset=quick", "--generations=150"]).command == "scb discover"
 
 
+@pytest.mark.parametrize("name", zoo_names())
+def test_the_command_of_every_zoo_entry_asks_for_what_its_json_holds(name):
+    metadata = bandit_metadata(name)
+    found, stored = shlex.split(metadata["command"]), metadata["config"]["discovery"]
+    config = config_dict(asked_for(*found[2:]))
+    assert config["evolution"] == stored["evolution"] and config["bandit"] == stored["bandit"]
+    # What has another name by now, or was not there then, kept its default.
+    different = {k for k in config.keys() & stored.keys() if config[k] != stored[k]}
+    assert different <= {"warm_start"} and not config["fixed_hyperparameters"]
+
+
 # Tables "Hyperparameters for meta-training", "Number of generations for each environment" and
 # "Hyperparameters for evaluation length curricula" of Liesen et al. (2024): generations, population
 # size, rollouts, evaluation seeds, mode, curriculum.
