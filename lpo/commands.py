@@ -38,7 +38,7 @@ from scb.command_line import LongRun, Output, flags, flags_given, listed
 from scb.console import console
 from scb.environments.registry import environment_spec
 from scb.errors import UserError, at_least
-from scb.measurement import Rows
+from scb.measurement import Place, Rows, check_seeds
 from scb.runs import config_dict, make_folder, write_json
 from scb.statistics import estimate
 
@@ -79,7 +79,9 @@ def seed_list(count: int, first: int, counted: str = "seeds") -> list[int]:
     """`count` consecutive seeds; a UserError, which says what is `counted`, for none or a negative one."""
     at_least(1, **{counted: count})
     at_least(0, seed=first)
-    return list(range(first, first + count))
+    seeds = list(range(first, first + count))
+    check_seeds(seeds)
+    return seeds
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -239,6 +241,7 @@ class Measuring(LongRun):
             .with_steps(config.steps)
             .with_values(policy_output_scale=config.policy_output_scale)
         )
+        Place.named(environment, config.backend)  # a mistake must not leave a folder behind
         folder, rows = self.opened()
         comparison = compare(
             environment,

@@ -241,7 +241,7 @@ def _embed(path: Path) -> dict[str, Any]:
             f"cannot read the figure {path} ({error.strerror}): save it before writing the report."
         ) from error
     if not data.startswith(_PNG_SIGNATURE) or len(data) < 24:
-        raise UserError(f"{path} is no PNG: save figures with lpo.plotting.save.")
+        raise UserError(f"{path} is no PNG: save figures with scb.plotting.save.")
     width, height = struct.unpack(">II", data[16:24])
     encoded = base64.b64encode(data).decode("ascii")
     return {"source": f"data:image/png;base64,{encoded}", "width": width, "height": height}

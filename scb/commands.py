@@ -39,6 +39,7 @@ from scb.statistics import estimate
 def _quick(given: Mapping[str, str]) -> DiscoveryConfig:
     """Half an hour on two cores: PPO in every candidate, agents compared by rank."""
     return DiscoveryConfig(
+        environment=given.get("environment") or DiscoveryConfig.environment,
         evaluation_episodes=12,
         evolution=EvolutionConfig(population_size=32, num_generations=150, combine="ranks"),
     )

@@ -128,6 +128,8 @@ def test_a_number_out_of_range_is_told_its_range(refused, arguments, message):
     ("arguments", "message"),
     [
         ("train --backend spring", "'Pendulum-v1' does not take {'backend': 'spring'}"),
+        # Nor is a folder left behind, which would be in the corrected command's way.
+        ("train --backend spring --out new", "'Pendulum-v1' does not take {'backend': 'spring'}"),
         ("meta-train --environment Pendulum-v1 --fitness transfer", "asks for a bandit"),
         ("meta-train --tasks ,", "the list of tasks is empty"),
         ("meta-train --environment a --tasks b,c", "the environment a and the tasks b,c are both"),

@@ -209,6 +209,7 @@ def test_the_command_that_a_configuration_is_written_as_asks_for_it_again():
     } | {name for name, value in paper.items() if value == config_dict(command.config)[name]}
     assert same == {"configs", "fixed_hyperparameters", "init", "min_spread", "parameterization"}
     for text in (
+        "--environment=CartPole-v1",
         "--fixed-hyperparameters",
         "--min-spread=0.5",
         "--parameterization=TI --init=random",
