@@ -296,7 +296,6 @@ def test_swimmer_can_be_stepped_though_its_fluid_model_calls_a_clip_that_jax_dro
 
 
 @pytest.mark.slow
-@pytest.mark.slow
 def test_standing_still_pays_the_healthy_reward_for_a_whole_episode():
     known = {name: environment_spec(name) for name in BRAX_NAMES}
     for name, spec in known.items():
@@ -307,6 +306,7 @@ def test_standing_still_pays_the_healthy_reward_for_a_whole_episode():
     assert sum(spec.standing_still() is not None for spec in known.values()) == 4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", BRAX_NAMES)
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_every_environment_steps_on_every_backend(name, backend):
