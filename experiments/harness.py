@@ -193,10 +193,15 @@ class Experiment:
         # What measures nothing leaves the report to the machine that made it.
         here = {"versions": package_versions(), "machine": machine_description()}
         report |= {"experiment": self.name, **fixed}
+        saved = json.dumps(report)
 
         def save() -> None:
+            nonlocal saved
+            if json.dumps(report) == saved:
+                return
             report.update(here, seconds=round(before + time.monotonic() - start, 1))
             write_json(out, report)
+            saved = json.dumps(report)
 
         further = {k: v for k, v in asdict(options).items() if k != "preset"}
         self.measure({**plan, **further} if self.presets else options, report, save)
