@@ -34,7 +34,7 @@ from lpo.suite import suite as suite_environments
 from scb import plotting
 from scb.agents.spec import environment_agent
 from scb.artefacts import machine_description, package_versions
-from scb.command_line import LongRun, Output, flags, flags_given, listed
+from scb.command_line import LongRun, Output, flags, listed
 from scb.console import console
 from scb.environments.registry import environment_spec
 from scb.errors import UserError, at_least
@@ -294,10 +294,13 @@ class Evaluate(Measuring):
 
     @classmethod
     def parse(cls, arguments: Sequence[str]) -> "Evaluate":
-        given = flags_given(arguments, "suite", "out")
-        if "suite" in given and "out" in given and (Path(given["out"]) / "config.json").exists():
-            arguments = [*arguments, "--resume", given["out"]]
-        return super().parse(arguments)
+        command = super().parse(arguments)
+        kept = command.output
+        if command.config.suite is None or kept.out is None or kept.resume is not None:
+            return command
+        # Other flags than the folder's are refused, not replaced by its own.
+        resume = kept.out if (kept.out / "config.json").exists() else None
+        return replace(command, output=replace(kept, resume=resume))
 
     def run(self) -> None:
         objectives = _named_apart(self.config.objectives)

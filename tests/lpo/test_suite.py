@@ -189,6 +189,9 @@ def test_a_killed_suite_is_completed_to_the_same_scores(tmp_path, tiny_agent, mo
 
     with pytest.raises(UserError, match=r"its config differs at config.seeds \(2 there, 4 now\)"):
         evaluate(seeds=4)
+    # A default is a setting too.
+    with pytest.raises(UserError, match=r"its config differs at config.seeds \(2 there, 10 now\)"):
+        commands.Evaluate.parse(["--suite=classic", "--objectives=ppo", f"--out={out}"]).run()
 
 
 def test_a_suite_and_an_environment_do_not_go_together():
