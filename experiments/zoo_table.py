@@ -14,6 +14,7 @@ the same command continues an interrupted one. The table and the figure are made
 """
 
 import hashlib
+import json
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -34,7 +35,7 @@ from experiments.zoo_table_page import (
     pairs,
     place,
 )
-from scb.agents.spec import algorithms_for, bandit_agent
+from scb.agents.spec import AgentSpec, algorithms_for, bandit_agent
 from scb.discovery import check_fits, judge
 from scb.environments.registry import environment_spec
 from scb.environments.synthetic import BanditConfig, SyntheticBandit
@@ -42,6 +43,7 @@ from scb.environments.zoo import bandit_metadata, open_bandit, zoo_names
 from scb.errors import UserError, at_least
 from scb.importer import PUBLISHED_BANDITS, published_bandit
 from scb.measurement import Place
+from scb.runs import config_dict
 from scb.seeds import REPORTING
 from scb.statistics import estimate, paired_difference
 
@@ -164,7 +166,7 @@ def measure_bandits(
                 "seed": REPORTING.start,
                 "backend": backend,
                 "training_steps": spec.steps,
-                "inner_loop": repr(spec),
+                "inner_loop": inner_loop(spec),
             }
             if any(row.items() <= _comparable(entry).items() for entry in entries):
                 continue
@@ -189,6 +191,12 @@ def measure_bandits(
             print(f"{environment} | {candidate.kind} | {algorithm} | {both}", flush=True)
     report["differences"] = differences(entries)
     save()
+
+
+def inner_loop(spec: AgentSpec) -> str:
+    """What agents were trained with, as one line that does not depend on the code's own names for it."""
+    parts = {name: config_dict(getattr(spec, name)) for name in ("config", "hyperparameters")}
+    return json.dumps({**parts, "lists": dict(spec.lists)}, sort_keys=True)
 
 
 def _comparable(entry: Mapping[str, Any]) -> dict[str, Any]:

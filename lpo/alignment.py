@@ -60,6 +60,7 @@ class Regime:
                 "Synthetic-Pendulum-v1, or a bandit's file."
             )
         at_least(1, self, "iterations", "epochs", "minibatches", "contexts")
+        at_least(0, self, "reward_noise")
 
     def spec(self) -> AgentSpec:
         """Of its agents: the setting's own but for what is given here."""

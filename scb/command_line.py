@@ -136,8 +136,8 @@ class LongRun:
         command = stored.get("command")
         if "config" not in stored or not isinstance(command, str):
             raise UserError(
-                f"cannot resume {folder}: an earlier version started it, whose random numbers this one does not "
-                "draw; start a new folder with --out."
+                f"cannot resume {folder}: an earlier version started it, and this one would not end with the same "
+                "numbers; start a new folder with --out, or remove this one."
             )
         if not command.startswith(cls.program):
             raise UserError(

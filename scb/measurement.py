@@ -36,6 +36,8 @@ from scb.runs import first_difference, write_json
 
 Row = dict[str, Any]
 MODE, SAMPLED = "mode", "sampled"
+# Steps of a training from which a CPU trains only as many agents at a time as it has devices.
+LONG = 250_000
 
 
 # -- one agent ------------------------------------------------------------------------------------
@@ -223,8 +225,8 @@ def measure(
       episodes: of each judgement.
       actions: "mode", the most likely ones, or "sampled", or both of the same agents.
       rows: where results are kept and found; None for memory.
-      side_by_side: agents that train at a time, and are kept together. All of them where left out; with
-        physics on a CPU as many as devices, so that long trainings are kept as they come.
+      side_by_side: agents that train at a time, and are kept together. All of them where left out; on a
+        CPU, with physics or `LONG` trainings, as many as devices, so that they are kept as they come.
       tell: takes a line when some agents are done.
 
     Returns:
@@ -247,7 +249,8 @@ def measure(
     judged_at = [iterations] if every is None else range(0, iterations + 1, every)
     steps = [spec.config.steps_after(n) for n in judged_at]
     params = (spec.training_params(train_in.params), judge_in.params)
-    if side_by_side is None and train_in.backend is not None and jax.default_backend() == "cpu":
+    long = train_in.backend is not None or spec.steps >= LONG
+    if side_by_side is None and long and jax.default_backend() == "cpu":
         side_by_side = jax.device_count()
     columns = {
         "environment": judge_in.name,
@@ -399,13 +402,17 @@ class Rows:
         if self.path is None or not self.path.exists():
             return
         try:
-            self._configurations = json.loads(self._described.read_text())
+            self._configurations = dict(json.loads(self._described.read_text()))
             lines = self.path.read_text().split("\n")
             self.rows = [json.loads(line) for line in lines[:-1]]
-            complete = all(row.keys() >= {*_AGENT, "configuration"} for row in self.rows)
-        except (OSError, ValueError, AttributeError) as error:
+            complete = all(
+                row.keys() >= {*_AGENT, "configuration"}
+                and row["configuration"] in self._configurations
+                for row in self.rows
+            )
+        except (OSError, TypeError, ValueError, AttributeError) as error:
             raise UserError(
-                f"{self.path} cannot be read ({error}): choose another file."
+                f"{self.path} cannot be read, with the .json beside it ({error}): choose another file."
             ) from error
         if not complete:
             raise UserError(f"{self.path} holds no rows of a measurement: choose another file.")
@@ -424,7 +431,7 @@ class Rows:
         there = [row for row in self.rows if all(row[n] == x for n, x in columns.items())]
         for row in there:
             if row["configuration"] != digest:
-                other = self._configurations.get(row["configuration"])
+                other = self._configurations[row["configuration"]]
                 raise UserError(
                     f"{self.path or 'the rows'} were measured under another configuration: it differs at "
                     f"{first_difference(other, described)}; choose another file, or measure as then."
@@ -508,7 +515,8 @@ def _plain(number: Any) -> float | None:
 def _description(value: Any) -> Any:
     """Of what JSON doesn't know: large arrays by their digest."""
     if is_dataclass(value) and not isinstance(value, type):
-        return {field.name: getattr(value, field.name) for field in fields(value)}
+        parts = {field.name: getattr(value, field.name) for field in fields(value)}
+        return {"class": type(value).__name__, **parts}
     if isinstance(value, Mapping):
         return dict(value)
     array = np.asarray(value)

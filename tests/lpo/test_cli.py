@@ -285,7 +285,7 @@ def test_a_run_of_an_earlier_version_is_not_resumed(refused, working_folder):
     (working_folder / "config.json").write_text(json.dumps(OLD))
     for command in ("meta-train", "run"):
         message = refused(command, "--resume", working_folder)
-        assert "an earlier version started it, whose random numbers this one does not" in message
+        assert "an earlier version started it, and this one would not end" in message
 
 
 def test_a_resumed_run_takes_the_stored_settings(interrupted, monkeypatch):

@@ -572,7 +572,7 @@ OLD = {
 @pytest.mark.parametrize(
     ("config", "message"),
     [
-        (OLD, "an earlier version started it, whose random numbers this one does not draw"),
+        (OLD, "an earlier version started it, and this one would not end with the same numbers"),
         ({}, "an earlier version started it"),
         (
             {"command": "lpo meta-train --seed=3", "config": {}},

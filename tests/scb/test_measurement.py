@@ -182,6 +182,13 @@ def test_a_file_of_something_else_is_refused_and_stays(copy, content):
     assert copy.read_text() == content
 
 
+@pytest.mark.parametrize("content", ["[]\n", "[1]\n", "{}\n", "no JSON\n"])
+def test_rows_without_their_configurations_are_refused(copy, content):
+    copy.with_suffix(".json").write_text(content)
+    with pytest.raises(UserError, match="choose another file"):
+        Rows(copy)
+
+
 # -- agents -----------------------------------------------------------------------------------------
 
 
