@@ -6,6 +6,7 @@ text (`ppo,sac`), the field's annotation says so, with `tyro.conf.arg` and `text
 
 import argparse
 import shlex
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
@@ -90,7 +91,7 @@ class Output:
 
 
 @dataclass(frozen=True, kw_only=True)
-class LongRun:
+class LongRun(ABC):
     """A command that leaves a run folder: a configuration, which the folder stores, from a preset and flags.
 
     A subclass has the fields `config` and `output`, and for the class:
@@ -114,8 +115,9 @@ class LongRun:
         """The deciding flags that a configuration has."""
         return {}
 
+    @abstractmethod
     def run(self) -> None:
-        raise NotImplementedError
+        """Does what the command is for."""
 
     @classmethod
     def parse(cls, arguments: Sequence[str]) -> Self:

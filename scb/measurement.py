@@ -10,7 +10,6 @@ row was measured is in the .json beside it, by the digest in its column `configu
 
 import hashlib
 import json
-import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
 from functools import lru_cache
@@ -32,7 +31,7 @@ from scb.errors import UserError, at_least
 from scb.evaluation import Episodes
 from scb.evolution import map_population
 from scb.keys import root_key, split_key
-from scb.runs import first_difference, write_json
+from scb.runs import first_difference, write_json, write_text
 
 Row = dict[str, Any]
 MODE, SAMPLED = "mode", "sampled"
@@ -456,11 +455,8 @@ class Rows:
         self.rows += rows
 
     def _write(self) -> None:
-        if self.path is None:
-            return
-        temporary = self.path.with_suffix(".tmp")
-        temporary.write_text("".join(map(_line, self.rows)))
-        os.replace(temporary, self.path)
+        if self.path is not None:
+            write_text(self.path, "".join(map(_line, self.rows)))
 
 
 @dataclass(frozen=True)

@@ -115,9 +115,7 @@ class Run:
                     break  # the half line that a kill left at the end
                 if generation < step:
                     kept.append(line + "\n")
-            temporary = path.with_suffix(".tmp")
-            temporary.write_text("".join(kept))
-            os.replace(temporary, path)
+            write_text(path, "".join(kept))
 
     def log(self, generation: int, metrics: Mapping[str, float], seconds: float) -> None:
         """Appends one generation to every log."""
@@ -170,11 +168,16 @@ def config_dict(config: Any) -> dict[str, Any]:
     return dict(json.loads(json.dumps(asdict(config))))
 
 
-def write_json(path: Path, content: Mapping[str, Any]) -> None:
-    """Writes JSON so that a kill leaves the old file or the new one, never half of one."""
+def write_text(path: Path, content: str) -> None:
+    """Writes a file so that a kill leaves the old one or the new one, never half of one."""
     temporary = path.with_name(path.name + ".tmp")
-    temporary.write_text(json.dumps(content, indent=2) + "\n")
+    temporary.write_text(content)
     os.replace(temporary, path)
+
+
+def write_json(path: Path, content: Mapping[str, Any]) -> None:
+    """Writes JSON as `write_text` writes text."""
+    write_text(path, json.dumps(content, indent=2) + "\n")
 
 
 class Checkpoints:
