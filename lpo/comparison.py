@@ -5,8 +5,8 @@ episodes, so that differences are paired. Final scores are interquartile means w
 intervals.
 """
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -51,28 +51,11 @@ class LearningCurves:
         """[S] mean return over the training, the untrained agent left out."""
         return self.returns[:, 1:].mean(axis=1)
 
-    @classmethod
-    def from_dict(cls, stored: Mapping[str, Any]) -> "LearningCurves":
-        """What `as_dict` wrote."""
-        names = ("environment", "backend", "objective", "seeds", "episodes", "mode_actions")
-        return cls(
-            steps=np.asarray(stored["steps"]),
-            returns=np.asarray(stored["returns"]),
-            **{name: stored[name] for name in names},
-            policy_output_scale=stored.get("policy_output_scale", 1.0),
-        )
-
     def as_dict(self) -> dict[str, Any]:
         return {
-            "environment": self.environment,
-            "backend": self.backend,
-            "objective": self.objective,
+            **vars(self),
             "steps": self.steps.tolist(),
             "returns": self.returns.tolist(),
-            "seeds": self.seeds,
-            "episodes": self.episodes,
-            "mode_actions": self.mode_actions,
-            "policy_output_scale": self.policy_output_scale,
             "final_iqm": estimate(self.final).as_dict(),
             "area_iqm": estimate(self.area).as_dict(),
         }
@@ -83,31 +66,6 @@ class Comparison:
     """Learning curves of several objectives on one environment, the first of them the reference."""
 
     curves: list[LearningCurves]
-
-    @classmethod
-    def joined(cls, parts: Sequence[Mapping[str, Any]]) -> "Comparison":
-        """One comparison of several that were measured apart, on seeds of their own: what `as_dict` wrote of each.
-
-        Raises:
-          UserError: they differ in more than their seeds, or share some.
-        """
-        read = [[LearningCurves.from_dict(x) for x in part["curves"]] for part in parts]
-        joined = []
-        for curves in zip(*read, strict=True):
-            first = curves[0]
-            alike = {
-                (x.steps.tobytes(), repr(replace(x, steps=None, returns=None, seeds=[])))
-                for x in curves
-            }
-            seeds = [seed for x in curves for seed in x.seeds]
-            if len(alike) > 1 or len(set(seeds)) < len(seeds):
-                raise UserError(
-                    f"comparisons of {first.objective} in {first.environment} differ in more than their seeds "
-                    f"({seeds}), or share some: join what was measured alike on others."
-                )
-            returns = np.concatenate([x.returns for x in curves])
-            joined.append(replace(first, seeds=seeds, returns=returns))
-        return cls(joined)
 
     def differences(self) -> dict[str, Estimate]:
         """{objective: paired difference of final IQM to the reference}, positive where it is better."""

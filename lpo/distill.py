@@ -5,7 +5,9 @@ al., 2022); here genetic programming does the reading (gplearn, the extra `disti
 sets the numbers, and what comes out is a `lpo.drifts.ClosedFormDrift`.
 """
 
+import itertools
 import math
+import re
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -21,7 +23,7 @@ from lpo.drifts import ClosedFormDrift
 from lpo.drifts.contract import CorrectedDrift
 from lpo.drifts.formula import FUNCTIONS, parse
 from scb.agents.ppo import clipped_surrogate_drift
-from scb.errors import UserError
+from scb.errors import UserError, at_least
 from scb.keys import root_key
 
 if TYPE_CHECKING:
@@ -79,20 +81,10 @@ class DistillConfig:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        for name, least in (
-            ("samples", 100),
-            ("population_size", 20),
-            ("generations", 1),
-            ("candidates", 1),
-            ("grown", 1),
-            ("numbers", 1),
-        ):
-            if getattr(self, name) < least:
-                raise UserError(f"{name} is {getattr(self, name)}: it must be at least {least}.")
-        if self.parsimony < 0 or self.tolerance < 0:
-            raise UserError(
-                f"parsimony and tolerance are {self.parsimony} and {self.tolerance}: both must be 0 or larger."
-            )
+        at_least(100, self, "samples")
+        at_least(20, self, "population_size")
+        at_least(1, self, "generations", "candidates", "grown", "numbers")
+        at_least(0, self, "parsimony", "tolerance")
 
 
 @dataclass(frozen=True)
@@ -140,17 +132,15 @@ def distill(objective: "Objective", config: DistillConfig | None = None) -> Dist
     if isinstance(drift, CorrectedDrift):
         nothing = replace(nothing, base=drift.base, clip=drift.clip, xi=drift.xi, gate=drift.gate)
     rng = np.random.default_rng(config.seed)
-    temporal = drift.temporal
+    terminals = [*_TERMINALS, *((*t, "progress") for t in _TERMINALS if drift.temporal)]
     fit = _Data(objective, sample_updates(rng, config.samples), nothing)
     if not fit.drift.max() > 0.0:
         raise UserError(
             f"{objective.name} charges nothing where updates go: there is no drift to write as a formula."
         )
-    programs = _programs(fit, config, temporal)
-    formulas = _formulas(programs, config)
-    tuned = [_tune(formula, fit) for formula in formulas]
-    tuned.sort(key=lambda found: -found[1])
-    library = _library(rng, temporal)
+    formulas = _formulas(_programs(fit, config, terminals), config)
+    tuned = sorted((_tune(formula, fit) for formula in formulas), key=lambda found: -found[1])
+    library = _library(rng, terminals)
     grown = [g for f in tuned[: config.grown] for g in _grow(*f, fit, library, config)]
     # Dropping terms one by one takes long: only from the best.
     longest = sorted([*tuned, *grown], key=lambda found: -found[1])[: config.grown]
@@ -261,7 +251,9 @@ class _Data:
         return float(1.0 - np.mean(self.residuals(added) ** 2))
 
 
-def _programs(data: _Data, config: DistillConfig, temporal: bool) -> list[list[Any]]:
+def _programs(
+    data: _Data, config: DistillConfig, terminals: Sequence[tuple[str, ...]]
+) -> list[list[Any]]:
     """The programs of all of gplearn's generations, best first, as lists in prefix notation."""
     try:
         from gplearn.fitness import make_fitness
@@ -271,7 +263,6 @@ def _programs(data: _Data, config: DistillConfig, temporal: bool) -> list[list[A
         raise UserError(
             "distilling needs the package gplearn: install the extra `distill`."
         ) from error
-    terminals = [*_TERMINALS, *((*t, "progress") for t in _TERMINALS if temporal)]
     inputs = np.stack(
         [np.prod([data.variables[name] for name in terminal], axis=0) for terminal in terminals],
         axis=-1,
@@ -326,7 +317,7 @@ def _programs(data: _Data, config: DistillConfig, temporal: bool) -> list[list[A
 
 def _formulas(programs: Sequence[Sequence[Any]], config: DistillConfig) -> list[_Sum]:
     """The best formulas, at most three of a size, each once; programs come best first."""
-    found: dict[Any, _Sum] = {}
+    found: dict[str, _Sum] = {}
     sizes: dict[int, int] = {}
     for program in programs:
         formula = _as_sum(program)
@@ -397,20 +388,14 @@ _OPERATIONS: dict[str, Callable[..., _Sum]] = {
 }
 
 
-def _structure(terms: _Sum) -> Any:
+def _structure(terms: _Sum) -> str:
     """A formula without its numbers."""
-    return tuple(
-        tuple(f if isinstance(f, str) else (f[0], _structure(f[1])) for f in factors)
-        for factors, _ in terms
-    )
+    return as_text(_with_numbers(terms, itertools.repeat(1.0)))
 
 
 def _size(terms: _Sum) -> int:
     """Numbers, variables and functions in a formula."""
-    return sum(
-        1 + sum(1 if isinstance(f, str) else 1 + _size(f[1]) for f in factors)
-        for factors, _ in terms
-    )
+    return len(_numbers(terms)) + len(re.findall(r"\w+", _structure(terms)))
 
 
 def _numbers(terms: _Sum) -> list[float]:
@@ -464,9 +449,8 @@ def _tune(terms: _Sum, data: _Data, evaluations: int = 20) -> tuple[_Sum, float]
     return rounded, data.score(_value(rounded, data.variables))
 
 
-def _library(rng: np.random.Generator, temporal: bool) -> list[_Sum]:
+def _library(rng: np.random.Generator, terminals: Sequence[tuple[str, ...]]) -> list[_Sum]:
     """Terms to grow by: products of at most two terminals, and tanh of random sums of three."""
-    terminals = [*_TERMINALS, *((*t, "progress") for t in _TERMINALS if temporal)]
     singles: list[_Sum] = [((tuple(sorted(t)), 1.0),) for t in terminals]
     pairs = [_product(x, y) for i, x in enumerate(singles) for y in singles[i:]]
     tanh = _function("tanh")

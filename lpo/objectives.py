@@ -17,6 +17,7 @@ from scb.errors import UserError, unknown_name
 from scb.keys import root_key
 
 KIND = "drift"
+KNOWN: dict[str, Drift] = {"ppo": ClipDrift(), "dpo": DPODrift(), "none": NoDrift()}
 _CLIP_NAME = re.compile(r"ppo-(\d*\.?\d+)$")
 
 
@@ -45,7 +46,7 @@ def zoo_names() -> list[str]:
 
 def objective_names() -> list[str]:
     """Every name that `load_objective` takes, files apart; "ppo-0.3" is PPO with clip 0.3."""
-    return ["ppo", "dpo", "none", *zoo_names()]
+    return [*KNOWN, *zoo_names()]
 
 
 def load_objective(name: str | Path) -> Objective:
@@ -56,14 +57,10 @@ def load_objective(name: str | Path) -> Objective:
     """
     text = str(name)
     clip = _CLIP_NAME.match(text)
-    if text == "ppo":
-        return closed_form(text, ClipDrift())
+    if text in KNOWN:
+        return closed_form(text, KNOWN[text])
     if clip:
         return closed_form(text, ClipDrift(float(clip.group(1))))
-    if text == "dpo":
-        return closed_form(text, DPODrift())
-    if text == "none":
-        return closed_form(text, NoDrift())
     if text in zoo_names():
         with resources.as_file(resources.files("lpo") / "zoo") as folder:
             return _from_file(folder / f"{text}.npz")
@@ -81,14 +78,12 @@ def _from_file(path: Path) -> Objective:
     artefact = artefacts.load(path, KIND)
     try:
         drift = drift_from_config(artefact.metadata["config"]["drift"])
-    except KeyError as error:
-        raise UserError(
-            f"{path} does not describe a drift: its .json lacks config entry {error}."
-        ) from error
-    except TypeError as error:
-        raise UserError(
-            f"{path} does not describe a drift: its .json garbles config entry 'drift' ({error})."
-        ) from error
+    except (KeyError, TypeError) as error:
+        lacks = isinstance(error, KeyError)
+        wrong = (
+            f"lacks config entry {error}" if lacks else f"garbles config entry 'drift' ({error})"
+        )
+        raise UserError(f"{path} does not describe a drift: its .json {wrong}.") from error
     except UserError as error:
         raise UserError(f"{path}: {error}") from error
     artefacts.expect_shapes(artefact, drift.shapes())
@@ -116,10 +111,5 @@ def save_objective(
         drift, parameters = told, told.init(root_key(0))
     certificate = certify(drift, parameters)
     config = {**metadata.get("config", {}), "drift": drift.to_config()}
-    full = {
-        **metadata,
-        "kind": KIND,
-        "config": config,
-        "certificate": certificate.as_dict(),
-    }
+    full = {**metadata, "kind": KIND, "config": config, "certificate": certificate.as_dict()}
     return artefacts.save(path, jax.device_get(parameters), full), certificate

@@ -9,12 +9,13 @@ by its structure, so the conditions of mirror learning hold whatever its numbers
 finds such expressions for learned drifts.
 """
 
+import ast
 import math
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, Self, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -37,10 +38,9 @@ VANISHING = ("d", "log_r")
 # Float32 ends at 3e38; its gradient multiplies a term once more.
 LARGEST = 1e30
 LONGEST = 4000
-DEEPEST = 50
-
-_NUMBER = r"(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?"
-_TOKEN = re.compile(rf"\s*(?:({_NUMBER})|(\w+)|(.))", re.S)
+DEEPEST = 150
+_ADDITIVE = (ast.Add, ast.Sub)
+_Number: TypeAlias = tuple[float, int, int]
 
 # All three are 0 at 0 and continuous, so that what vanishes inside vanishes outside.
 FUNCTIONS: dict[str, Callable[[Array, Any], Array]] = {
@@ -67,33 +67,48 @@ class Node:
 
 @dataclass(frozen=True)
 class Expression:
-    """A text, what it says, and its numbers in their order."""
+    """A text, what it says, and its numbers in their order, each with where it begins and ends."""
 
     text: str
     root: Node
-    constants: tuple[float, ...]
+    numbers: tuple[_Number, ...]
+
+    @property
+    def constants(self) -> tuple[float, ...]:
+        return tuple(value for value, _, _ in self.numbers)
 
 
 @lru_cache(maxsize=256)
 def parse(text: str) -> Expression:
-    """Reads an expression such as "0.5*A*d - tanh(2*A*log_r)"; nothing in it is ever run.
+    """Reads an expression such as "0.5*A*d - tanh(2*A*log_r)" by Python's grammar; nothing in it is ever run.
 
     Raises:
-      UserError: says at which character it stops being one; or a term does not vanish at ratio 1, or
-        grows beyond 32-bit numbers.
+      UserError: says where it stops being one; or a term does not vanish at ratio 1, or grows beyond
+        32-bit numbers.
     """
     if len(text) > LONGEST:
         raise UserError(
             f"the expression has {len(text)} characters: at most {LONGEST} are read, so shorten it."
         )
-    expression = _Parser(text).expression()
-    if not _vanishes(expression.root):
+    text = " ".join(text.split())
+    strange = re.search(r"[^\w\s.+*()-]", text, re.ASCII)
+    if strange:
+        raise _unreadable(text, repr(strange.group()), strange.start())
+    try:
+        tree = ast.parse(text, mode="eval").body
+    except SyntaxError as error:
+        raise _unreadable(text, "no formula", max(error.offset or 1, 1) - 1) from error
+    except (RecursionError, MemoryError) as error:
+        raise _too_deep(text) from error
+    numbers: list[_Number] = []
+    root = _read(tree, text, numbers)
+    expression = Expression(text, root, tuple(numbers))
+    if not _vanishes(root):
         raise UserError(
             f"the expression {_quoted(text)} does not vanish at ratio 1 whatever its numbers are: give every "
             "term a factor d (r - 1) or log_r."
         )
-    bound = _bound(expression.root, expression.constants)
-    if not bound <= LARGEST:
+    if not _bound(root, expression.constants) <= LARGEST:
         raise UserError(
             f"the expression {_quoted(text)} grows beyond 32-bit numbers at the largest ratios of training: "
             "use lower powers, or tanh(d) in place of d."
@@ -101,100 +116,56 @@ def parse(text: str) -> Expression:
     return expression
 
 
-class _Parser:
-    """Recursive descent over sum := term ((+|-) term)*, term := factor (* factor)*."""
+def _read(tree: ast.expr, text: str, numbers: list[_Number], depth: int = 1) -> Node:
+    """What a part of Python's tree says; its numbers are added to those before it."""
+    if depth > DEEPEST:
+        raise _too_deep(text)
 
-    def __init__(self, text: str) -> None:
-        self.text = text
-        self.tokens = [
-            (m.group(1) or m.group(2) or m.group(3), m.start(m.lastindex or 0))
-            for m in _TOKEN.finditer(text.rstrip())
-        ]
-        self.next = 0
-        self.depth = 0
-        self.constants: list[float] = []
+    def inside(part: ast.expr) -> Node:
+        return _read(part, text, numbers, depth + 1)
 
-    def expression(self) -> Expression:
-        root = self.sum()
-        if self.next < len(self.tokens):
-            raise self.unexpected("+, - or *")
-        return Expression(self.text, root, tuple(self.constants))
+    match tree:
+        case ast.Constant(value=bool()):
+            pass
+        case ast.Constant(value=int() | float() as value) if value <= LARGEST:
+            numbers.append((float(value), tree.col_offset, tree.end_col_offset or 0))
+            return Node("number", position=len(numbers) - 1)
+        case ast.Name(id=name) if name in VARIABLES:
+            return Node("variable", name=name)
+        case ast.Call(ast.Name(id=name), [argument], []) if name in FUNCTIONS:
+            return Node(name, (inside(argument),))
+        case ast.UnaryOp(ast.USub(), part):
+            return Node("negative", (inside(part),))
+        case ast.BinOp(op=ast.Add() | ast.Sub() | ast.Mult()):
+            first, rest = _chain(tree, ast.Mult if isinstance(tree.op, ast.Mult) else _ADDITIVE)
+            arguments = [inside(first)]
+            for operator, part in rest:
+                node = inside(part)
+                arguments.append(Node("negative", (node,)) if operator is ast.Sub else node)
+            return Node("*" if isinstance(tree.op, ast.Mult) else "+", tuple(arguments))
+    raise _unreadable(text, repr(ast.get_source_segment(text, tree)), tree.col_offset)
 
-    def peek(self) -> str:
-        return self.tokens[self.next][0] if self.next < len(self.tokens) else ""
 
-    def take(self, token: str) -> bool:
-        found = self.peek() == token
-        self.next += found
-        return found
+def _chain(tree: ast.expr, operators: Any) -> tuple[ast.expr, list[tuple[type, ast.expr]]]:
+    """Of a - b + c: a, and [(Sub, b), (Add, c)]."""
+    rest: list[tuple[type, ast.expr]] = []
+    while isinstance(tree, ast.BinOp) and isinstance(tree.op, operators):
+        rest.append((type(tree.op), tree.right))
+        tree = tree.left
+    return tree, rest[::-1]
 
-    def sum(self) -> Node:
-        terms = [self.term()]
-        while True:
-            if self.take("+"):
-                terms.append(self.term())
-            elif self.take("-"):
-                terms.append(Node("negative", (self.term(),)))
-            else:
-                return Node("+", tuple(terms)) if len(terms) > 1 else terms[0]
 
-    def term(self) -> Node:
-        factors = [self.factor()]
-        while self.take("*"):
-            factors.append(self.factor())
-        return Node("*", tuple(factors)) if len(factors) > 1 else factors[0]
+def _unreadable(text: str, found: str, start: int) -> UserError:
+    return UserError(
+        f"the expression {_quoted(text)} has {found} at character {start + 1}: it takes numbers up to "
+        f"{LARGEST:g}, {', '.join(VARIABLES)}, +, -, *, parentheses, and {', '.join(FUNCTIONS)} of one of these."
+    )
 
-    def factor(self) -> Node:
-        self.depth += 1
-        if self.depth > DEEPEST:
-            raise UserError(
-                f"the expression {_quoted(self.text)} is nested more than {DEEPEST} deep: simplify it."
-            )
-        node = self.innermost()
-        self.depth -= 1
-        return node
 
-    def innermost(self) -> Node:
-        if self.take("-"):
-            return Node("negative", (self.factor(),))
-        if self.take("("):
-            return self.closed(self.sum())
-        token = self.peek()
-        if re.fullmatch(_NUMBER, token):
-            return self.number(float(token))
-        if token in VARIABLES:
-            self.next += 1
-            return Node("variable", name=token)
-        if token in FUNCTIONS:
-            self.next += 1
-            if not self.take("("):
-                raise self.unexpected(f"( after {token}")
-            return Node(token, (self.closed(self.sum()),))
-        raise self.unexpected(
-            f"a number, {', '.join(VARIABLES)}, {', '.join(FUNCTIONS)}, - or parentheses"
-        )
-
-    def number(self, value: float) -> Node:
-        if value > LARGEST:
-            raise self.unexpected(f"a number of at most {LARGEST:g}")
-        self.next += 1
-        self.constants.append(value)
-        return Node("number", position=len(self.constants) - 1)
-
-    def closed(self, node: Node) -> Node:
-        if not self.take(")"):
-            raise self.unexpected("+, -, * or )")
-        return node
-
-    def unexpected(self, expected: str) -> UserError:
-        if self.next < len(self.tokens):
-            token, start = self.tokens[self.next]
-            found = f"{_quoted(token)} at character {start + 1}"
-        else:
-            found = "its end"
-        return UserError(
-            f"the expression {_quoted(self.text)} has {found} where {expected} is expected: correct it there."
-        )
+def _too_deep(text: str) -> UserError:
+    return UserError(
+        f"the expression {_quoted(text)} is nested more than {DEEPEST} deep: simplify it."
+    )
 
 
 def _quoted(text: str) -> str:
@@ -301,17 +272,15 @@ class ClosedFormDrift(CorrectedDrift):
 
         A negative number becomes a minus sign and its magnitude, since numbers are read without one.
         """
+        read = parse(self.expression)
         numbers = np.asarray(parameters["constants"], np.float32)
-        if np.array_equal(numbers, np.asarray(parse(self.expression).constants, np.float32)):
+        if np.array_equal(numbers, np.asarray(read.constants, np.float32)):
             return self
-        values = iter(numbers)
-
-        def replaced(match: re.Match[str]) -> str:
-            if match.group(1) is None:
-                return match.group()
-            return match.group().removesuffix(match.group(1)) + str(next(values))
-
-        return replace(self, expression=_TOKEN.sub(replaced, self.expression))
+        text, end = "", 0
+        for (_, start, after), number in zip(read.numbers, numbers, strict=True):
+            text += read.text[end:start] + str(number)
+            end = after
+        return replace(self, expression=text + read.text[end:])
 
     def correction(
         self, parameters: Any, log_ratio: Array, advantage: Array, progress: Array, xp: Any

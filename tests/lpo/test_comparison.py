@@ -73,22 +73,6 @@ def test_dictionaries_are_json_and_hold_what_was_measured():
     assert (curve["final_iqm"]["value"], curve["area_iqm"]["value"]) == (5.5, 3.5)
 
 
-def test_parts_on_other_seeds_join_to_one_comparison():
-    whole = Comparison([curves("ppo"), curves("dpo")])
-    parts = [
-        Comparison(
-            [replace(c, seeds=[c.seeds[i]], returns=c.returns[i : i + 1]) for c in whole.curves]
-        )
-        for i in range(2)
-    ]
-    stored = [part.as_dict() for part in parts]
-    assert Comparison.joined(stored).as_dict() == whole.as_dict()
-    other = Comparison([replace(c, seeds=[7], episodes=99) for c in parts[1].curves]).as_dict()
-    for wrong in ([stored[0], stored[0]], [stored[0], other]):
-        with pytest.raises(UserError, match="differ in more than their seeds"):
-            Comparison.joined(wrong)
-
-
 # -- trained ------------------------------------------------------------------------------------
 
 
