@@ -27,9 +27,11 @@ from scb.environments.registry import environment_spec, make
 from scb.errors import UserError, at_least
 from scb.evolution import map_population
 from scb.keys import root_key, split_key
-from scb.measurement import Judge, check_seeds, families, train_and_judge
+from scb.measurement import Judge, Rows, check_seeds, families, train_and_judge
 from scb.runs import Stopwatch
 from scb.statistics import iqm, spearman
+
+RESAMPLES = 1000
 
 
 @dataclass(frozen=True)
@@ -129,14 +131,15 @@ def outcomes(
     steps: int | None = None,
     backend: str | None = None,
     policy_output_scale: float | None = None,
+    rows: Rows | None = None,
 ) -> dict[str, np.ndarray]:
-    """{objective: [S] return of PPO trained with it}, mode actions; arguments as `learning_curves`."""
+    """{objective: [S] return of PPO trained with it}, mode actions; arguments as `compare`."""
     spec = (
         environment_agent("ppo", environment)
         .with_steps(steps)
         .with_values(policy_output_scale=policy_output_scale)
     )
-    comparison = compare(environment, objectives, seeds, spec=spec, backend=backend, points=1)
+    comparison = compare(environment, objectives, seeds, spec, backend, points=1, rows=rows)
     return {curves.objective: curves.final for curves in comparison.curves}
 
 
@@ -151,47 +154,24 @@ def regime_fitness(
     check_seeds(seeds)
     found = {}
     for family in families(objectives):
-        of_family = np.asarray(_family_fitness(regime, family, seeds), np.float64)
-        for objective, of_it in zip(family, of_family, strict=True):
-            found[objective.name] = dict(zip(LABELS, of_it.T, strict=True))
-    return found
-
-
-def _family_fitness(regime: Regime, family: Sequence[Objective], seeds: Sequence[int]) -> Any:
-    """[objectives, S, F] fitnesses of objectives that share a drift."""
-    task = regime.task(family[0])
-    program = _program(regime.static(), family[0].drift, len(family) * len(seeds))
-    return _over_objectives(
-        lambda parameters, every_seed: program(
+        task = regime.task(family[0])
+        program = _program(regime.static(), family[0].drift, len(family) * len(seeds))
+        # Every objective with every seed, all at once.
+        parameters = jax.tree.map(
+            lambda *leaves: jnp.repeat(jnp.stack(leaves), len(seeds), axis=0),
+            *(objective.parameters for objective in family),
+        )
+        earned = program(
             parameters,
-            every_seed,
+            np.tile(np.asarray(seeds, np.uint32), len(family)),
             regime.spec().hyperparameters,
             task.env_params,
             task.training_params,
-        ),
-        family,
-        seeds,
-    )
-
-
-def _over_objectives(
-    mapped: Callable[[Any, np.ndarray], Any], objectives: Sequence[Objective], seeds: Sequence[int]
-) -> Any:
-    """Calls a function for every objective of a family with every seed, all at once.
-
-    Args:
-      mapped: ([N] drift parameters, [N] seeds) -> pytree of [N, ...], such as `map_population` makes.
-
-    Returns:
-      The pytree, every leaf [objectives, seeds, ...].
-    """
-    parameters = jax.tree.map(
-        lambda *leaves: jnp.repeat(jnp.stack(leaves), len(seeds), axis=0),
-        *(objective.parameters for objective in objectives),
-    )
-    results = mapped(parameters, np.tile(np.asarray(seeds, np.uint32), len(objectives)))
-    shape = (len(objectives), len(seeds))
-    return jax.tree.map(lambda x: np.reshape(x, (*shape, *x.shape[1:])), results)
+        )
+        of_family = np.asarray(earned, np.float64).reshape(len(family), len(seeds), -1)
+        for objective, of_it in zip(family, of_family, strict=True):
+            found[objective.name] = dict(zip(LABELS, of_it.T, strict=True))
+    return found
 
 
 @lru_cache(maxsize=64)
@@ -202,10 +182,8 @@ def _program(regime: Regime, drift: Drift, size: int) -> Callable[..., Any]:
     """
     task = regime.task(Objective("any", drift, None))
     home, home_params = make(task.home)
-    along = list(dict.fromkeys(f.judge for f in FITNESSES.values() if f.along))
-    at_end = [
-        judge for judge in dict.fromkeys(f.judge for f in FITNESSES.values()) if judge not in along
-    ]
+    along = dict.fromkeys(f.judge for f in FITNESSES.values() if f.along)
+    at_end = dict.fromkeys(f.judge for f in FITNESSES.values() if f.judge not in along)
 
     def train(
         parameters: Any,
@@ -258,18 +236,12 @@ class Alignment:
     high: float
 
 
-def alignment(
-    fitness: Mapping[str, np.ndarray],
-    outcome: Mapping[str, np.ndarray],
-    num_resamples: int = 1000,
-    seed: int = 0,
-) -> Alignment:
+def alignment(fitness: Mapping[str, np.ndarray], outcome: Mapping[str, np.ndarray]) -> Alignment:
     """How a fitness ranks objectives, against how their outcome does.
 
     Args:
       fitness: {objective: [S]}, of which the mean counts, as in meta-training.
       outcome: {objective: [S']} of the same objectives, of which the interquartile mean counts.
-      num_resamples, seed: of the bootstrap.
 
     Raises:
       UserError: other objectives in one than in the other, or fewer than three.
@@ -281,7 +253,7 @@ def alignment(
             f"there are {len(outcome)} objectives, which rank nothing: give at least 3."
         )
     names = list(outcome)
-    generator = np.random.default_rng(seed)
+    generator = np.random.default_rng(0)
 
     def correlation(resample: bool) -> float | None:
         def drawn(x: np.ndarray) -> np.ndarray:
@@ -292,7 +264,7 @@ def alignment(
             [float(iqm(drawn(outcome[n]))) for n in names],
         )
 
-    resampled = [correlation(True) or 0.0 for _ in range(num_resamples)]
+    resampled = [correlation(True) or 0.0 for _ in range(RESAMPLES)]
     low, high = np.percentile(resampled, [2.5, 97.5])
     return Alignment(correlation(False), float(low), float(high))
 
@@ -306,6 +278,7 @@ def measure_alignment(
     backend: str | None = None,
     policy_output_scale: float | None = None,
     tell: Callable[[str], None] = print,
+    rows: Rows | None = None,
     done: Mapping[str, Any] | None = None,
     keep: Callable[[dict[str, Any]], None] = lambda report: None,
 ) -> dict[str, Any]:
@@ -317,6 +290,7 @@ def measure_alignment(
       environment, steps, backend, policy_output_scale: where and how the outcome is measured.
       seeds: of the agents in the environment and in the regimes.
       tell: takes a line when a regime has been measured.
+      rows: where the environment's agents are kept, and found.
       done: what `keep` was given before, whose regimes are not measured again.
       keep: is given the report so far after every regime.
 
@@ -333,7 +307,7 @@ def measure_alignment(
     }
     report: dict[str, Any] = dict(done or {})
     if not report:
-        found = outcomes(environment, objectives, seeds, steps, backend, policy_output_scale)
+        found = outcomes(environment, objectives, seeds, steps, backend, policy_output_scale, rows)
         report = {
             **asked,
             "outcome_iqm": {name: float(iqm(returns)) for name, returns in found.items()},

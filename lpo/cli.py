@@ -15,7 +15,7 @@ def _commands() -> dict[str, Any]:
         "meta-train": commands.MetaTrain,
         "train": commands.Train,
         "evaluate": commands.Evaluate,
-        "align": commands.align,
+        "align": commands.Align,
         "certify": commands.certify_command,
         "distill": commands.distill_command,
     }

@@ -1,6 +1,7 @@
 """What the subcommands of `lpo` do. Their docstrings are the command line's help."""
 
 import itertools
+import json
 import shlex
 import sys
 from collections.abc import Mapping, Sequence
@@ -122,16 +123,9 @@ class MetaTrain(LongRun):
         problem = MetaTraining(
             self.config
         )  # before the folder, which a mistake must not leave behind
-        run, config = self.open(), self.config
+        run = self.open()
         objective = learn_objective(problem, run, self.command)
-        curve = figures.meta_training_curve(
-            run.metrics(),
-            ", ".join(config.judged_in),
-            config.fitness,
-            config.evolution.population_size,
-            config.evolution.mean_evaluations,
-            ", ".join(config.homes) if config.validation else None,
-        )
+        curve = figures.meta_training_curve(run.metrics(), self.config)
         plotting.save(curve, run.folder / "figures" / "meta_training.png")
         return objective
 
@@ -209,7 +203,7 @@ class Kept:
     """Where agents' returns are kept as they come.
 
     Attributes:
-      out: folder for rows.jsonl, comparison.json and curves.png; must be new or empty.
+      out: folder for rows.jsonl and for the table and figure made of them; must be new or empty.
       resume: a folder that an interrupted command wrote; its settings apply, and a flag that
         contradicts them is an error.
     """
@@ -368,30 +362,11 @@ class Evaluate(Measuring):
             plotting.save(figures.suite_scores(scores), folder / "suite.png")
 
 
-def align(
-    bandits: tuple[str, ...] = ("Synthetic-Pendulum-v1",),
-    environment: str | None = None,
-    objectives: tuple[str, ...] = (),
-    reward_noise: tuple[float, ...] = (0.0, 2.0, 5.0),
-    contexts: tuple[int, ...] = (200,),
-    iterations: tuple[int, ...] = (),
-    learning_rates: tuple[float, ...] = (),
-    epochs: tuple[int, ...] = (),
-    minibatches: tuple[int, ...] = (),
-    steps: int | None = None,
-    policy_output_scale: float | None = None,
-    agents: int = 16,
-    seed: int = 500,
-    backend: str | None = None,
-    out: Path | None = None,
-) -> None:
-    """Measure which inner loop on a bandit ranks objectives as an environment does.
+@dataclass(frozen=True)
+class AlignConfig:
+    """What `lpo align` does.
 
-    Trains agents with a family of known objectives on the environment and in every combination of
-    the values given, and prints Spearman's correlation of each fitness with the environment's final
-    return. Choose a regime with it before meta-training.
-
-    Args:
+    Attributes:
       bandits: zoo names or files.
       environment: whose outcome counts; the first bandit's own where left out.
       objectives: that join the family of PPO's clips, DPO's and none: zoo names, files.
@@ -407,39 +382,85 @@ def align(
       agents: of each objective, in the environment and in each regime.
       seed: the first of their seeds.
       backend: Brax physics: generalized, positional or spring.
-      out: folder for alignment.json and alignment.png; must be new or empty.
     """
-    family = [*known_drifts(), *_named_apart(objectives)]
-    regimes = [
-        Regime(*values, policy_output_scale=policy_output_scale)
-        for values in itertools.product(
-            bandits,
-            reward_noise,
-            contexts,
-            iterations or (None,),
-            epochs or (None,),
-            minibatches or (None,),
-            learning_rates or (None,),
+
+    bandits: tuple[str, ...] = (Regime.bandit,)
+    environment: str | None = None
+    objectives: tuple[str, ...] = ()
+    reward_noise: tuple[float, ...] = (0.0, 2.0, 5.0)
+    contexts: tuple[int, ...] = (Regime.contexts,)
+    iterations: tuple[int, ...] = ()
+    learning_rates: tuple[float, ...] = ()
+    epochs: tuple[int, ...] = ()
+    minibatches: tuple[int, ...] = ()
+    steps: int | None = None
+    policy_output_scale: float | None = None
+    agents: int = 16
+    seed: int = 500
+    backend: str | None = None
+
+    def regimes(self) -> list[Regime]:
+        """Every combination of the values given."""
+        found = [
+            Regime(*values, policy_output_scale=self.policy_output_scale)
+            for values in itertools.product(
+                self.bandits,
+                self.reward_noise,
+                self.contexts,
+                self.iterations or (None,),
+                self.epochs or (None,),
+                self.minibatches or (None,),
+                self.learning_rates or (None,),
+            )
+        ]
+        if not found:
+            raise UserError("no regimes: give at least one value of each.")
+        return found
+
+
+@dataclass(frozen=True, kw_only=True)
+class Align(Measuring):
+    """Measure which inner loop on a bandit ranks objectives as an environment does.
+
+    Trains agents with a family of known objectives on the environment and in every combination of
+    the values given, and prints Spearman's correlation of each fitness with the environment's final
+    return. Choose a regime with it before meta-training.
+    """
+
+    program = "lpo align"
+    presets = MappingProxyType({"quick": lambda given: AlignConfig()})
+
+    config: Annotated[AlignConfig, tyro.conf.arg(name="")] = field(default_factory=AlignConfig)
+
+    def run(self) -> None:
+        config: AlignConfig = self.config
+        family = [*known_drifts(), *_named_apart(config.objectives)]
+        regimes, seeds = config.regimes(), seed_list(config.agents, config.seed, "agents")
+        target = config.environment or environment_spec(regimes[0].bandit).evaluation_environment
+        Place.named(target, config.backend)  # a mistake must not leave a folder behind
+        folder, rows = self.opened()
+        stored = None if folder is None else folder / "alignment.json"
+        printer = console()
+        report = measure_alignment(
+            regimes,
+            family,
+            target,
+            seeds,
+            config.steps,
+            config.backend,
+            config.policy_output_scale,
+            printer.print,
+            rows,
+            json.loads(stored.read_text()) if stored and stored.exists() else None,
+            partial(write_json, stored) if stored else lambda report: None,
         )
-    ]
-    if not regimes:
-        raise UserError("no regimes: give at least one value of each.")
-    target = environment or environment_spec(regimes[0].bandit).evaluation_environment
-    seeds = seed_list(agents, seed, "agents")
-    if out is not None:
-        _make_folder(out)
-    printer = console()
-    report = measure_alignment(
-        regimes, family, target, seeds, steps, backend, policy_output_scale, printer.print
-    )
-    table = Table("regime", *LABELS, title=f"Spearman's correlation with {target} [95 %]")
-    for row in report["regimes"]:
-        cells = (row["alignment"][fitness] for fitness in LABELS)
-        table.add_row(row["name"], *(correlation_text(cell) for cell in cells))
-    printer.print(table)
-    if out is not None:
-        write_json(out / "alignment.json", report)
-        plotting.save(figures.alignment_heatmap(report), out / "alignment.png")
+        table = Table("regime", *LABELS, title=f"Spearman's correlation with {target} [95 %]")
+        for row in report["regimes"]:
+            cells = (row["alignment"][fitness] for fitness in LABELS)
+            table.add_row(row["name"], *(correlation_text(cell) for cell in cells))
+        printer.print(table)
+        if folder is not None:
+            plotting.save(figures.alignment_heatmap(report), folder / "alignment.png")
 
 
 def distill_command(

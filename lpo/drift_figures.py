@@ -8,6 +8,7 @@ from matplotlib import colormaps
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
+from matplotlib.colorbar import Colorbar
 from matplotlib.colors import LinearSegmentedColormap, ListedColormap, Normalize
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -33,6 +34,8 @@ from scb.plotting import (
 if TYPE_CHECKING:
     from lpo.objectives import Objective
 
+_RATIO = r"ratio $r = \pi(a|s)\,/\,\pi_{\mathrm{old}}(a|s)$"
+_ADVANTAGE = "advantage A\n(standard deviations)"
 RATIOS = (0.4, 1.8)
 ADVANTAGES = (-3.0, 3.0)
 # Of `lpo.update_regions.REGIONS`. What stops or turns an update is dark, what leaves it alone is pale.
@@ -49,7 +52,7 @@ _REGION_COLORS = {
 NEGLIGIBLE = 1e-3
 
 
-def drift_heatmaps(objectives: "Sequence[Objective]", progress: float = 0.5) -> Figure:
+def drift_heatmaps(objectives: "Sequence[Objective]") -> Figure:
     """What objectives charge for moving away, and where that makes an update stop or turn round.
 
     First row: the drift f(r, A) over ratio and advantage. Second row: the gradient d/dr (r A - f)
@@ -58,86 +61,49 @@ def drift_heatmaps(objectives: "Sequence[Objective]", progress: float = 0.5) -> 
     share one colour scale.
 
     Args:
-      objectives: side by side, in this order.
-      progress: fraction of training done, for drifts that depend on it.
+      objectives: side by side, in this order; drifts that depend on the fraction of training done at a half.
     """
     if not objectives:
         raise UserError("there are no objectives to draw: give at least one.")
     ratios = np.linspace(*RATIOS, 281)
     advantages = np.linspace(*ADVANTAGES, 241)
-    surfaces = [surface(o, np.log(ratios), advantages, progress) for o in objectives]
+    surfaces = [surface(o, np.log(ratios), advantages, 0.5) for o in objectives]
     drifts = [drift for drift, _ in surfaces]
     gradients = [gradient / ratios for _, gradient in surfaces]
     with figure_style():
         figure = Figure(figsize=(WIDTH, 6.4))
         grid = figure.subplots(2, len(objectives), sharex=True, sharey=True, squeeze=False)
-        # The dark end of the map is cut off: contours would drown in it.
-        pale_is_none = LinearSegmentedColormap.from_list(
-            "drift", colormaps["magma_r"](np.linspace(0.0, 0.85, 256))
-        )
-        penalty = _Scale(pale_is_none, Normalize(0.0, _largest(drifts)))
-        largest = _largest([np.abs(g) for g in gradients])
-        direction = _Scale(colormaps["RdBu_r"], Normalize(-largest, largest))
+        penalty, direction = _scales(drifts, gradients)
         levels = [t for t in MaxNLocator(7).tick_values(0.0, penalty.norm.vmax or 1.0) if t > 0]
         turns_back = False
-        for column, (objective, drift, gradient) in enumerate(
-            zip(objectives, drifts, gradients, strict=True)
+        for (top, bottom), objective, drift, gradient in zip(
+            grid.T, objectives, drifts, gradients, strict=True
         ):
-            top, bottom = grid[0, column], grid[1, column]
             penalty.draw(top, ratios, advantages, drift)
             if drift.max() > NEGLIGIBLE:
-                top.contour(
-                    ratios,
-                    advantages,
-                    drift,
-                    [NEGLIGIBLE],
-                    colors="black",
-                    linewidths=1.0,
-                    linestyles="--",
-                )
+                black = {"colors": "black", "linewidths": 1.0, "linestyles": "--"}
+                top.contour(ratios, advantages, drift, [NEGLIGIBLE], **black)
                 top.contour(ratios, advantages, drift, levels, colors="black", linewidths=0.6)
             direction.draw(bottom, ratios, advantages, gradient)
             back = gradient * np.sign(advantages)[:, None]
             if back.min() < -NEGLIGIBLE:
-                bottom.contourf(
-                    ratios,
-                    advantages,
-                    back,
-                    [-np.inf, -NEGLIGIBLE],
-                    colors="none",
-                    hatches=["////"],
-                )
-                bottom.contour(
-                    ratios,
-                    advantages,
-                    back,
-                    [-NEGLIGIBLE],
-                    colors="black",
-                    linewidths=0.8,
-                    linestyles="-",  # matplotlib's default for negative levels is dashed
-                )
+                turned = [-np.inf, -NEGLIGIBLE]
+                bottom.contourf(ratios, advantages, back, turned, colors="none", hatches=["////"])
+                # matplotlib's default for negative levels is dashed
+                black = {"colors": "black", "linewidths": 0.8, "linestyles": "-"}
+                bottom.contour(ratios, advantages, back, turned[1:], **black)
                 turns_back = True
             top.set_title(objective.name, loc="center")
-            bottom.set_xlabel(r"ratio $r = \pi(a|s)\,/\,\pi_{\mathrm{old}}(a|s)$")
+            bottom.set_xlabel(_RATIO)
             for axes in (top, bottom):
                 axes.axvline(1.0, color=GREY, linewidth=0.9)
                 axes.grid(visible=False)
-        for row, scale, label in (
-            (0, penalty, "drift f (penalty)"),
-            (1, direction, "gradient d/dr (r A − f)"),
-        ):
-            grid[row, 0].set_ylabel("advantage A\n(standard deviations)")
-            bar = figure.colorbar(
-                ScalarMappable(scale.norm, scale.map),
-                ax=list(grid[row]),
-                extend="neither" if scale.covers else ("max" if row == 0 else "both"),
-                aspect=16,
-                pad=0.02,
-            )
-            bar.set_label(label)
-            if row == 0:
-                for level in levels:
-                    bar.ax.axhline(level, color="black", linewidth=0.6)
+        for row in grid:
+            row[0].set_ylabel(_ADVANTAGE)
+        bar = penalty.bar(figure, grid[0], aspect=16, label="drift f (penalty)")
+        for level in levels:
+            bar.ax.axhline(level, color="black", linewidth=0.6)
+        direction.bar(figure, grid[1], aspect=16, label="gradient d/dr (r A − f)")
         handles: list[Artist] = [
             Line2D([], [], color="black", linewidth=1.0, linestyle="--"),
             Line2D([], [], color="black", linewidth=0.6),
@@ -181,12 +147,7 @@ def drift_and_gradient(
     with figure_style():
         figure = Figure(figsize=(WIDTH, 1.7 + 1.9 * len(rows)))
         grid = figure.subplots(len(rows), 3, sharex=True, sharey=True, squeeze=False)
-        pale_is_none = LinearSegmentedColormap.from_list(
-            "drift", colormaps["magma_r"](np.linspace(0.0, 0.85, 256))
-        )
-        penalty = _Scale(pale_is_none, Normalize(0.0, _largest([a.drift for _, a in rows])))
-        largest = _largest([np.abs(a.gradient) for _, a in rows])
-        direction = _Scale(colormaps["RdBu_r"], Normalize(-largest, largest))
+        penalty, direction = _scales([a.drift for _, a in rows], [a.gradient for _, a in rows])
         classes = ListedColormap([_REGION_COLORS[name] for name in names])
         for row, (label, analysis) in zip(grid, rows, strict=True):
             ratios, advantages = np.exp(analysis.log_ratios), analysis.advantages
@@ -206,7 +167,7 @@ def drift_and_gradient(
                     axes.axvline(x, color=GREY, linewidth=0.9, linestyle=linestyle)
                 axes.axhline(0.0, color=GREY, linewidth=0.9)
                 axes.grid(visible=False)
-            row[0].set_ylabel("advantage A\n(standard deviations)", fontsize=9)
+            row[0].set_ylabel(_ADVANTAGE, fontsize=9)
             row[0].annotate(
                 label,
                 (-0.36, 0.5),
@@ -226,39 +187,25 @@ def drift_and_gradient(
         ):
             axes.set_title(title, fontsize=10, weight="normal")
         for axes in grid[-1]:
-            axes.set_xlabel(r"ratio $r = \pi(a|s)\,/\,\pi_{\mathrm{old}}(a|s)$")
-        for column, scale, extend in ((0, penalty, "max"), (1, direction, "both")):
-            figure.colorbar(
-                ScalarMappable(scale.norm, scale.map),
-                ax=list(grid[:, column]),
-                location="bottom",
-                extend="neither" if scale.covers else extend,
-                aspect=18,
-                pad=0.02,
-            )
+            axes.set_xlabel(_RATIO)
+        for column, scale in enumerate((penalty, direction)):
+            scale.bar(figure, grid[:, column], location="bottom", aspect=18)
         # The third column has its legend where the others have their scales.
-        shown = [i for i in range(len(names)) if any((a.regions == i).any() for _, a in rows)]
+        shown = [n for i, n in enumerate(names) if any((a.regions == i).any() for _, a in rows)]
+        handles = [
+            *(Patch(facecolor=_REGION_COLORS[n], edgecolor=GREY, linewidth=0.6) for n in shown),
+            Line2D([], [], color=GREY, linewidth=0.9, linestyle=":"),
+        ]
         figure_title(figure, "What a drift charges, and what it does to the update")
-        legend_below(
-            figure,
-            (
-                [
-                    Patch(facecolor=_REGION_COLORS[names[i]], edgecolor=GREY, linewidth=0.6)
-                    for i in shown
-                ]
-                + [Line2D([], [], color=GREY, linewidth=0.9, linestyle=":")],
-                [names[i] for i in shown] + ["PPO's clip, 0.2"],
-            ),
-            columns=4,
-        )
+        legend_below(figure, (handles, [*shown, "PPO's clip, 0.2"]), columns=4)
     return figure
 
 
 class _Scale:
-    """A colour scale that all panels of a row share."""
+    """A colour scale that several panels share; its bar is pointed at `extend` where one has more."""
 
-    def __init__(self, colors: Any, norm: Normalize) -> None:
-        self.map, self.norm, self.covers = colors, norm, True
+    def __init__(self, colors: Any, norm: Normalize, extend: str) -> None:
+        self.map, self.norm, self.extend, self.covers = colors, norm, extend, True
 
     def draw(
         self,
@@ -272,8 +219,28 @@ class _Scale:
         )
         self.covers &= bool(np.abs(values).max() <= (self.norm.vmax or 0.0))
 
+    def bar(self, figure: Figure, panels: NDArray[Any], **how: Any) -> Colorbar:
+        extend = "neither" if self.covers else self.extend
+        mappable = ScalarMappable(self.norm, self.map)
+        return figure.colorbar(mappable, ax=list(panels), extend=extend, pad=0.02, **how)
 
-def _largest(surfaces: list[NDArray[np.floating]]) -> float:
+
+def _scales(
+    drifts: Sequence[NDArray[np.floating]], gradients: Sequence[NDArray[np.floating]]
+) -> tuple[_Scale, _Scale]:
+    """Of penalties, pale where there is none, and of gradients, pale at zero."""
+    # The dark end of the map is cut off: contours would drown in it.
+    pale_is_none = LinearSegmentedColormap.from_list(
+        "drift", colormaps["magma_r"](np.linspace(0.0, 0.85, 256))
+    )
+    largest = _largest([np.abs(g) for g in gradients])
+    return (
+        _Scale(pale_is_none, Normalize(0.0, _largest(drifts)), "max"),
+        _Scale(colormaps["RdBu_r"], Normalize(-largest, largest), "both"),
+    )
+
+
+def _largest(surfaces: Sequence[NDArray[np.floating]]) -> float:
     # One extreme corner of one objective must not make the others look flat; the pointed end of the
     # colour bar says that there is more.
     values = np.concatenate([s.ravel() for s in surfaces])

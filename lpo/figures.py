@@ -30,6 +30,7 @@ from scb.plotting import (
     VERMILLION,
     WIDTH,
     Look,
+    error_bar,
     figure_style,
     figure_title,
     legend_below,
@@ -72,23 +73,12 @@ def looks(names: Sequence[str]) -> dict[str, Look]:
     return chosen | {name: _FURTHER[i % len(_FURTHER)] for i, name in enumerate(further)}
 
 
-def meta_training_curve(
-    metrics: list[dict[str, Any]],
-    environment: str,
-    fitness: str,
-    population_size: int | None = None,
-    mean_evaluations: int | None = None,
-    validated_on: str | None = None,
-) -> Figure:
-    """Fitness over the generations of an evolution.
+def meta_training_curve(metrics: list[dict[str, Any]], config: MetaTrainingConfig) -> Figure:
+    """Fitness over the generations of an evolution, and the mean's, which has a scale of its own where it is validated.
 
     Args:
       metrics: one dict a generation, as `scb.evolution.evolve` logs them.
-      environment: where fitness is earned.
-      fitness: "return", "area" or "transfer".
-      population_size, mean_evaluations: candidates a generation, and agents that judge the search
-        distribution's mean; stated in the figure where given.
-      validated_on: where the mean was judged instead, on a scale of its own.
+      config: of the meta-training.
 
     Raises:
       UserError: no generation was logged.
@@ -97,6 +87,7 @@ def meta_training_curve(
         raise UserError(
             "the run has logged no generation: let it finish at least one before drawing it."
         )
+    environment = ", ".join(config.judged_in)
     generations = np.array([row["generation"] for row in metrics])
     mean, std, best = (_column(metrics, f"fitness/{k}") for k in ("mean", "std", "max"))
     judged = [
@@ -125,21 +116,21 @@ def meta_training_curve(
         )
         judging = axes
         if judged:
-            agents = "" if mean_evaluations is None else f" ({mean_evaluations} agents a point)"
-            if validated_on is not None:
+            if config.validation:
                 judging = axes.twinx()
                 judging.grid(visible=False)
                 judging.spines["right"].set_visible(True)
-                judging.set_ylabel(f"of the mean: return on {validated_on}")
+                judging.set_ylabel(f"of the mean: return on {', '.join(config.homes)}")
             judging.plot(
                 *zip(*judged, strict=True),
                 color=VERMILLION,
                 marker="o",
-                label=f"search distribution's mean{agents}",
+                label=f"search distribution's mean ({config.evolution.mean_evaluations} agents a point)",
             )
         axes.set_xlabel("generation")
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-        axes.set_ylabel(_fitness_label(environment, fitness))
+        during = " during training" if config.judgement.along else ""
+        axes.set_ylabel(f"fitness: mean return{during}\nin {environment}")
         axes.margins(x=0.02)
         last = metrics[-1]
         per_generation = last.get("steps/total", 0) / (last["generation"] + 1)
@@ -149,8 +140,10 @@ def meta_training_curve(
             )
             top.xaxis.set_major_formatter(EngFormatter(sep=""))
             top.set_xlabel("environment steps of the population (training + evaluation)")
-        size = "" if population_size is None else f", population of {population_size}"
-        figure_title(figure, f"Meta-training on {environment}{size}")
+        figure_title(
+            figure,
+            f"Meta-training on {environment}, population of {config.evolution.population_size}",
+        )
         handles, labels = axes.get_legend_handles_labels()
         if judged and judging is not axes:
             of_mean = judging.get_legend_handles_labels()
@@ -159,56 +152,38 @@ def meta_training_curve(
     return figure
 
 
-def environment_steps(
-    bandit: Mapping[str, int],
-    environment: Mapping[str, int],
-    names: tuple[str, str] = ("on the bandit", "on the environment"),
-) -> Figure:
+def environment_steps(bandit: Mapping[str, int], environment: Mapping[str, int]) -> Figure:
     """What the bandit saves: environment steps of the same meta-training on either, counted apart.
 
     Args:
       bandit, environment: {"training", "evaluation", "total"} steps.
-      names: what the two are called.
     """
     rows = ("training", "evaluation", "total")
-    for name, steps in zip(names, (bandit, environment), strict=True):
-        missing = [row for row in rows if row not in steps]
-        if missing:
-            raise UserError(
-                f"the steps {name} lack {', '.join(missing)}: give training, evaluation and total."
-            )
+    height, positions = 0.38, np.arange(len(rows))
     with figure_style():
         figure = Figure(figsize=(WIDTH, 3.0))
         axes = figure.add_subplot()
         axes.set_xscale("log")
-        height = 0.38
         drawn = [steps[row] for steps in (bandit, environment) for row in rows if steps[row] > 0]
         left = 10.0 ** np.floor(np.log10(min(drawn, default=1)) - 0.3)
         for steps, offset, color, hatch, name in (
-            (bandit, -height / 2, VERMILLION, "", names[0]),
-            (environment, height / 2, BLUE, "///", names[1]),
+            (bandit, -height / 2, VERMILLION, "", "on the bandit"),
+            (environment, height / 2, BLUE, "///", "on the environment"),
         ):
-            for position, row in enumerate(rows):
-                # A logarithmic axis has no zero: no steps are no bar.
-                axes.barh(
-                    position + offset,
-                    max(steps[row] - left, 0),
-                    height=height,
-                    left=left,
-                    color=color,
-                    hatch=hatch,
-                    edgecolor="white",
-                    linewidth=0,
-                    label=name if position == 0 else "_",
-                )
-                axes.annotate(
-                    _count(steps[row]),
-                    (max(steps[row], left), position + offset),
-                    xytext=(4, 0),
-                    textcoords="offset points",
-                    va="center",
-                    fontsize=9,
-                )
+            counts = [steps[row] for row in rows]
+            # A logarithmic axis has no zero: no steps are no bar.
+            bars = axes.barh(
+                positions + offset,
+                np.maximum(np.array(counts) - left, 0),
+                height=height,
+                left=left,
+                color=color,
+                hatch=hatch,
+                edgecolor="white",
+                linewidth=0,
+                label=name,
+            )
+            axes.bar_label(bars, [_count(count) for count in counts], padding=4, fontsize=9)
         for position, row in enumerate(rows):
             axes.text(
                 1.0,
@@ -223,7 +198,7 @@ def environment_steps(
             )
         # Room on the right for the ratios, which stand in one column.
         axes.set_xlim(left, left * (max(drawn, default=10) / left) ** 1.42)
-        axes.set_yticks(range(len(rows)), rows)
+        axes.set_yticks(positions, rows)
         axes.invert_yaxis()
         axes.tick_params(axis="y", length=0)
         axes.grid(axis="y", visible=False)
@@ -312,12 +287,11 @@ def suite_scores(scores: "SuiteScores") -> Figure:
         profile.set_ylabel("share of runs with a score above \u03c4")
         profile.set_ylim(0.0, 1.0)
         profile.set_title("Performance profiles: 95 % bands", fontsize=10, weight="normal")
-        for i, estimated in enumerate(scores.aggregate()):
-            look = style[scores.objectives[i]]
-            low_end = estimated.value if estimated.low is None else estimated.low
-            high_end = estimated.value if estimated.high is None else estimated.high
-            aggregate.plot([low_end, high_end], [i, i], color=look.color, linewidth=3)
-            aggregate.plot([estimated.value], [i], look.marker, color=look.color, markersize=7)
+        for i, (name, found) in enumerate(zip(scores.objectives, scores.aggregate(), strict=True)):
+            color = style[name].color
+            ends = [found.value if end is None else end for end in (found.low, found.high)]
+            aggregate.plot(ends, [i, i], color=color, linewidth=3)
+            aggregate.plot([found.value], [i], style[name].marker, color=color, markersize=7)
         aggregate.set_yticks(range(len(scores.objectives)), scores.objectives)
         aggregate.invert_yaxis()
         aggregate.grid(axis="y", visible=False)
@@ -340,15 +314,9 @@ def alignment_heatmap(report: Mapping[str, Any]) -> Figure:
     rows = report["regimes"]
     fitnesses = list(rows[0]["alignment"])
     labels = [regime_label(row, report["environment"]) for row in rows]
-    values = np.array(
-        [
-            [
-                np.nan if c["spearman"] is None else c["spearman"]
-                for c in (row["alignment"][name] for name in fitnesses)
-            ]
-            for row in rows
-        ]
-    )
+    # What is undefined is None, and becomes NaN.
+    cells = [[row["alignment"][name] for name in fitnesses] for row in rows]
+    values = np.array([[cell["spearman"] for cell in of_row] for of_row in cells], float)
     with figure_style():
         figure = Figure(figsize=(WIDTH, 1.6 + 0.42 * len(rows)))
         axes = figure.subplots()
@@ -358,9 +326,8 @@ def alignment_heatmap(report: Mapping[str, Any]) -> Figure:
         axes.set_yticks(range(len(rows)), [textwrap.fill(name, 34) for name in labels])
         axes.grid(visible=False)
         axes.tick_params(length=0)
-        for i, row in enumerate(rows):
-            for j, name in enumerate(fitnesses):
-                cell = row["alignment"][name]
+        for i, of_row in enumerate(cells):
+            for j, cell in enumerate(of_row):
                 text = "-" if cell["spearman"] is None else f"{cell['spearman']:.2f}"
                 axes.text(
                     j,
@@ -401,11 +368,12 @@ def _curve(axes: Axes, curve: "LearningCurves", look: Look) -> None:
         label=curve.objective,
     )
     if len(curve.seeds) > 1:
-        points = [estimate(column) for column in curve.returns.T]
+        middle = iqm(curve.returns, axis=0)
+        below, above = error_bar(*(estimate(column) for column in curve.returns.T))
         axes.fill_between(
             curve.steps,
-            [p.value if p.low is None else p.low for p in points],
-            [p.value if p.high is None else p.high for p in points],
+            middle - below,
+            middle + above,
             color=look.color,
             alpha=0.18,
             linewidth=0,
@@ -437,15 +405,6 @@ def _protocol(curve: "LearningCurves") -> str:
     scale = curve.policy_output_scale
     start = "" if scale == 1.0 else f", policy's last layer x {scale:g}"
     return f"{curve.environment}{physics}{start}: {actions} actions, {curve.episodes} episodes"
-
-
-def _fitness_label(environment: str, fitness: str) -> str:
-    labels = {
-        "return": f"fitness: mean return\nin {environment}",
-        "area": f"fitness: mean return during training\nin {environment}",
-        "transfer": f"fitness: mean return\nin {environment}",
-    }
-    return labels.get(fitness, f"fitness: {fitness}")
 
 
 def _column(metrics: list[dict[str, Any]], name: str) -> NDArray[np.floating]:

@@ -224,14 +224,7 @@ def _figures(
 ) -> dict[str, Path]:
     drawn = {}
     if meta:
-        drawn["meta_training"] = figures.meta_training_curve(
-            meta["metrics"],
-            ", ".join(config.judged_in),
-            config.fitness,
-            config.evolution.population_size,
-            config.evolution.mean_evaluations,
-            ", ".join(config.homes) if config.validation else None,
-        )
+        drawn["meta_training"] = figures.meta_training_curve(meta["metrics"], config)
         drawn["environment_steps"] = figures.environment_steps(
             meta["steps"], meta["environment_steps"]
         )

@@ -192,6 +192,7 @@ WRITING = {
     "meta-train": ["meta-train"],
     "train": ["train"],
     "evaluate": ["evaluate"],
+    "align": ["align"],
 }
 
 
@@ -704,22 +705,27 @@ def test_a_run_of_everything_takes_its_seed_and_its_preset():
 
 
 def test_align_measures_every_combination_and_stores_it(monkeypatch, working_folder, capsys):
-    asked = []
+    asked, told = [], []
 
-    def measure(regimes, objectives, environment, seeds, steps, backend, scale, tell):
+    def measure(
+        regimes, objectives, environment, seeds, steps, backend, scale, tell, rows, done, keep
+    ):
         assert scale == 0.01 and all(r.policy_output_scale == scale for r in regimes)
         asked.extend(regimes)
         assert {"ppo-0.2", "none", "lpo-pendulum"} <= {o.name for o in objectives}
         assert (environment, seeds) == ("Pendulum-v1", [500, 501])
         cell = {"spearman": 0.5, "low": 0.25, "high": 0.75}
         measured = {"alignment": dict.fromkeys(LABELS, cell)}
-        rows = [{"name": str(r), "bandit": r.bandit, **measured} for r in regimes]
-        return {
+        known = done["regimes"] if done else []
+        report = {
             "environment": environment,
             "agents": 2,
             "outcome_iqm": {o.name: 0.0 for o in objectives},
-            "regimes": rows,
+            "regimes": [{"name": str(r), "bandit": r.bandit, **measured} for r in regimes],
         }
+        keep(report)
+        told.append((len(known), rows.path.name))
+        return report
 
     monkeypatch.setattr(commands, "measure_alignment", measure)
     flags = ["--objectives", "lpo-pendulum", "--agents=2", "--out=aligned"]
@@ -731,6 +737,10 @@ def test_align_measures_every_combination_and_stores_it(monkeypatch, working_fol
     stored = json.loads((working_folder / "aligned" / "alignment.json").read_text())
     assert len(stored["regimes"]) == 4
     assert (working_folder / "aligned" / "alignment.png").stat().st_size > 5000
+    # What is there already is not measured again.
+    assert cli.main(["align", "--resume=aligned"]) == 0
+    assert told == [(0, "rows.jsonl"), (4, "rows.jsonl")]
+    assert asked[4:] == asked[:4]
 
 
 def test_inner_agents_hyperparameters_are_read_from_one_line(one_sentence):

@@ -14,6 +14,7 @@ from matplotlib.collections import FillBetweenPolyCollection, QuadMesh
 
 from lpo import drift_figures, figures
 from lpo.comparison import LearningCurves
+from lpo.meta_training import MetaTrainingConfig
 from lpo.objectives import Objective, load_objective
 from lpo.update_regions import surface
 from scb import plotting
@@ -128,7 +129,7 @@ def test_nothing_to_draw_is_refused():
     with pytest.raises(UserError, match="no objectives"):
         drift_figures.drift_heatmaps([])
     with pytest.raises(UserError, match="no generation"):
-        figures.meta_training_curve([], "Synthetic-Pendulum-v1", "return")
+        figures.meta_training_curve([], searched())
 
 
 def test_an_objective_looks_the_same_whatever_it_is_drawn_with():
@@ -202,12 +203,18 @@ def generations(count: int) -> list[dict[str, Any]]:
     ]
 
 
+def searched(fitness: str = "return", **evolution) -> MetaTrainingConfig:
+    """A search on Pendulum, or with transfer on its bandit."""
+    task = "Synthetic-Pendulum-v1" if fitness == "transfer" else "Pendulum-v1"
+    default = MetaTrainingConfig(tasks=(task,), fitness=fitness)
+    return replace(default, evolution=replace(default.evolution, **evolution))
+
+
 def test_the_final_judgement_of_the_mean_stands_after_the_last_generation():
     metrics = generations(4)
     metrics[-1]["final_mean/fitness"] = 9.0
-    figure = figures.meta_training_curve(
-        metrics, "Pendulum-v1", "transfer", population_size=8, mean_evaluations=64
-    )
+    config = searched("transfer", population_size=8, mean_evaluations=64)
+    figure = figures.meta_training_curve(metrics, config)
     judged = line(figure.axes[0], "search distribution's mean (64 agents a point)")
     np.testing.assert_array_equal(judged.get_xdata(), [0, 2, 4])
     np.testing.assert_array_equal(judged.get_ydata(), [0.25, 2.25, 9.0])
@@ -217,7 +224,7 @@ def test_the_final_judgement_of_the_mean_stands_after_the_last_generation():
 
 def test_the_upper_axis_counts_environment_steps():
     # 400 steps in 4 generations: 100 a generation.
-    figure = figures.meta_training_curve(generations(4), "Pendulum-v1", "return")
+    figure = figures.meta_training_curve(generations(4), searched())
     figure.draw_without_rendering()
     [below] = figure.axes
     [above] = below.child_axes
@@ -225,7 +232,7 @@ def test_the_upper_axis_counts_environment_steps():
 
 
 def test_the_population_is_drawn_as_mean_and_standard_deviation():
-    [axes] = figures.meta_training_curve(generations(3), "Pendulum-v1", "return").axes
+    [axes] = figures.meta_training_curve(generations(3), searched()).axes
     np.testing.assert_array_equal(line(axes, "population: mean").get_ydata(), [0, 1, 2])
     [band] = bands(axes)
     at_two = [y for x, y in band.get_paths()[0].vertices if x == 2]
@@ -235,8 +242,9 @@ def test_the_population_is_drawn_as_mean_and_standard_deviation():
 def test_a_judgement_that_was_not_finite_is_left_out():
     metrics = generations(3)
     metrics[0]["mean/fitness"] = None
-    [axes] = figures.meta_training_curve(metrics, "Pendulum-v1", "return").axes
-    assert list(line(axes, "search distribution's mean").get_xdata()) == [2]
+    [axes] = figures.meta_training_curve(metrics, searched(mean_evaluations=64)).axes
+    judged = line(axes, "search distribution's mean (64 agents a point)")
+    assert list(judged.get_xdata()) == [2]
 
 
 def test_bars_end_at_the_steps_and_the_ratio_is_written_beside_them():
@@ -275,16 +283,11 @@ def test_no_steps_are_no_bar():
     assert [bar.get_width() for bar in figure.axes[0].patches[:3]] == [0, 0, 0]
 
 
-def test_steps_that_lack_a_part_are_refused():
-    with pytest.raises(UserError, match="on the bandit lack evaluation"):
-        figures.environment_steps({"training": 1, "total": 1}, {"training": 1, "total": 1})
-
-
 def all_figures():
     steps = {"training": 10, "evaluation": 5, "total": 15}
     return [
         figures.learning_curves([curve(), curve("dpo"), curve("a-rather-long-name")]),
-        figures.meta_training_curve(generations(4), "Pendulum-v1", "area"),
+        figures.meta_training_curve(generations(4), searched("area")),
         figures.environment_steps(steps, steps),
         drift_figures.drift_heatmaps([load_objective("ppo"), load_objective("dpo")]),
     ]
@@ -332,9 +335,8 @@ def test_a_validated_mean_has_a_scale_of_its_own():
         {"generation": 1, "fitness/mean": -0.5, "fitness/std": 0.1, "fitness/max": -0.3},
     ]
     metrics[0]["mean/fitness"], metrics[1]["final_mean/fitness"] = -900.0, -300.0
-    drawn = figures.meta_training_curve(
-        metrics, "Synthetic-Pendulum-v1", "return", validated_on="Pendulum-v1"
-    )
+    config = MetaTrainingConfig(tasks=("Synthetic-Pendulum-v1",), validation=True)
+    drawn = figures.meta_training_curve(metrics, config)
     fitness, judged = drawn.axes[:2]
     assert judged.get_ylabel() == "of the mean: return on Pendulum-v1"
     assert fitness.get_ylim()[0] > -10.0
