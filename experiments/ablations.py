@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from experiments import searches
 from experiments.claims import OF_THE_WAY, TENTH, Claim
 from experiments.harness import Experiment, Report, Save
-from experiments.searches import ENOUGH, NONE, PAPER_SIZES, Final
+from experiments.searches import ENOUGH, NONE, Final
 from scb import plotting
 from scb.discovery import DiscoveryConfig
 from scb.environments.registry import environment_spec
@@ -199,59 +199,8 @@ def draw(report: Mapping[str, Any]) -> Figure:
     return figure
 
 
-def _presets() -> dict[str, dict[str, Any]]:
-    shared = {"evaluate_mean_every": 5}
-    return {
-        "quick": {
-            **shared,
-            "runs": "runs/ablations/quick",
-            "algorithms": ["ppo"],
-            "evaluation_episodes": 8,
-            "mean_evaluations": 16,
-            "environments": {
-                "Pendulum-v1": {
-                    "generations": 60,
-                    "population_size": 16,
-                    "agents_per_candidate": 1,
-                    "seeds": 2,
-                },
-                "MountainCar-v0": {
-                    "generations": 30,
-                    "population_size": 16,
-                    "agents_per_candidate": 1,
-                    "seeds": 1,
-                },
-            },
-        },
-        "paper": {
-            **shared,
-            "runs": "runs/ablations/paper",
-            "algorithms": [],
-            "evaluation_episodes": 50,
-            "mean_evaluations": 64,
-            "environments": {
-                "Pendulum-v1": {**PAPER_SIZES["Pendulum-v1"], "seeds": 5},
-                "MountainCar-v0": {**PAPER_SIZES["MountainCar-v0"], "seeds": 20},
-            },
-        },
-    }
-
-
-EXPERIMENT = Experiment(
-    name="ablations",
-    title="What the meta-evolution needs",
-    paper="figure 14, appendix on ablations of the meta-evolution algorithm",
-    claim="learning the transition alone (T) is beaten by learning the initial state too (TI), and never reaches the "
-    "goal of MountainCar; one step (I) is as good as many, apart from some searches on Pendulum, and spares the "
-    "overflows of long episodes; a curriculum helps MountainCar (IC), whatever its shape; continuous latents are "
-    "better than categorical ones.",
-    presets=_presets(),
-    minutes={"quick": "30", "paper": "weeks; for a GPU"},
-    measure=measure,
-    claims=claims,
-    facts=facts,
-    draw=draw,
-    needs="keeps its searches under runs/ablations",
+EXPERIMENT = Experiment.of_the_paper(
+    "ablations", measure=measure, claims=claims, facts=facts, draw=draw
 )
 
 

@@ -235,11 +235,11 @@ def draw(report: Mapping[str, Any]) -> dict[str, Figure]:
 
 
 EXPERIMENT = Experiment(
-    name="alignment",
-    title="Which bandit regime ranks objectives as the environment does",
-    measure=measure,
-    draw=draw,
+    "alignment",
+    "Which bandit regime ranks objectives as the environment does",
+    measure,
     facts=facts,
+    draw=draw,
     options=Options,
     keys=("stages",),
 )

@@ -295,9 +295,9 @@ def _json_of(command: list[str]) -> dict[str, list[float]]:
 
 
 EXPERIMENT = Experiment(
-    name="benchmark",
-    title="Training in a bandit, this project against rejax",
-    measure=measure,
+    "benchmark",
+    "Training in a bandit, this project against rejax",
+    measure,
     options=Options,
     out=Path("runs/benchmark.json"),
 )

@@ -118,53 +118,8 @@ def draw(report: Mapping[str, Any]) -> Figure:
     return figure
 
 
-EXPERIMENT = Experiment(
-    name="brax_curriculum",
-    title="Hopper's bandit with and without a curriculum",
-    paper="figure 4",
-    claim="without a curriculum the search on Hopper converges quickly to a local optimum; with one it goes on to "
-    "better returns, whatever the curriculum's shape.",
-    presets={
-        "quick": {
-            "runs": "runs/brax_curriculum/quick",
-            "backend": "spring",
-            "algorithms": ["ppo"],
-            "mode": "all",
-            "population_size": 16,
-            "generations": 60,
-            "agents_per_candidate": 1,
-            "evaluation_episodes": 4,
-            "mean_evaluations": 8,
-            "evaluate_mean_every": 5,
-            "seeds": {NONE: 3, "linear": 3, "exponential": 3, "step": 3},
-        },
-        "paper": {
-            "runs": "runs/brax_curriculum/paper",
-            "backend": "generalized",
-            "algorithms": [],
-            "mode": "sequential",
-            "population_size": 256,
-            "generations": 2000,
-            "agents_per_candidate": 1,
-            "evaluation_episodes": 16,
-            "mean_evaluations": 64,
-            "evaluate_mean_every": 20,
-            "seeds": {
-                NONE: 9,
-                "linear": 1,
-                "quadratic": 1,
-                "cosine": 1,
-                "exponential": 1,
-                "step": 1,
-            },
-        },
-    },
-    minutes={"quick": "25", "paper": "weeks; for a GPU"},
-    measure=measure,
-    claims=claims,
-    facts=facts,
-    draw=draw,
-    needs="keeps its searches under runs/brax_curriculum",
+EXPERIMENT = Experiment.of_the_paper(
+    "brax_curriculum", measure=measure, claims=claims, facts=facts, draw=draw
 )
 
 

@@ -287,44 +287,8 @@ def draw(report: Mapping[str, Any]) -> Figure:
     return figure
 
 
-EXPERIMENT = Experiment(
-    name="brax_training",
-    title="Training in a Brax bandit and in the environment itself",
-    paper="figures 5, 15 and 16, table 2",
-    claim="agents take 10 000 steps in a bandit to learn locomotion for which training in the environment takes "
-    "millions: it is roughly two orders of magnitude slower.",
-    presets={
-        "quick": {
-            "bandits": [[OURS, "hopper", "spring"], [PUBLISHED, "hopper", "generalized"]],
-            "bandit_algorithms": ["ppo", "sac", "ddpg", "td3"],
-            "bandit_agents": 20,
-            "environment_algorithms": ["ppo", "sac"],
-            "environment_agents": 4,
-            "environment_steps": 1_000_000,
-            "episodes": 5,
-            "points": 10,
-        },
-        "paper": {
-            "bandits": [
-                [OURS, "hopper", "spring"],
-                *([PUBLISHED, name, "generalized"] for name in BRAX),
-            ],
-            "bandit_algorithms": ["ppo", "sac", "ddpg", "td3"],
-            "bandit_agents": 20,
-            "environment_algorithms": ["ppo", "sac", "ddpg", "td3"],
-            "environment_agents": 5,
-            "environment_steps": 5 * 2**20,
-            "episodes": 50,
-            "points": 20,
-        },
-    },
-    minutes={"quick": "45", "paper": "days; for a GPU"},
-    measure=measure,
-    claims=claims,
-    facts=facts,
-    draw=draw,
-    needs="needs for the published bandits --published DIRECTORY with their arrays",
-    options=Options,
+EXPERIMENT = Experiment.of_the_paper(
+    "brax_training", measure=measure, claims=claims, facts=facts, draw=draw, options=Options
 )
 
 

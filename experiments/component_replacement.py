@@ -235,34 +235,8 @@ def draw(report: Mapping[str, Any]) -> Figure:
     return figure
 
 
-EXPERIMENT = Experiment(
-    name="component_replacement",
-    title="What of a bandit is needed: its reward and its contexts replaced by an expert's",
-    paper="figure 12, appendix on replacing components",
-    claim="on Pendulum the bandit's contexts are needed to learn well within 10 000 steps; an expert's Q-function as "
-    "the reward does not work well; cloning the expert, or rewarding closeness to its action, on the bandit's contexts "
-    "does as well as the bandit's reward.",
-    presets={
-        "quick": {
-            "experts": 3,
-            "candidates": 2,
-            "expert_episodes": 64,
-            "agents": 20,
-            "episodes": 20,
-        },
-        "paper": {
-            "experts": 10,
-            "candidates": 4,
-            "expert_episodes": 256,
-            "agents": 20,
-            "episodes": 50,
-        },
-    },
-    minutes={"quick": "3", "paper": "16"},
-    measure=measure,
-    claims=claims,
-    facts=facts,
-    draw=draw,
+EXPERIMENT = Experiment.of_the_paper(
+    "component_replacement", measure=measure, claims=claims, facts=facts, draw=draw
 )
 
 

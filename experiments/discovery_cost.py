@@ -11,23 +11,30 @@ computed anew. `--only-render` makes table and figure from the JSON.
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
 import tyro
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 from matplotlib.ticker import EngFormatter, MaxNLocator
 
 from experiments.harness import Experiment, Save
-from experiments.zoo_table_page import ENVIRONMENTS, TARGETS, label
+from experiments.rendering import plain
+from experiments.searches import judgements
+from experiments.zoo_table_page import TARGETS, label, rank
 from scb import plotting
 from scb.discovery import DiscoveryConfig
 from scb.environments.registry import environment_spec
 from scb.errors import UserError
 from scb.runs import read_config
 
-STARTS = ("warm", "random")
+# How a run's line is drawn by its start.
+STARTS: dict[str, dict[str, Any]] = {
+    "warm": {"color": plotting.VERMILLION, "linestyle": "-", "marker": "o", "markersize": 3.5},
+    "random": {"color": plotting.BLUE, "linestyle": "--", "marker": "s", "markersize": 3.5},
+}
+_TARGET: dict[str, Any] = {"color": plotting.BLACK, "linewidth": 1.4, "linestyle": ":"}
 # How a run's log names an algorithm's interquartile mean beside its mean.
 _IQM = "_iqm"
 # What makes two searches incomparable where it differs; shown in the JSON, and said on the page.
@@ -81,24 +88,13 @@ def _run(folder: Path) -> dict[str, Any] | str:
     environment = config.get("environment") or DiscoveryConfig.environment
     rows, seconds = _lines(folder / "metrics.jsonl"), _lines(folder / "timing.jsonl")
     number = min(len(rows), len(seconds))  # a run that goes on writes one before the other
-    rows = rows[:number]
-    warm = _warm_start(folder, environment)
-    elapsed, minutes = warm["minutes"] or 0.0, []
-    for line in seconds[:number]:
-        minutes.append(elapsed)
-        elapsed += line["seconds"] / 60
-    before = [0] + [row["steps/total"] for row in rows]
-    points, algorithms = [], {}
-    for generation, row in enumerate(rows):
-        if row.get("mean/fitness") is not None:
-            # Judged before the generation's own candidates are.
-            steps = before[generation] + (warm["steps"] or 0)
-            points.append([generation, round(minutes[generation], 3), steps, _judged(row, "mean/")])
-            algorithms = _by_algorithm(row, "mean/")
-    if rows and rows[-1].get("final_mean/fitness") is not None:
-        steps = before[-1] + (warm["steps"] or 0)
-        points.append([number, round(elapsed, 3), steps, _judged(rows[-1], "final_mean/")])
-        algorithms = _by_algorithm(rows[-1], "final_mean/")
+    rows, warm = rows[:number], _warm_start(folder, environment)
+    # Before every generation, and after the last.
+    spent = [x["seconds"] / 60 for x in seconds[:number]]
+    minutes = list(accumulate(spent, initial=warm["minutes"] or 0.0))
+    steps = [x + (warm["steps"] or 0) for x in (0, *(row["steps/total"] for row in rows))]
+    judged = [(g, x) for g, x in judgements(rows) if x["fitness"] is not None]
+    points = [[g, round(minutes[g], 3), steps[g], _judged(x)] for g, x in judged]
     if not points:
         return "it has not been judged yet"
     target = TARGETS.get(environment)
@@ -113,12 +109,12 @@ def _run(folder: Path) -> dict[str, Any] | str:
         "settings": {name: config.get(name, evolution.get(name)) for name in SETTINGS},
         "generations": number,
         "planned_generations": evolution.get("generations", evolution.get("num_generations")),
-        "minutes": round(elapsed, 3),
+        "minutes": round(minutes[-1], 3),
         "steps": {
             "warm_start": warm["steps"] if start == "warm" else 0,
             "training": rows[-1]["steps/training"],
             "evaluation": rows[-1]["steps/evaluation"],
-            "total": rows[-1]["steps/total"] + (warm["steps"] or 0),
+            "total": steps[-1],
         },
         "warm_start_minutes": warm["minutes"] if start == "warm" else 0.0,
         "machine": warm["machine"],
@@ -126,20 +122,19 @@ def _run(folder: Path) -> dict[str, Any] | str:
         "reached": None
         if at_target is None
         else dict(zip(("generation", "minutes", "steps", "mean"), at_target, strict=True)),
-        "algorithms": algorithms,
+        "algorithms": {
+            name.removeprefix("fitness/"): value
+            for name, value in judged[-1][1].items()
+            if name.startswith("fitness/")
+        },
         "statistic": "IQM" if any(f"mean/fitness{_IQM}" in row for row in rows) else "mean",
         "points": points,
     }
 
 
-def _judged(row: Mapping[str, Any], prefix: str) -> float:
+def _judged(found: Mapping[str, Any]) -> float:
     """The interquartile mean over the agents, which targets are stated in; the mean where none was logged."""
-    return float(row.get(f"{prefix}fitness{_IQM}", row[f"{prefix}fitness"]))
-
-
-def _by_algorithm(row: Mapping[str, Any], prefix: str) -> dict[str, float]:
-    start = f"{prefix}fitness/"
-    return {k.removeprefix(start): v for k, v in row.items() if k.startswith(start)}
+    return float(found.get(f"fitness{_IQM}", found["fitness"]))
 
 
 def _warm_start(folder: Path, environment: str) -> dict[str, Any]:
@@ -173,156 +168,79 @@ def _lines(path: Path) -> list[dict[str, Any]]:
 
 
 def _place(run: Mapping[str, Any]) -> tuple[Any, ...]:
-    name = run["environment"].split(" (")[0]
-    rank = ENVIRONMENTS.index(name) if name in ENVIRONMENTS else len(ENVIRONMENTS)
-    return (rank, name, STARTS.index(run["start"]), run["seed"], run["name"])
+    environment = rank(run["environment"].split(" (")[0])
+    return (environment, list(STARTS).index(run["start"]), run["seed"], run["name"])
 
 
 def facts(report: Mapping[str, Any]) -> dict[str, Any]:
-    """The table's rows, and what a reader must know about these runs."""
-    rows = []
-    for run in report["runs"]:
-        steps, reached, target = run["steps"], run["reached"], run["target"]
-        unfinished = run["planned_generations"] not in (None, run["generations"])
-        of_all = f" of {run['planned_generations']}" if unfinished else ""
-        to_target = ["" if target is None else "not reached", "", ""]
-        if reached is not None:
-            minutes = f"{reached['minutes']:.1f}"
-            to_target = [str(reached["generation"]), minutes, _count(reached["steps"])]
-        warm = steps["warm_start"]
-        rows.append(
-            [
-                run["environment"],
-                run["start"],
-                str(run["seed"]),
-                f"{run['generations']}{of_all}",
-                "not recorded" if warm is None else _count(warm),
-                *(_count(steps[kind]) for kind in ("training", "evaluation", "total")),
-                f"{run['minutes']:.1f}",
-                "" if target is None else _number(target),
-                *to_target,
-                _end(run),
-            ]
-        )
-    return {"rows": rows, "notes": _notes(report)}
-
-
-def _notes(report: Mapping[str, Any]) -> list[str]:
-    """What a reader must know about these runs, each a paragraph."""
-    runs, notes = report["runs"], []
-    if any(run["warm_start_minutes"] is None for run in runs):
-        notes.append(
-            "The minutes leave out the warm start's own where the run does not record them."
-        )
-    if any(run["steps"]["warm_start"] is None for run in runs):
-        notes.append("Where the warm start's steps are not recorded, the total leaves them out.")
-    machines = {json.dumps(run["machine"], sort_keys=True) for run in runs if run["machine"]}
-    if machines:
-        texts = [
-            f"{machine['cores']} cores, {machine['processor']}, accelerator: {machine['accelerator']}"
-            for machine in map(json.loads, sorted(machines))
-        ]
-        notes.append(f"Minutes are wall-clock on: {'; '.join(texts)}.")
+    """What a reader must know about these runs: {environment: {setting: its values, where they differ}}, machines."""
+    runs, differing = report["runs"], {}
     for environment in dict.fromkeys(run["environment"] for run in runs):
         settings = [run["settings"] for run in runs if run["environment"] == environment]
-        for name in SETTINGS:
-            values = [x.get(name) for x in settings]
-            values = list(dict.fromkeys("the default" if x is None else str(x) for x in values))
-            if len(values) > 1:
-                notes.append(
-                    f"The runs of {environment} differ in {name.replace('_', ' ')}: {', '.join(values)}."
-                )
-    if report["left_out"]:
-        left_out = "; ".join(f"{left['name']}, since {left['why']}" for left in report["left_out"])
-        notes.append(f"Left out: {left_out}.")
-    return notes
+        of_each = {
+            name: list(dict.fromkeys(_setting(x.get(name)) for x in settings)) for name in SETTINGS
+        }
+        differing[environment] = {name: x for name, x in of_each.items() if len(x) > 1}
+    machines = {json.dumps(run["machine"], sort_keys=True) for run in runs if run["machine"]}
+    return {
+        "machines": list(map(json.loads, sorted(machines))),
+        "differing": differing,
+        "end": _end,
+    }
+
+
+def _setting(value: Any) -> str:
+    return "the default" if value is None else str(value)
 
 
 def _end(run: Mapping[str, Any]) -> str:
     """The last mean, and by algorithm the interquartile means where the run logs them, else the means."""
-    end, logged = _number(run["points"][-1][3]), run["algorithms"]
+    end, logged = plain(run["points"][-1][3]), run["algorithms"]
     iqms = {name.removesuffix(_IQM): x for name, x in logged.items() if name.endswith(_IQM)}
     shown = iqms or logged
     if not iqms and len(logged) < 2:
         return end
-    each = ", ".join(f"{name.upper()} {_number(x)}" for name, x in shown.items())
+    each = ", ".join(f"{name.upper()} {plain(x)}" for name, x in shown.items())
     return f"{end} ({'IQM: ' if iqms else ''}{each})"
-
-
-def _number(x: float | None) -> str:
-    return "none" if x is None else f"{x:.1f}".removesuffix(".0").replace("-", "−")
-
-
-def _count(steps: float) -> str:
-    """A number of steps as a table shows it: 12.5 million, 40 960."""
-    if steps >= 1e6:
-        return f"{steps / 1e6:.1f}".removesuffix(".0") + " million"
-    return f"{steps:,.0f}".replace(",", "\N{NARROW NO-BREAK SPACE}")
 
 
 def figure(report: Mapping[str, Any]) -> Figure:
     """A row an environment: the mean's return against minutes (left) and environment steps (right)."""
     runs = report["runs"]
     environments = list(dict.fromkeys(run["environment"] for run in runs))
-    looks = {
-        "warm": plotting.Look(plotting.VERMILLION, "-", "o"),
-        "random": plotting.Look(plotting.BLUE, "--", "s"),
+    drawn = Figure(figsize=(plotting.WIDTH, 2.4 * len(environments) + 1.2))
+    grid = drawn.subplots(len(environments), 2, sharey="row", squeeze=False)
+    for row, environment in zip(grid, environments, strict=True):
+        of_it = [run for run in runs if run["environment"] == environment]
+        for axes, column in zip(row, (1, 2), strict=True):
+            for run in of_it:
+                x, y = ([point[i] for point in run["points"]] for i in (column, 3))
+                axes.plot(x, y, **STARTS[run["start"]], linewidth=1.1)
+            if of_it[0]["target"] is not None:
+                axes.axhline(of_it[0]["target"], **_TARGET)
+            axes.margins(x=0.03, y=0.08)
+            # From zero, so that what a warm start costs before the first point can be seen.
+            right = axes.get_xlim()[1]
+            axes.set_xlim(-0.02 * right, right)
+            axes.xaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 2.5, 5, 10]))
+        row[1].xaxis.set_major_formatter(EngFormatter(sep=""))
+        statistics = " or ".join(dict.fromkeys(run["statistic"] for run in of_it))
+        row[0].set_ylabel(f"return ({statistics})")
+        row[0].set_title(environment)
+    grid[-1][0].set_xlabel("minutes")
+    grid[-1][1].set_xlabel("environment steps (training + evaluation)")
+    number = {start: sum(run["start"] == start for run in runs) for start in STARTS}
+    shown = {
+        f"{start} start ({number[start]} run{'s' if number[start] > 1 else ''})": look
+        for start, look in STARTS.items()
+        if number[start]
     }
-    with plotting.figure_style():
-        drawn = Figure(figsize=(plotting.WIDTH, 2.4 * len(environments) + 1.2))
-        grid = drawn.subplots(len(environments), 2, sharey="row", squeeze=False)
-        for row, environment in zip(grid, environments, strict=True):
-            of_it = [run for run in runs if run["environment"] == environment]
-            for axes, column in zip(row, (1, 2), strict=True):
-                for run in of_it:
-                    look = looks[run["start"]]
-                    axes.plot(
-                        [point[column] for point in run["points"]],
-                        [point[3] for point in run["points"]],
-                        color=look.color,
-                        linestyle=look.linestyle,
-                        marker=look.marker,
-                        linewidth=1.1,
-                        markersize=3.5,
-                    )
-                if of_it[0]["target"] is not None:
-                    axes.axhline(
-                        of_it[0]["target"], color=plotting.BLACK, linewidth=1.4, linestyle=":"
-                    )
-                axes.margins(x=0.03, y=0.08)
-                # From zero, so that what a warm start costs before the first point can be seen.
-                right = axes.get_xlim()[1]
-                axes.set_xlim(-0.02 * right, right)
-                axes.xaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 2.5, 5, 10]))
-            row[1].xaxis.set_major_formatter(EngFormatter(sep=""))
-            statistics = " or ".join(dict.fromkeys(run["statistic"] for run in of_it))
-            row[0].set_ylabel(f"return ({statistics})")
-            row[0].set_title(environment)
-        grid[-1][0].set_xlabel("minutes")
-        grid[-1][1].set_xlabel("environment steps (training + evaluation)")
-        handles, names = [], []
-        for start in STARTS:
-            number = sum(run["start"] == start for run in runs)
-            if number:
-                look = looks[start]
-                handles.append(
-                    Line2D(
-                        [],
-                        [],
-                        color=look.color,
-                        linestyle=look.linestyle,
-                        marker=look.marker,
-                        markersize=3.5,
-                    )
-                )
-                names.append(f"{start} start ({number} run{'s' if number > 1 else ''})")
-        if any(run["target"] is not None for run in runs):
-            handles.append(Line2D([], [], color=plotting.BLACK, linewidth=1.4, linestyle=":"))
-            names.append("target")
-        plotting.figure_title(
-            drawn, "Discovery of a bandit: return of agents trained in the search's mean"
-        )
-        plotting.legend_below(drawn, (handles, names), columns=3)
+    if any(run["target"] is not None for run in runs):
+        shown["target"] = _TARGET
+    plotting.figure_title(
+        drawn, "Discovery of a bandit: return of agents trained in the search's mean"
+    )
+    plotting.legend_of(drawn, shown, columns=3)
     return drawn
 
 
@@ -343,11 +261,11 @@ def measure(options: Options, report: dict[str, Any], save: Save) -> None:
 
 
 EXPERIMENT = Experiment(
-    name="discovery_cost",
-    title="What discovering a bandit costs",
-    measure=measure,
-    draw=figure,
+    "discovery_cost",
+    "What discovering a bandit costs",
+    measure,
     facts=facts,
+    draw=figure,
     options=Options,
     keys=("runs",),
 )

@@ -16,7 +16,6 @@ from matplotlib.figure import Figure
 from experiments import searches
 from experiments.claims import OF_THE_WAY, TENTH, Claim
 from experiments.harness import CLASSIC_CONTROL, Experiment, Report, Save, finite
-from experiments.searches import PAPER_SIZES
 from scb import plotting
 from scb.agents.spec import AgentSpec, algorithms_for, bandit_agent
 from scb.curriculum import paper_curriculum
@@ -230,51 +229,8 @@ def draw(report: Mapping[str, Any]) -> Figure:
     return figure
 
 
-EXPERIMENT = Experiment(
-    name="episode_lengths",
-    title="How long the episodes of synthetic MDPs are",
-    paper="figure 2",
-    claim="in most environments more than 80% of the episodes of a synthetic MDP that may take many steps end after "
-    "one; limiting them to one has next to no negative impact, and is sometimes better.",
-    presets={
-        "quick": {
-            "runs": "runs/episode_lengths/quick",
-            "seed": 0,
-            "limits": [OWN, "10", "1"],
-            "algorithms": ["ppo"],
-            "judged_by": ["ppo", "sac"],
-            "sizes": {
-                name: {
-                    "generations": 60 if name == "Pendulum-v1" else 30,
-                    "population_size": 16,
-                    "agents_per_candidate": 1,
-                }
-                for name in CLASSIC_CONTROL
-            },
-            "evaluation_episodes": 8,
-            "mean_evaluations": 16,
-            "agents": 8,
-            "episodes": 50,
-        },
-        "paper": {
-            "runs": "runs/episode_lengths/paper",
-            "seed": 0,
-            "limits": [OWN, "100", "50", "10", "5", "2", "1"],
-            "algorithms": [],
-            "judged_by": [],
-            "sizes": PAPER_SIZES,
-            "evaluation_episodes": 50,
-            "mean_evaluations": 64,
-            "agents": 20,
-            "episodes": 50,
-        },
-    },
-    minutes={"quick": "30", "paper": "days; for a GPU"},
-    measure=measure,
-    claims=claims,
-    facts=facts,
-    draw=draw,
-    needs="keeps its searches under runs/episode_lengths",
+EXPERIMENT = Experiment.of_the_paper(
+    "episode_lengths", measure=measure, claims=claims, facts=facts, draw=draw
 )
 
 

@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 
 import scb
 from experiments.claims import Claim
-from experiments.harness import CLASSIC_CONTROL, Experiment, Report, Save
+from experiments.harness import Experiment, Report, Save
 from scb import plotting
 from scb.agents.spec import environment_agent
 from scb.analysis.components import SACExpert, train_sac_expert
@@ -108,31 +108,8 @@ def draw(report: Mapping[str, Any]) -> Figure:
     return figure
 
 
-EXPERIMENT = Experiment(
-    name="experts",
-    title="SAC experts on classic control",
-    paper="table 1, appendix on replacing components",
-    claim="a SAC agent trained on the environment is near-optimal in all of classic control: Acrobot \u221276.7, "
-    "CartPole 500, MountainCar \u2212117.7, its continuous sibling 94.9, Pendulum \u2212137.4.",
-    presets={
-        "quick": {
-            "environments": list(CLASSIC_CONTROL),
-            "agents": 4,
-            "selection_episodes": 50,
-            "evaluations": 200,
-        },
-        "paper": {
-            "environments": list(CLASSIC_CONTROL),
-            "agents": 10,
-            "selection_episodes": 200,
-            "evaluations": 200,
-        },
-    },
-    minutes={"quick": "5", "paper": "12"},
-    measure=measure,
-    claims=claims,
-    facts=facts,
-    draw=draw,
+EXPERIMENT = Experiment.of_the_paper(
+    "experts", measure=measure, claims=claims, facts=facts, draw=draw
 )
 
 

@@ -20,8 +20,7 @@ from matplotlib.figure import Figure
 import scb
 from experiments import searches
 from experiments.claims import OF_THE_WAY, TENTH, Claim
-from experiments.harness import CLASSIC_CONTROL, Experiment, Report, Save, finite
-from experiments.searches import PAPER_SIZES
+from experiments.harness import Experiment, Report, Save, finite
 from scb import measurement, plotting
 from scb.agents.spec import AgentSpec, algorithms_for, bandit_agent
 from scb.analysis.optimal_actions import optimal_policy
@@ -334,56 +333,8 @@ def draw(report: Mapping[str, Any]) -> Figure:
     return figure
 
 
-_SHARED: dict[str, Any] = {
-    "environments": list(CLASSIC_CONTROL),
-    "seed": 0,
-    "neuroevolution": {"population_size": 64, "num_generations": 200, "episodes": 32, "sigma": 0.1},
-}
-
-EXPERIMENT = Experiment(
-    name="generality",
-    title="What agents a bandit can train",
-    paper="figures 3 and 8 to 11",
-    claim="bandits are much more robust to an agent's hyperparameters than their environments are, more so where the "
-    "search drew them; and they train agents that no search saw: other networks, other activations, neuroevolution; "
-    "the CB-optimal policy does well in the environment.",
-    presets={
-        "quick": {
-            **_SHARED,
-            "runs": "runs/generality/quick",
-            "algorithms": ["ppo"],
-            "init": "expert",
-            "combine": "ranks",
-            "sizes": {
-                name: {"generations": 20, "population_size": 16, "agents_per_candidate": 2}
-                for name in CLASSIC_CONTROL
-            },
-            "sigma": 0.02,
-            "evaluation_episodes": 8,
-            "mean_evaluations": 32,
-            "agents": 8,
-            "episodes": 50,
-        },
-        "paper": {
-            **_SHARED,
-            "runs": "runs/generality/paper",
-            "algorithms": [],
-            "init": "random",
-            "combine": "mean",
-            "sizes": PAPER_SIZES,
-            "sigma": 0.05,
-            "evaluation_episodes": 50,
-            "mean_evaluations": 64,
-            "agents": 20,
-            "episodes": 50,
-        },
-    },
-    minutes={"quick": "60 to 120 min", "paper": "days; for a GPU"},
-    measure=measure,
-    claims=claims,
-    facts=facts,
-    draw=draw,
-    needs="keeps its searches under runs/generality",
+EXPERIMENT = Experiment.of_the_paper(
+    "generality", measure=measure, claims=claims, facts=facts, draw=draw
 )
 
 

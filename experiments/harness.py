@@ -1,15 +1,16 @@
 """What all experiments run on: flags, a report that is continued, claims that are judged, a page from a template.
 
-An experiment is a module with an `EXPERIMENT`. Its report is a JSON object that says what was measured,
-with which preset and versions, and how long it took; page and figure are made from it alone, by
-templates/NAME.md.j2. What a report holds already is not measured again, so that the same command
-continues an interrupted one.
+An experiment is a module with an `EXPERIMENT`; plans/NAME.toml says what the paper claims and what is run
+for it. Its report is a JSON object that says what was measured, with which preset and versions, and how long
+it took; page and figure are made from it alone, by templates/NAME.md.j2. What a report holds already is not
+measured again, so that the same command continues an interrupted one.
 """
 
 import importlib
 import json
 import sys
 import time
+import tomllib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, make_dataclass
 from pathlib import Path
@@ -31,6 +32,7 @@ from scb.runs import make_folder, write_json
 CLASSIC_CONTROL = tuple(sorted(families()["classic"].suite))
 DATA = Path("docs/data")
 DOCS = Path("docs")
+PLANS = Path(__file__).with_name("plans")
 Save = Callable[[], None]
 Report = Mapping[str, Any]
 
@@ -97,6 +99,14 @@ class Experiment:
     out: Path | None = None
     reports: bool = True
     dpi: int = plotting.DPI
+
+    @classmethod
+    def of_the_paper(cls, name: str, **parts: Any) -> "Experiment":
+        """One whose title, claim, needs and presets are those of plans/NAME.toml; presets.both is part of either."""
+        said = tomllib.loads((PLANS / f"{name}.toml").read_text())
+        both = said["presets"].pop("both", {})
+        said["presets"] = {preset: both | own for preset, own in said["presets"].items()}
+        return cls(name, **said, **parts)
 
     def judged(self, report: Report) -> list[Judged]:
         """What becomes of each part of the claim."""

@@ -55,7 +55,6 @@ def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None
 
 
 def _examine(name: str, plan: Mapping[str, Any]) -> dict[str, Any]:
-
     bandit = open_bandit(environment_spec(name).bandit)
     env, env_params = scb.make(name)
     numbers, drawn = explain(bandit, env, env_params, name, plan["episodes"], plan["seed"])
@@ -180,22 +179,8 @@ def draw(report: Mapping[str, Any]) -> Figure:
     return figure
 
 
-EXPERIMENT = Experiment(
-    name="interpretability",
-    title="What a bandit says about its environment",
-    paper="figure 6 and its section",
-    claim="SCBs give insights into their environment: the reward hardly depends on Acrobot's angles (compared with its "
-    "angular velocities), nor on CartPole's position and angle; MountainCar's bandit never does nothing, its "
-    "continuous sibling's often does.",
-    presets={
-        "quick": {"episodes": 50, "repetitions": 5, "seed": 0},
-        "paper": {"episodes": 200, "repetitions": 20, "seed": 0},
-    },
-    minutes={"quick": "1", "paper": "2"},
-    measure=measure,
-    claims=claims,
-    facts=facts,
-    draw=draw,
+EXPERIMENT = Experiment.of_the_paper(
+    "interpretability", measure=measure, claims=claims, facts=facts, draw=draw
 )
 
 

@@ -210,18 +210,7 @@ def draw(report: Mapping[str, Any]) -> Figure:
     return figure
 
 
-EXPERIMENT = Experiment(
-    name="lemma",
-    title="Every MDP has a contextual bandit with the same optimum",
-    paper="lemma 1 and its proof",
-    claim="given any Markov decision process M there is a contextual bandit B such that every policy that is "
-    "optimal in B is also optimal in M.",
-    presets={"quick": {"mdps": 300, "seed": 0}, "paper": {"mdps": 5000, "seed": 0}},
-    minutes={"quick": "1", "paper": "4"},
-    measure=measure,
-    claims=claims,
-    draw=draw,
-)
+EXPERIMENT = Experiment.of_the_paper("lemma", measure=measure, claims=claims, draw=draw)
 
 
 if __name__ == "__main__":

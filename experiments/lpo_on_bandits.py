@@ -24,7 +24,7 @@ from matplotlib.ticker import EngFormatter, LogLocator, NullFormatter, StrMethod
 
 from experiments.claims import OF_THE_WAY, TENTH, Claim
 from experiments.harness import Experiment, Preset, Report, Save
-from experiments.searches import objective_of_run
+from experiments.searches import judgements, objective_of_run
 from lpo.comparison import compare
 from lpo.objectives import Objective, load_objective
 from scb import plotting
@@ -41,63 +41,6 @@ SIZES = ("population_size", "agents_per_candidate", "generations")
 CLIPS = ("ppo-0.1", "ppo", "ppo-0.3", "ppo-0.5", "ppo-1")
 SCALES = {"Flax's initialisation": 1.0, "small last layer": 0.01}
 
-_JUDGED = {"validate": True, "mean_evaluations": 16}
-PRESETS: dict[str, dict[str, Any]] = {
-    "quick": {
-        "searches": {
-            "bandit": {
-                "seeds": 5,
-                "settings": {
-                    **_JUDGED,
-                    "environment": "Synthetic-Pendulum-v1",
-                    "population_size": 32,
-                    "generations": 30,
-                    "agents_per_candidate": 4,
-                    "evaluate_mean_every": 5,
-                },
-            },
-            # A generation takes forty times as long here: a candidate has one agent, and the search
-            # is short.
-            "environment": {
-                "seeds": 5,
-                "settings": {
-                    **_JUDGED,
-                    "environment": "Pendulum-v1",
-                    "population_size": 16,
-                    "generations": 10,
-                    "agents_per_candidate": 1,
-                    "evaluate_mean_every": 2,
-                },
-            },
-        },
-        "agents": 20,
-        "tuning_agents": 10,
-        # 12 500 steps a second: the first search's objective alone.
-        "hopper": {"backend": "generalized", "steps": 250_000, "agents": 10, "searches": 1},
-    },
-    "paper": {
-        "searches": {
-            source: {
-                "seeds": 5,
-                "settings": {
-                    **_JUDGED,
-                    "environment": environment,
-                    "population_size": 64,
-                    "generations": 512,
-                    "agents_per_candidate": 4,
-                    "evaluate_mean_every": 16,
-                },
-            }
-            for source, environment in zip(
-                SOURCES, ("Synthetic-Pendulum-v1", "Pendulum-v1"), strict=True
-            )
-        },
-        "agents": 20,
-        "tuning_agents": 20,
-        "hopper": {"backend": "generalized", "steps": 5 * 2**20, "agents": 10, "searches": 5},
-    },
-}
-
 
 def search_curve(metrics: Sequence[Mapping[str, Any]], seconds: Sequence[float]) -> dict[str, Any]:
     """What a search's log says: the judged mean over generations, steps and minutes.
@@ -105,22 +48,17 @@ def search_curve(metrics: Sequence[Mapping[str, Any]], seconds: Sequence[float])
     The time of a generation is the median of those that judged nothing: judging is no part of the
     search. The first, which compiles, is left out of it too.
     """
-    judged = [("mean/fitness_iqm" in line) for line in metrics]
+    judged = ["mean/fitness_iqm" in line for line in metrics]
     plain = [s for s, j in list(zip(seconds, judged, strict=True))[1:] if not j] or list(seconds)
-    per_generation = float(np.median(plain))
-    per = {kind: metrics[0][f"steps/{kind}"] for kind in ("training", "evaluation", "total")}
-    points = [
-        (line["generation"], line["mean/fitness_iqm"])
-        for line in metrics
-        if line.get("mean/fitness_iqm") is not None
-    ]
-    if metrics[-1].get("final_mean/fitness_iqm") is not None:
-        points.append((metrics[-1]["generation"] + 1, metrics[-1]["final_mean/fitness_iqm"]))
+    points = [(g, x["fitness_iqm"]) for g, x in judgements(metrics)]
+    points = [(g, x) for g, x in points if x is not None]
     return {
         "generations": [g for g, _ in points],
-        "returns": [r for _, r in points],
-        "steps_per_generation": per,
-        "seconds_per_generation": round(per_generation, 3),
+        "returns": [x for _, x in points],
+        "steps_per_generation": {
+            kind: metrics[0][f"steps/{kind}"] for kind in ("training", "evaluation", "total")
+        },
+        "seconds_per_generation": round(float(np.median(plain)), 3),
     }
 
 
@@ -220,19 +158,23 @@ def draw(report: Mapping[str, Any]) -> Figure:
         curves, look = search["curves"], looks[source]
         name = f"on the {source} ({len(curves)} searches)"
         per = curves[0]["steps_per_generation"]
-        seconds = float(np.median([c["seconds_per_generation"] for c in curves]))
+        minutes = float(np.median([c["seconds_per_generation"] for c in curves])) / 60
         generations = np.asarray(curves[0]["generations"], float)
-        returns = [c["returns"] for c in curves]
-        _band(panels[0], generations, returns, look, name)
+        returns = [estimate(x) for x in np.transpose([c["returns"] for c in curves])]
         # No step is taken and no time passes before generation 0, which a logarithm cannot show.
-        later, returns = generations[1:], [r[1:] for r in returns]
-        _band(panels[1], later * per["total"], returns, look, f"{source}: total")
-        _band(panels[2], later * seconds / 60, returns, look, name)
-        middle = iqm(np.asarray(returns), axis=0)
+        for panel, first, each, label in (
+            (panels[0], 0, 1.0, name),
+            (panels[1], 1, per["total"], f"{source}: total"),
+            (panels[2], 1, minutes, name),
+        ):
+            x, found = generations[first:] * each, returns[first:]
+            plotting.estimate_curve(
+                panel, x, found, look.color, look.linestyle, label, marker=look.marker
+            )
         for kind, style in (("training", ":"), ("evaluation", "-.")):
             panels[1].plot(
-                later * per[kind],
-                middle,
+                generations[1:] * per[kind],
+                [x.value for x in returns[1:]],
                 linestyle=style,
                 color=look.color,
                 label=f"{source}: {kind}",
@@ -259,26 +201,7 @@ def draw(report: Mapping[str, Any]) -> Figure:
     return figure
 
 
-def _band(
-    axes: Axes, x: np.ndarray, returns: Sequence[Sequence[float]], look: Any, label: str
-) -> None:
-
-    found = [estimate(column) for column in np.asarray(returns).T]
-    axes.plot(
-        x,
-        [f.value for f in found],
-        look.linestyle,
-        color=look.color,
-        marker=look.marker,
-        label=label,
-    )
-    if len(returns) > 1:
-        low, high = [f.low for f in found], [f.high for f in found]
-        axes.fill_between(x, low, high, color=look.color, alpha=0.15, linewidth=0)  # type: ignore[arg-type]
-
-
 def _dots(axes: Axes, table: Mapping[str, Any]) -> None:
-
     for position, (objective, finals) in enumerate(table["finals"].items()):
         learned = objective.startswith("LPO")
         color = plotting.VERMILLION if learned else plotting.BLUE
@@ -424,22 +347,14 @@ class Options(Preset):
     """for the run folders"""
 
 
-EXPERIMENT = Experiment(
-    name="lpo_on_bandits",
-    title="Learned policy optimisation on synthetic contextual bandits",
-    paper="figure and section on learned policy optimisation",
-    claim="objectives learned on Pendulum's bandit and on Pendulum itself both outperform PPO's on Pendulum, in speed "
-    "and at the end; the bandit takes two orders of magnitude fewer environment steps, with no negative effect on the "
-    "final performance; on Hopper both are comparable to PPO.",
-    presets=PRESETS,
-    minutes={"quick": "120", "paper": "days; for a GPU"},
+EXPERIMENT = Experiment.of_the_paper(
+    "lpo_on_bandits",
     measure=measure,
     claims=claims,
     facts=facts,
     draw=draw,
     options=Options,
     keys=("preset", "searches", "evaluations"),
-    needs="keeps its searches under --runs",
 )
 
 

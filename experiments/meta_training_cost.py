@@ -72,9 +72,9 @@ def measure(options: Options, report: dict[str, Any], save: Save) -> None:
 
 
 EXPERIMENT = Experiment(
-    name="meta_training_cost",
-    title="What meta-training costs",
-    measure=measure,
+    "meta_training_cost",
+    "What meta-training costs",
+    measure,
     options=Options,
     out=Path("runs/meta_training_cost.json"),
 )

@@ -7,6 +7,7 @@ from typing import Any
 import jinja2
 
 from experiments.claims import UNDECIDED, UNTESTED
+from scb.plotting import thousands
 from scb.statistics import Estimate, estimate, iqm
 
 TEMPLATES = Path(__file__).with_name("templates")
@@ -15,6 +16,16 @@ TEMPLATES = Path(__file__).with_name("templates")
 def number(value: float, places: int = 0, sign: bool = False) -> str:
     """With a real minus sign."""
     return f"{value:{'+' if sign else ''}z.{places}f}".replace("-", "\N{MINUS SIGN}")
+
+
+def plain(value: float | None) -> str:
+    """To one place, where that is none that is zero; "none" where there is no number."""
+    return "none" if value is None else number(value, 1).removesuffix(".0")
+
+
+def millions(steps: float) -> str:
+    """A number of steps as a table shows it: 12.5 million, 40 960."""
+    return f"{plain(steps / 1e6)} million" if steps >= 1e6 else thousands(steps)
 
 
 def text(value: Estimate | Mapping[str, Any] | Any, places: int = 0, sign: bool = False) -> str:
@@ -26,6 +37,14 @@ def text(value: Estimate | Mapping[str, Any] | Any, places: int = 0, sign: bool 
     if values["low"] is not None:
         found += f" [{number(values['low'], places)}, {number(values['high'], places)}]"
     return found
+
+
+def digits(interval: Mapping[str, Any] | None, sign: bool = False) -> str:
+    """An estimate with four digits of its largest number: −194.2 [−262.8, −167.9]."""
+    if interval is None:
+        return "none"
+    found = str(Estimate(**interval)).rsplit(" (n=", 1)[0].replace("-", "\N{MINUS SIGN}")
+    return f"+{found}" if sign and interval["value"] > 0 else found
 
 
 def percent(share: float, places: int = 0) -> str:
@@ -64,11 +83,16 @@ ENVIRONMENT = jinja2.Environment(
 )
 ENVIRONMENT.filters |= {
     "algorithms": algorithms,
+    "digits": digits,
     "iqm": lambda x: float(iqm(x)),
     "listed": listed,
+    "millions": millions,
     "number": number,
     "percent": percent,
+    "plain": plain,
     "said": said,
+    "short": lambda x: f"{x:g}".replace("-", "\N{MINUS SIGN}"),
+    "spaced": lambda x: f"{x:,}".replace(",", " "),
     "span": span,
     "text": text,
 }

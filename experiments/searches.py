@@ -24,15 +24,6 @@ NONE = "none"  # the curriculum that is none
 # Of two searches the bootstrap's interval is their range: two such lie apart by chance in every third comparison.
 ENOUGH = 5
 
-# The paper's tables of the outer loop, classic control.
-PAPER_SIZES: dict[str, dict[str, int]] = {
-    name: {"generations": 300, "population_size": 128, "agents_per_candidate": 1}
-    for name in ("Acrobot-v1", "CartPole-v1", "MountainCarContinuous-v0")
-} | {
-    "MountainCar-v0": {"generations": 1000, "population_size": 128, "agents_per_candidate": 1},
-    "Pendulum-v1": {"generations": 1000, "population_size": 64, "agents_per_candidate": 8},
-}
-
 
 def config_of(
     environment: str, plan: Mapping[str, Any], size: Mapping[str, int], seed: int, **changes: Any
@@ -115,6 +106,20 @@ def searched_curve(config: DiscoveryConfig, folder: str | Path) -> dict[str, Any
     return {**curve(outcome.metrics), "seconds": round(outcome.seconds, 1)}
 
 
+def judgements(metrics: Sequence[Mapping[str, Any]]) -> list[tuple[int, dict[str, Any]]]:
+    """(generation before which, {"fitness", "fitness_iqm", ...}) of each judgement that a search's log has of its mean.
+
+    The last comes after all generations.
+    """
+    found = []
+    for line in metrics:
+        for later, start in enumerate(("mean/", "final_mean/")):
+            judged = {k.removeprefix(start): x for k, x in line.items() if k.startswith(start)}
+            if judged:
+                found.append((line["generation"] + later, judged))
+    return found
+
+
 def curve(metrics: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]:
     """What a search distribution's mean was worth over the generations, from a run's log.
 
@@ -122,25 +127,18 @@ def curve(metrics: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]:
       {"generation", "fitness" (interquartile mean over agents; None where one failed), "mean" (over agents),
       "failed" (mean number of candidates without a finite fitness since the last judgement)}.
     """
-    generations: list[int] = []
-    fitness: list[float | None] = []
-    mean: list[float | None] = []
-    failed: list[float] = []
-    since: list[int] = []
-    for line in metrics:
-        if "mean/fitness" in line:
-            generations.append(line["generation"])
-            fitness.append(_rounded(line.get("mean/fitness_iqm")))
-            mean.append(_rounded(line["mean/fitness"], 4))
-            failed.append(round(sum(since) / len(since), 3) if since else 0.0)
-            since = []
-        since.append(line["failed"])
-        if "final_mean/fitness" in line:
-            generations.append(line["generation"] + 1)
-            fitness.append(_rounded(line.get("final_mean/fitness_iqm")))
-            mean.append(_rounded(line["final_mean/fitness"], 4))
-            failed.append(round(sum(since) / len(since), 3))
-    return {"generation": generations, "fitness": fitness, "mean": mean, "failed": failed}
+    judged = judgements(metrics)
+    failed, last = [], 0
+    for generation, _ in judged:
+        since = [x["failed"] for x in metrics if last <= x["generation"] < generation]
+        failed.append(round(sum(since) / len(since), 3) if since else 0.0)
+        last = generation
+    return {
+        "generation": [generation for generation, _ in judged],
+        "fitness": [_rounded(x.get("fitness_iqm")) for _, x in judged],
+        "mean": [_rounded(x["fitness"], 4) for _, x in judged],
+        "failed": failed,
+    }
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,6 @@ from matplotlib.figure import Figure
 from experiments import experts
 from experiments.claims import Claim
 from experiments.harness import (
-    CLASSIC_CONTROL,
     Experiment,
     Report,
     Save,
@@ -59,7 +58,6 @@ def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None
 
 
 def _examine(environment: str, plan: Mapping[str, Any]) -> dict[str, Any]:
-
     key_states, key_episodes, key_pick = split_key(root_key(SEED), 3)
     expert, env, env_params = experts.train(environment, plan["agents"], plan["selection_episodes"])
     bandit = open_bandit(environment_spec(environment).bandit)
@@ -207,36 +205,8 @@ def draw(report: Mapping[str, Any]) -> Figure:
     return figure
 
 
-# Which entries of the larger observations span the plane: the largest two numbers are taken.
-_ENTRIES = {"Acrobot-v1": [0, 0, 0, 0, 1, 1], "CartPole-v1": [0, 0, 1, 1]}
-
-EXPERIMENT = Experiment(
-    name="state_distributions",
-    title="The states of an expert and of a bandit",
-    paper="figure 13, appendix on replacing components",
-    claim="the synthetic initial states sample a significantly larger part of the state space than what the expert "
-    "visits, and the bandit's best actions are smoother than those of the expert's Q-function in several environments.",
-    presets={
-        "quick": {
-            "environments": list(CLASSIC_CONTROL),
-            "agents": 4,
-            "selection_episodes": 50,
-            "episodes": 64,
-            "entries": _ENTRIES,
-        },
-        "paper": {
-            "environments": list(CLASSIC_CONTROL),
-            "agents": 10,
-            "selection_episodes": 200,
-            "episodes": 256,
-            "entries": _ENTRIES,
-        },
-    },
-    minutes={"quick": "6", "paper": "13"},
-    measure=measure,
-    claims=claims,
-    facts=facts,
-    draw=draw,
+EXPERIMENT = Experiment.of_the_paper(
+    "state_distributions", measure=measure, claims=claims, facts=facts, draw=draw
 )
 
 

@@ -264,11 +264,11 @@ def _learn(options: Options, name: str, seed: int, entry: dict[str, Any]) -> Any
 
 
 EXPERIMENT = Experiment(
-    name="transfer_study",
-    title="What makes an objective carry over from a bandit",
-    measure=measure,
-    draw=draw,
+    "transfer_study",
+    "What makes an objective carry over from a bandit",
+    measure,
     facts=facts,
+    draw=draw,
     options=Options,
     keys=("searches", "objectives"),
 )

@@ -206,15 +206,14 @@ def draw(report: Mapping[str, Any]) -> Figure:
 
 
 EXPERIMENT = Experiment(
-    name="understanding",
-    title="What the drifts do to an update",
-    measure=measure,
-    draw=draw,
+    "understanding",
+    "What the drifts do to an update",
+    measure,
     facts=facts,
+    draw=draw,
     options=Options,
-    # Half the usual resolution: it is a tall figure of smooth maps, which compress badly.
-    dpi=100,
     keys=("analyses",),
+    dpi=100,  # half the usual: it is a tall figure of smooth maps, which compress badly
 )
 
 

@@ -33,7 +33,6 @@ from scb.environments.registry import environment_spec
 from scb.environments.zoo import open_bandit
 from scb.errors import UserError
 from scb.keys import root_key, split_key
-from scb.seeds import ILLUSTRATING
 from scb.statistics import Estimate, estimate
 
 HOPPER = "hopper (spring)"
@@ -55,7 +54,6 @@ def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None
 
 
 def _show(name: str, plan: Mapping[str, Any]) -> dict[str, Any]:
-
     environment, backend = ("hopper", "spring") if name == HOPPER else (name, None)
     place = environment_spec(environment)
     env, env_params = place.make(backend)
@@ -151,36 +149,8 @@ def draw(report: Mapping[str, Any]) -> Figure:
     return figure
 
 
-EXPERIMENT = Experiment(
-    name="visualize",
-    title="Agents trained in a bandit, acting in the environment",
-    paper="figure 1, what its agents do",
-    claim="agents trained for 10 000 steps in a bandit do well in the environment, which they have never seen.",
-    presets={
-        "quick": {
-            "agents": 4,
-            "episodes": 20,
-            "brax_episodes": 4,
-            "brax_steps": 300,
-            "every": 2,
-            "seed": ILLUSTRATING[10_000],
-        },
-        "paper": {
-            "agents": 20,
-            "episodes": 50,
-            "brax_episodes": 10,
-            "brax_steps": 1000,
-            "every": 2,
-            "seed": ILLUSTRATING[10_000],
-        },
-    },
-    minutes={"quick": "2", "paper": "3"},
-    needs="needs a browser with access to the web for Hopper's page",
-    measure=measure,
-    claims=claims,
-    facts=facts,
-    draw=draw,
-    extras=animate,
+EXPERIMENT = Experiment.of_the_paper(
+    "visualize", measure=measure, claims=claims, facts=facts, draw=draw, extras=animate
 )
 
 

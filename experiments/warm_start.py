@@ -118,9 +118,9 @@ def measure(options: Options, report: dict[str, Any], save: Save) -> None:
 
 
 EXPERIMENT = Experiment(
-    name="warm_start",
-    title="Which bandit fitted to an expert trains best",
-    measure=measure,
+    "warm_start",
+    "Which bandit fitted to an expert trains best",
+    measure,
     options=Options,
     out=Path("runs/warm_start.json"),
 )

@@ -69,11 +69,7 @@ def measure(options: Options, report: dict[str, Any], save: Save) -> None:
 
 
 EXPERIMENT = Experiment(
-    name="zoo_bandit",
-    title="Discovered bandits into the zoo",
-    measure=measure,
-    options=Options,
-    reports=False,
+    "zoo_bandit", "Discovered bandits into the zoo", measure, options=Options, reports=False
 )
 
 

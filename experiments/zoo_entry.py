@@ -79,11 +79,7 @@ def measure(options: Options, report: dict[str, Any], save: Save) -> None:
 
 
 EXPERIMENT = Experiment(
-    name="zoo_entry",
-    title="A learned objective into the zoo",
-    measure=measure,
-    options=Options,
-    reports=False,
+    "zoo_entry", "A learned objective into the zoo", measure, options=Options, reports=False
 )
 
 

@@ -24,16 +24,16 @@ from typing import Any
 import numpy as np
 
 from experiments.harness import Experiment, Save
+from experiments.rendering import digits
 from experiments.zoo_table_page import (
     ACTIONS,
     BANDITS,
     TARGETS,
-    cell,
-    environment_rank,
     facts,
     figure,
     pairs,
     place,
+    rank,
 )
 from scb.agents.spec import AgentSpec, algorithms_for, bandit_agent
 from scb.discovery import check_fits, judge
@@ -66,16 +66,36 @@ class Candidate:
 
 
 @dataclass(frozen=True)
-class Protocol:
-    """How bandits are measured; `episodes` are classic control's, the others' are `brax_episodes`."""
+class Options:
+    """What is measured, and how."""
 
+    published: Path | None = None
+    """folder with the published bandits' .npz files"""
+    bandits: tuple[str, ...] = ()
+    """zoo names or path.npz; the zoo and all published if left out"""
     agents: int = 20
     episodes: int = 50
+    """of each agent in classic control"""
     brax_episodes: int = 5
+    """of each agent in Brax"""
     backend: str = "generalized"
+    """Brax's physics"""
+    skip_brax: bool = False
 
-    def __post_init__(self) -> None:
-        at_least(1, self, "agents", "episodes", "brax_episodes")
+
+def command_text(options: Options) -> str:
+    """The command, with no path of this machine in it."""
+    parts = ["python -m experiments.zoo_table"]
+    if options.published is not None:
+        parts.append("--published DIRECTORY")
+    if options.bandits:
+        parts.append(f"--bandits {' '.join(Path(name).name for name in options.bandits)}")
+    parts.append(f"--agents {options.agents} --episodes {options.episodes}")
+    if options.skip_brax:
+        parts.append("--skip-brax")
+    else:
+        parts.append(f"--brax-episodes {options.brax_episodes} --backend {options.backend}")
+    return " ".join(parts)
 
 
 def candidates(
@@ -121,7 +141,7 @@ def candidates(
     found = [x for x in found if not (skip_brax and environment_spec(x.environment).backends)]
     if not found:
         raise UserError("there is no bandit to measure: name some, or give --published.")
-    return sorted(found, key=lambda x: (environment_rank(x.environment), BANDITS.index(x.kind)))
+    return sorted(found, key=lambda x: (rank(x.environment), BANDITS.index(x.kind)))
 
 
 def arrays_digest(path: Path) -> str:
@@ -136,7 +156,7 @@ def arrays_digest(path: Path) -> str:
 
 
 def measure_bandits(
-    found: Iterable[Candidate], protocol: Protocol, report: dict[str, Any], save: Save
+    found: Iterable[Candidate], options: Options, report: dict[str, Any], save: Save
 ) -> None:
     """Fills `report["entries"]` with every algorithm's returns in every bandit, writing it after each.
 
@@ -148,7 +168,7 @@ def measure_bandits(
     bandits: dict[BanditConfig, SyntheticBandit] = {}
     for candidate in found:
         home = environment_spec(candidate.environment)
-        backend = home.physics(protocol.backend)
+        backend = home.physics(options.backend)
         if candidate.environment != environment:
             environment, bandits = candidate.environment, {}
             env, env_params = home.make(backend)
@@ -161,8 +181,8 @@ def measure_bandits(
                 "algorithm": algorithm,
                 "bandit": candidate.kind,
                 "sha256": candidate.sha256,
-                "agents": protocol.agents,
-                "episodes": protocol.brax_episodes if home.backends else protocol.episodes,
+                "agents": options.agents,
+                "episodes": options.brax_episodes if home.backends else options.episodes,
                 "seed": REPORTING.start,
                 "backend": backend,
                 "training_steps": spec.steps,
@@ -187,7 +207,7 @@ def measure_bandits(
             entries.sort(key=place)
             report["differences"] = differences(entries)
             save()
-            both = ", ".join(f"{ACTIONS[a]} {cell(row[a]['iqm'])}" for a in returns)
+            both = ", ".join(f"{ACTIONS[a]} {digits(row[a]['iqm'])}" for a in returns)
             print(f"{environment} | {candidate.kind} | {algorithm} | {both}", flush=True)
     report["differences"] = differences(entries)
     save()
@@ -233,54 +253,21 @@ def differences(entries: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     return rows
 
 
-def command_text(options: "Options") -> str:
-    """The command, with no path of this machine in it."""
-    parts = ["python -m experiments.zoo_table"]
-    if options.published is not None:
-        parts.append("--published DIRECTORY")
-    if options.bandits:
-        parts.append(f"--bandits {' '.join(Path(name).name for name in options.bandits)}")
-    parts.append(f"--agents {options.agents} --episodes {options.episodes}")
-    if options.skip_brax:
-        parts.append("--skip-brax")
-    else:
-        parts.append(f"--brax-episodes {options.brax_episodes} --backend {options.backend}")
-    return " ".join(parts)
-
-
-@dataclass(frozen=True)
-class Options:
-    """What is measured, and how."""
-
-    published: Path | None = None
-    """folder with the published bandits' .npz files"""
-    bandits: tuple[str, ...] = ()
-    """zoo names or path.npz; the zoo and all published if left out"""
-    agents: int = 20
-    episodes: int = 50
-    """of each agent in classic control"""
-    brax_episodes: int = 5
-    """of each agent in Brax"""
-    backend: str = "generalized"
-    """Brax's physics"""
-    skip_brax: bool = False
-
-
 def measure(options: Options, report: dict[str, Any], save: Save) -> None:
     """All bandits. Entries that are there already stay, so several commands may have made them."""
+    at_least(1, options, "agents", "episodes", "brax_episodes")
     commands = dict.fromkeys([*report.get("commands", []), command_text(options)])
     report |= {"commands": list(commands), "targets": TARGETS}
-    protocol = Protocol(options.agents, options.episodes, options.brax_episodes, options.backend)
     found = candidates(options.bandits or None, options.published, options.skip_brax)
-    measure_bandits(found, protocol, report, save)
+    measure_bandits(found, options, report, save)
 
 
 EXPERIMENT = Experiment(
-    name="zoo_table",
-    title="The bandits, by environment and algorithm",
-    measure=measure,
-    draw=figure,
+    "zoo_table",
+    "The bandits, by environment and algorithm",
+    measure,
     facts=facts,
+    draw=figure,
     options=Options,
 )
 

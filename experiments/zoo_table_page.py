@@ -1,18 +1,16 @@
 """The page and the figure of `experiments.zoo_table`, and what the paper states beside it."""
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
 from scb import plotting
 from scb.agents.spec import ALGORITHMS
 from scb.environments.registry import environment_spec
 from scb.errors import UserError
-from scb.statistics import Estimate
 
 ACTIONS = {"mode_actions": "most likely actions", "sampled_actions": "sampled actions"}
 BANDITS = ("ours", "published")
@@ -71,129 +69,56 @@ def label(entry: Mapping[str, Any]) -> str:
     return f"{entry['environment']} ({physics})" if physics else entry["environment"]
 
 
-def environment_rank(name: str) -> tuple[int, str]:
-    return (ENVIRONMENTS.index(name) if name in ENVIRONMENTS else len(ENVIRONMENTS), name)
-
-
-def algorithm_rank(name: str) -> tuple[int, str]:
-    """In the registry's order, and what it doesn't hold (any more) after that."""
-    names = list(ALGORITHMS)
-    return (names.index(name) if name in names else len(names), name)
+def rank(name: str, known: Sequence[str] = ENVIRONMENTS) -> tuple[int, str]:
+    """The place of an environment in this order; what it doesn't hold (any more) comes last."""
+    return (known.index(name) if name in known else len(known), name)
 
 
 def place(entry: Mapping[str, Any]) -> tuple[Any, ...]:
+    """An entry's place in the table: by environment, physics, bandit and algorithm."""
     return (
-        environment_rank(entry["environment"]),
+        rank(entry["environment"]),
         entry["backend"] or "",
         BANDITS.index(entry["bandit"]),
-        algorithm_rank(entry["algorithm"]),
+        rank(entry["algorithm"], list(ALGORITHMS)),
     )
 
 
 def facts(report: Mapping[str, Any]) -> dict[str, Any]:
     """The table's rows, and what must be said of its entries."""
     entries = report["entries"]
-    rows = []
-    for (name, algorithm), pair in pairs(entries).items():
-        entry = next(iter(pair.values()))
-        environment = entry["environment"]
-        # What the paper states is of the generalized physics.
-        stated = PAPER if entry["backend"] in (None, "generalized") else {}
-        paper = stated.get(environment, {}).get(algorithm)
-        rows.append(
-            [
-                name,
-                algorithm.upper(),
-                *(
-                    cell(pair[kind][actions]["iqm"]) if kind in pair else ""
-                    for kind in BANDITS
-                    for actions in ACTIONS
-                ),
-                "" if paper is None else _number(paper),
-                _target_cell(environment, pair.get("ours")),
-            ]
-        )
-    failed = [
-        f"{entry['algorithm'].upper()} on {label(entry)} ({entry['bandit']}, {ACTIONS[actions]}): "
-        f"{entry[actions]['failed']} of {entry['agents']}"
-        for entry in entries
-        for actions in ACTIONS
-        if entry[actions]["failed"]
-    ]
-    differences = [
-        [row["environment"], row["algorithm"].upper()]
-        + [cell(row.get(actions), signed=True) for actions in ACTIONS]
-        for row in report["differences"]
-    ]
-    kinds = {entry["bandit"] for entry in entries}
-    moved = any(
-        x["bandit"] == "published" and x["backend"] not in (None, "generalized") for x in entries
-    )
+    published = [x["backend"] for x in entries if x["bandit"] == "published"]
     return {
-        "protocol": _protocol_text(entries),
-        "rows": rows,
-        "failed": failed,
-        "against": differences,
-        "published": "published" in kinds,
-        "moved": moved,
+        "pairs": pairs(entries),
+        "actions": ACTIONS,
+        "bandits": BANDITS,
+        "paper": _paper,
+        "target": _target,
+        "failed": [
+            f"{x['algorithm'].upper()} on {label(x)} ({x['bandit']}, {text}): {x[actions]['failed']} of {x['agents']}"
+            for x in entries
+            for actions, text in ACTIONS.items()
+            if x[actions]["failed"]
+        ],
+        "published": bool(published),
+        "moved": any(x not in (None, "generalized") for x in published),
     }
 
 
-def _protocol_text(entries: Sequence[Mapping[str, Any]]) -> str:
-    """The protocol as the entries have it, in one sentence or two."""
-
-    def values(field: str, among: Iterable[Mapping[str, Any]]) -> str:
-        return " or ".join(f"{x:,}".replace(",", " ") for x in sorted({e[field] for e in among}))
-
-    brax = [entry for entry in entries if entry["backend"] is not None]
-    classic = [entry for entry in entries if entry["backend"] is None]
-    text = (
-        f"{values('agents', entries)} agents, trained for {values('training_steps', entries)} steps in the bandit; "
-        f"reporting seed {values('seed', entries)}."
-    )
-    if classic:
-        text += (
-            " Classic control: hyperparameters drawn from the paper's lists, "
-            f"{values('episodes', classic)} episodes an agent."
-        )
-    if brax:
-        physics = " or ".join(sorted({entry["backend"] for entry in brax}))
-        text += (
-            f" Brax ({physics} physics): the paper's fixed hyperparameters, "
-            f"{values('episodes', brax)} episodes an agent."
-        )
-    return text
+def _paper(pair: Mapping[str, Mapping[str, Any]]) -> float | None:
+    """What the paper states of its bandit, which is of the generalized physics."""
+    entry = next(iter(pair.values()))
+    stated = PAPER if entry["backend"] in (None, "generalized") else {}
+    return stated.get(entry["environment"], {}).get(entry["algorithm"])
 
 
-def cell(interval: Mapping[str, Any] | None, signed: bool = False) -> str:
-    """An estimate as the documentation writes it: −194.2 [−262.8, −167.9]."""
-    if interval is None:
-        return "none"
-    text = str(Estimate(**interval)).rsplit(" (n=", 1)[0].replace("-", "−")
-    return f"+{text}" if signed and interval["value"] > 0 else text
-
-
-def _number(x: float) -> str:
-    return f"{x:g}".replace("-", "−")
-
-
-def reached(environment: str, entry: Mapping[str, Any]) -> dict[str, bool]:
-    """{actions: whether the interquartile mean is at the environment's target or above}."""
-    iqms = {actions: entry[actions]["iqm"] for actions in ACTIONS}
-    return {
-        actions: iqm is not None and iqm["value"] >= TARGETS[environment]
-        for actions, iqm in iqms.items()
-    }
-
-
-def _target_cell(environment: str, ours: Mapping[str, Any] | None) -> str:
-    if environment not in TARGETS:
-        return ""
-    target = _number(TARGETS[environment])
-    if ours is None:
-        return target
-    answers = ["yes" if answer else "no" for answer in reached(environment, ours).values()]
-    return f"{target}: {' / '.join(answers)}"
+def _target(pair: Mapping[str, Mapping[str, Any]]) -> tuple[float | None, list[str]]:
+    """The target of a pair's environment, and by kind of actions whether ours reaches it."""
+    target = TARGETS.get(next(iter(pair.values()))["environment"])
+    if target is None or "ours" not in pair:
+        return target, []
+    iqms = (pair["ours"][actions]["iqm"] for actions in ACTIONS)
+    return target, ["yes" if iqm and iqm["value"] >= target else "no" for iqm in iqms]
 
 
 def figure(report: Mapping[str, Any]) -> Figure:
@@ -203,82 +128,69 @@ def figure(report: Mapping[str, Any]) -> Figure:
         raise UserError("nothing has been measured yet: there is no figure to draw.")
     found = pairs(entries)
     environments = list(dict.fromkeys(environment for environment, _ in found))
-    looks = {"ours": (plotting.VERMILLION, "o"), "published": (plotting.BLUE, "s")}
-    offsets = {
-        (kind, actions): offset
-        for (kind, actions), offset in zip(
-            [(kind, actions) for kind in BANDITS for actions in ACTIONS],
-            (-0.3, -0.1, 0.1, 0.3),
-            strict=True,
+    looks = {
+        (kind, actions): {
+            "color": color,
+            "marker": marker,
+            "markerfacecolor": color if actions == "mode_actions" else "white",
+            "markeredgewidth": 1.4,
+        }
+        for kind, color, marker in zip(
+            BANDITS, (plotting.VERMILLION, plotting.BLUE), "os", strict=True
         )
+        for actions in ACTIONS
     }
     columns = min(2, len(environments))
     rows = math.ceil(len(environments) / columns)
-    with plotting.figure_style():
-        drawn = Figure(figsize=(plotting.WIDTH, 2.1 * rows + 1.1))
-        grid = drawn.subplots(rows, columns, squeeze=False).flat
-        for panel, (axes, environment) in enumerate(zip(grid, environments, strict=False)):
-            algorithms = [a for e, a in found if e == environment]
-            for position, algorithm in enumerate(algorithms):
-                if position % 2 == 0:
-                    axes.axhspan(position - 0.5, position + 0.5, color="#F4F4F4", linewidth=0)
-                for (kind, actions), offset in offsets.items():
-                    entry = found[environment, algorithm].get(kind)
-                    if entry is None or entry[actions]["iqm"] is None:
-                        continue
-                    iqm, (color, marker) = entry[actions]["iqm"], looks[kind]
-                    y = position + offset
-                    if iqm["low"] is not None and iqm["high"] is not None:
-                        axes.hlines(y, iqm["low"], iqm["high"], color=color, linewidth=1.6)
-                    axes.plot(
-                        iqm["value"],
-                        y,
-                        color=color,
-                        marker=marker,
-                        markerfacecolor=color if actions == "mode_actions" else "white",
-                        markeredgewidth=1.4,
-                        markersize=6,
-                        linestyle="",
-                    )
-            expert = _paper_expert(environment)
-            if expert is not None:
-                axes.axvline(expert, color=plotting.BLACK, linewidth=1.4, linestyle=":")
-            axes.set_yticks(range(len(algorithms)), [a.upper() for a in algorithms])
-            axes.set_ylim(len(algorithms) - 0.5, -0.5)
-            axes.tick_params(axis="y", length=0)
-            axes.grid(axis="y", visible=False)
-            axes.xaxis.set_major_locator(MaxNLocator(5, steps=[1, 2, 2.5, 5, 10]))
-            axes.margins(x=0.06)
-            axes.set_title(_panel_title(environment, entries))
-            if panel + columns >= len(environments):  # nothing below it
-                axes.set_xlabel("return in the environment")
-        for axes in drawn.axes[len(environments) :]:
-            axes.remove()
-        kinds = [kind for kind in BANDITS if any(e["bandit"] == kind for e in entries)]
-        handles = [
-            Line2D(
-                [],
-                [],
-                color=looks[kind][0],
-                marker=looks[kind][1],
-                markerfacecolor=looks[kind][0] if actions == "mode_actions" else "white",
-                markeredgewidth=1.4,
-                linewidth=1.6,
-            )
-            for kind in kinds
-            for actions in ACTIONS
-        ]
-        names = [f"{kind}, {text}" for kind in kinds for text in ACTIONS.values()]
-        if any(_paper_expert(environment) is not None for environment in environments):
-            handles.append(Line2D([], [], color=plotting.BLACK, linewidth=1.4, linestyle=":"))
-            names.append("SAC trained on the environment (paper)")
-        agents = " or ".join(str(n) for n in sorted({entry["agents"] for entry in entries}))
-        plotting.figure_title(
-            drawn,
-            f"Agents trained in a bandit, in its environment: IQM of {agents} agents, 95 % intervals",
-        )
-        plotting.legend_below(drawn, (handles, names), columns=3)
+    drawn = Figure(figsize=(plotting.WIDTH, 2.1 * rows + 1.1))
+    grid = drawn.subplots(rows, columns, squeeze=False).flat
+    for panel, (axes, environment) in enumerate(zip(grid, environments, strict=False)):
+        algorithms = [a for e, a in found if e == environment]
+        for position, algorithm in enumerate(algorithms):
+            if position % 2 == 0:
+                axes.axhspan(position - 0.5, position + 0.5, color="#F4F4F4", linewidth=0)
+            for ((kind, actions), look), offset in zip(
+                looks.items(), (-0.3, -0.1, 0.1, 0.3), strict=True
+            ):
+                iqm = found[environment, algorithm].get(kind, {}).get(actions, {}).get("iqm")
+                if iqm is None:
+                    continue
+                y = position + offset
+                if iqm["low"] is not None and iqm["high"] is not None:
+                    axes.hlines(y, iqm["low"], iqm["high"], color=look["color"], linewidth=1.6)
+                axes.plot(iqm["value"], y, **look, markersize=6, linestyle="")
+        expert = _paper_expert(environment)
+        if expert is not None:
+            axes.axvline(expert, **_EXPERT)
+        axes.set_yticks(range(len(algorithms)), [a.upper() for a in algorithms])
+        axes.set_ylim(len(algorithms) - 0.5, -0.5)
+        axes.tick_params(axis="y", length=0)
+        axes.grid(axis="y", visible=False)
+        axes.xaxis.set_major_locator(MaxNLocator(5, steps=[1, 2, 2.5, 5, 10]))
+        axes.margins(x=0.06)
+        axes.set_title(_panel_title(environment, entries))
+        if panel + columns >= len(environments):  # nothing below it
+            axes.set_xlabel("return in the environment")
+    for axes in drawn.axes[len(environments) :]:
+        axes.remove()
+    measured = {entry["bandit"] for entry in entries}
+    shown = {
+        f"{kind}, {ACTIONS[actions]}": {**look, "linewidth": 1.6}
+        for (kind, actions), look in looks.items()
+        if kind in measured
+    }
+    if any(_paper_expert(environment) is not None for environment in environments):
+        shown["SAC trained on the environment (paper)"] = _EXPERT
+    agents = " or ".join(str(n) for n in sorted({entry["agents"] for entry in entries}))
+    plotting.figure_title(
+        drawn,
+        f"Agents trained in a bandit, in its environment: IQM of {agents} agents, 95 % intervals",
+    )
+    plotting.legend_of(drawn, shown, columns=3)
     return drawn
+
+
+_EXPERT: dict[str, Any] = {"color": plotting.BLACK, "linewidth": 1.4, "linestyle": ":"}
 
 
 def _paper_expert(name: str) -> float | None:

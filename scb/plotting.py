@@ -15,6 +15,7 @@ import matplotlib.style
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from numpy.typing import ArrayLike, NDArray
 
 from scb.statistics import Estimate, Statistic, estimate
@@ -113,11 +114,12 @@ def estimate_curve(
     color: str,
     linestyle: Any = "-",
     label: str | None = None,
+    marker: str = "",
 ) -> None:
     """A line through estimates, their intervals a band."""
     middle = np.array([e.value for e in found])
     below, above = error_bar(*found)
-    axes.plot(x, middle, color=color, linestyle=linestyle, label=label)
+    axes.plot(x, middle, color=color, linestyle=linestyle, label=label, marker=marker)
     axes.fill_between(x, middle - below, middle + above, color=color, alpha=0.15, linewidth=0)
 
 
@@ -137,6 +139,12 @@ def figure_title(figure: Figure, text: str) -> None:
 def legend_below(figure: Figure, entries: tuple[list[Any], list[Any]], columns: int) -> None:
     """One legend for the whole figure, outside the axes, where it can cover no data."""
     figure.legend(*entries, loc="outside lower center", ncols=columns, columnspacing=1.5)
+
+
+def legend_of(figure: Figure, looks: Mapping[str, Mapping[str, Any]], columns: int) -> None:
+    """`legend_below` of lines, given by label as what `Line2D` takes."""
+    handles = [Line2D([], [], **look) for look in looks.values()]
+    legend_below(figure, (handles, list(looks)), columns)
 
 
 def save(figure: Figure, path: str | Path, dpi: int = DPI) -> Path:

@@ -159,7 +159,7 @@ def test_the_figure_has_a_row_an_environment_and_a_line_a_run(tmp_path):
         run_folder(tmp_path / "c", "random", environment="CartPole-v1"),
     ]
     report = discovery_cost.collect(folders)
-    drawn = discovery_cost.figure(report)
+    drawn = discovery_cost.EXPERIMENT.figures(report)["discovery_cost"]
     cartpole, _, minutes, steps = drawn.axes
     assert cartpole.get_title(loc="left") == "CartPole-v1"
     assert len(cartpole.lines) == 2  # one run, the target

@@ -17,6 +17,7 @@ from experiments.generality import (
     WIDE,
     ZOO,
 )
+from experiments.harness import CLASSIC_CONTROL
 from scb.neuroevolution import NeuroevolutionConfig
 
 TINY = {
@@ -136,7 +137,7 @@ def test_agents_from_a_search(tmp_path, monkeypatch, small_agents):
 @pytest.mark.parametrize("preset", ["quick", "paper"])
 def test_presets_make_configurations(preset):
     plan = generality.EXPERIMENT.presets[preset]
-    assert plan["environments"] == list(generality.CLASSIC_CONTROL)
+    assert plan["environments"] == list(CLASSIC_CONTROL)
     generality.config_of("Pendulum-v1", DRAWN, plan)
 
 

@@ -193,9 +193,9 @@ def test_a_report_of_other_searches_is_refused(tiny, tmp_path):
 
 
 def test_the_settings_of_every_preset_are_those_of_the_command():
-    for preset in module.PRESETS.values():
+    for preset in module.EXPERIMENT.presets.values():
         for search in preset["searches"].values():
             config = meta_training(search["settings"]).config
             assert config.validation
             assert config.evolution.num_generations == search["settings"]["generations"]
-    assert module.PRESETS["paper"]["hopper"]["steps"] == 5_242_880
+    assert module.EXPERIMENT.presets["paper"]["hopper"]["steps"] == 5_242_880

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from experiments import searches
+from experiments import ablations, episode_lengths, generality, searches
 from experiments.claims import Claim, judge
 from scb import plotting
 from scb.commands import Discover
@@ -35,14 +35,21 @@ def test_a_search_that_has_ended_is_read_and_not_run_again(tmp_path, small_agent
     assert found["failed"] == [0.0, 0.0, 0.0]
 
 
-def test_the_papers_sizes_are_those_of_its_preset():
-    for name, size in searches.PAPER_SIZES.items():
+@pytest.mark.parametrize(
+    ("experiment", "part"),
+    [(ablations, "environments"), (episode_lengths, "sizes"), (generality, "sizes")],
+)
+def test_searches_of_the_papers_size_are_those_of_its_preset(experiment, part):
+    for name, size in experiment.EXPERIMENT.presets["paper"][part].items():
         paper = Discover.presets["paper"]({"environment": name})
-        assert size == {
-            "generations": paper.evolution.num_generations,
-            "population_size": paper.evolution.population_size,
-            "agents_per_candidate": paper.agents_per_candidate,
-        }
+        assert (
+            size.items()
+            >= {
+                "generations": paper.evolution.num_generations,
+                "population_size": paper.evolution.population_size,
+                "agents_per_candidate": paper.agents_per_candidate,
+            }.items()
+        )
 
 
 def test_the_last_judgement_is_over_searches_that_have_one():

@@ -107,7 +107,7 @@ def test_the_page_says_how_many_episodes_and_which_physics():
 
 def test_the_figure_draws_what_the_table_says():
     hopper = entry("hopper", "ppo", "ours", [1, 2, 3], [1, 2, 3], episodes=5, backend="generalized")
-    drawn = zoo_table_page.figure(report(*PENDULUM["entries"], hopper))
+    drawn = zoo_table.EXPERIMENT.figures(report(*PENDULUM["entries"], hopper))["zoo_table"]
     pendulum, brax = drawn.axes
     assert brax.get_title(loc="left") == "hopper (generalized, 5 episodes)"
     points = {line.get_xdata()[0]: line for line in pendulum.lines if line.get_marker() in "os"}
@@ -305,7 +305,10 @@ def test_a_bandit_stands_in_the_table_once_for_every_physics():
     ]
     # What the paper states is of the generalized physics.
     assert "853.5" in rows[0] and "853.5" not in rows[1]
-    titles = [axes.get_title(loc="left") for axes in zoo_table_page.figure(report(*both)).axes]
+    titles = [
+        axes.get_title(loc="left")
+        for axes in zoo_table.EXPERIMENT.figures(report(*both))["zoo_table"].axes
+    ]
     assert titles == ["hopper (generalized, 5 episodes)", "hopper (spring, 5 episodes)"]
     assert [row["environment"] for row in zoo_table.differences(both)] == [
         "hopper (generalized)",
