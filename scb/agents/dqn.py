@@ -1,22 +1,21 @@
 """Deep Q-learning (Mnih et al., 2015) and double Q-learning (van Hasselt et al., 2015), one traced flag apart."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-import optax
 from flax import struct
 from jax.typing import ArrayLike
 
 from scb.agents import networks
-from scb.agents.agent import Algorithm, clipped_adam
+from scb.agents.agent import Algorithm
 from scb.agents.off_policy import (
+    Learner,
     OffPolicyAgent,
     OffPolicyConfig,
     Transition,
-    gradient_update,
     require_discrete,
     target_values,
 )
@@ -55,35 +54,25 @@ class DQNHyperparameters:
     max_grad_norm: ArrayLike = 10.0
 
 
-@struct.dataclass
-class DQNLearner:
-    params: Any
-    target: Any  # None in one-step environments
-    optimizer: optax.OptState
-
-
 @dataclass(frozen=True, eq=False)
 class DQN(OffPolicyAgent):
     """Deep Q-learning with epsilon-greedy exploration; evaluated greedily."""
 
     config: DQNConfig
+    with_targets = ("q",)
 
     def _network(self, env_params: Any) -> Any:
         space = self.env.action_space(env_params)
         require_discrete("dqn", space, True)
         return networks.QNetwork(space.n, self.config.hidden_sizes, self.config.activation)
 
-    def init_learner(
-        self, key: jax.Array, hyperparameters: DQNHyperparameters, env_params: Any
-    ) -> DQNLearner:
+    def init_params(self, key: jax.Array, env_params: Any) -> dict[str, Any]:
         observation = jnp.zeros(self.observation_size(env_params))
-        params = self._network(env_params).init(key, observation)
-        optimizer = clipped_adam(hyperparameters).init(params)
-        return DQNLearner(params, None if self.one_step else params, optimizer)
+        return {"q": self._network(env_params).init(key, observation)}
 
     def explore(
         self,
-        learner: DQNLearner,
+        learner: Learner,
         hyperparameters: DQNHyperparameters,
         observation: jax.Array,
         key: jax.Array,
@@ -95,36 +84,38 @@ class DQN(OffPolicyAgent):
         done = jnp.clip(progress / hyperparameters.epsilon_decay, 0.0, 1.0)
         start = jnp.asarray(hyperparameters.epsilon_start)
         end = jnp.asarray(hyperparameters.epsilon_end)
-        q = self._network(env_params).apply(learner.params, observation)
+        q = self._network(env_params).apply(learner.params["q"], observation)
         random = jax.random.randint(key_random, (number,), 0, q.shape[-1])
         explores = jax.random.uniform(key_coin, (number,)) < start + (end - start) * done
         return jnp.where(explores, random, jnp.argmax(q, axis=-1))
 
     def greedy(
         self,
-        learner: DQNLearner,
+        learner: Learner,
         observation: jax.Array,
         key: jax.Array,
         env_params: Any,
         mode: bool,
     ) -> jax.Array:
-        return jnp.argmax(self._network(env_params).apply(learner.params, observation), axis=-1)
+        return jnp.argmax(
+            self._network(env_params).apply(learner.params["q"], observation), axis=-1
+        )
 
     def learn(
         self,
-        learner: DQNLearner,
+        learner: Learner,
         hyperparameters: DQNHyperparameters,
         batch: Transition,
         key: jax.Array,
         step: jax.Array,
         env_params: Any,
-    ) -> DQNLearner:
+    ) -> Learner:
         network = self._network(env_params)
         if self.one_step:
             target = batch.reward
         else:
-            judged = network.apply(learner.target, batch.next_observation)
-            own = network.apply(learner.params, batch.next_observation)
+            judged = network.apply(learner.targets["q"], batch.next_observation)
+            own = network.apply(learner.params["q"], batch.next_observation)
             pick = jnp.where(jnp.asarray(hyperparameters.double) > 0.5, own, judged)
             best = jax.nn.one_hot(jnp.argmax(pick, axis=-1), pick.shape[-1])
             next_value = jnp.sum(judged * best, axis=-1)
@@ -135,19 +126,16 @@ class DQN(OffPolicyAgent):
             taken = jnp.sum(q * jax.nn.one_hot(batch.action, q.shape[-1]), axis=-1)
             return 0.5 * jnp.mean((taken - target) ** 2)
 
-        gradient = jax.grad(loss)(learner.params)
-        params, optimizer = gradient_update(
-            clipped_adam(hyperparameters), gradient, learner.optimizer, learner.params
-        )
-        return DQNLearner(params, learner.target, optimizer)
+        gradient = jax.grad(loss)(learner.params["q"])
+        return learner.stepped("q", self.optimizer(hyperparameters), gradient)
 
     def update_targets(
-        self, learner: DQNLearner, hyperparameters: DQNHyperparameters, iteration: jax.Array
-    ) -> DQNLearner:
+        self, learner: Learner, hyperparameters: DQNHyperparameters, iteration: jax.Array
+    ) -> Learner:
         every = max(1, self.config.target_update_every // self.config.num_envs)
         copy = (iteration + 1) % every == 0
-        target = jax.tree.map(lambda t, p: jnp.where(copy, p, t), learner.target, learner.params)
-        return DQNLearner(learner.params, target, learner.optimizer)
+        targets = jax.tree.map(lambda t, p: jnp.where(copy, p, t), learner.targets, learner.params)
+        return replace(learner, targets=targets)
 
 
 DQN_ALGORITHM = Algorithm("dqn", DQN, DQNConfig, DQNHyperparameters, actions=("discrete",))

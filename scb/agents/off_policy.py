@@ -7,7 +7,7 @@ bootstrapping (target networks, the next state's action) is left out of their pr
 
 from abc import abstractmethod
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +16,7 @@ from flax import struct
 from gymnax.environments import spaces
 
 from scb.agents import replay
-from scb.agents.agent import Agent, AgentConfig, clip_to_space
+from scb.agents.agent import Agent, AgentConfig, clip_to_space, clipped_adam
 from scb.agents.normalization import RunningStatistics, update_statistics
 from scb.errors import UserError
 from scb.keys import key_at, split_key
@@ -79,10 +79,31 @@ class Transition(NamedTuple):
 
 
 @struct.dataclass
-class OffPolicyState:
-    """An agent: what it learned (networks, targets, optimisers), its buffer, where its environments stand."""
+class Learner:
+    """What an agent learned; `targets` are those of its networks that have one, None in one-step environments."""
 
-    learner: Any
+    params: dict[str, Any]  # {network, or number: what is learned of it}
+    targets: Any
+    optimizer: dict[str, optax.OptState]
+
+    def replaced(self, name: str, params: Any, optimizer_state: Any) -> "Learner":
+        """With other parameters of one network."""
+        params, state = {**self.params, name: params}, {**self.optimizer, name: optimizer_state}
+        return Learner(params, self.targets, state)
+
+    def stepped(
+        self, name: str, optimizer: optax.GradientTransformation, gradient: Any
+    ) -> "Learner":
+        """After one step of one network."""
+        state = self.optimizer[name], self.params[name]
+        return self.replaced(name, *gradient_update(optimizer, gradient, *state))
+
+
+@struct.dataclass
+class OffPolicyState:
+    """An agent: what it learned, its buffer, where its environments stand."""
+
+    learner: Learner
     buffer: replay.ReplayBuffer
     statistics: RunningStatistics
     environment: Any  # [N] states and [N, O] observations; None in one-step environments
@@ -95,15 +116,26 @@ class OffPolicyAgent(Agent):
     """The loop; a subclass says how to act and how to learn."""
 
     config: OffPolicyConfig
+    with_targets: ClassVar[tuple[str, ...]]  # what has a target network
 
     @abstractmethod
-    def init_learner(self, key: jax.Array, hyperparameters: Any, env_params: Any) -> Any:
+    def init_params(self, key: jax.Array, env_params: Any) -> dict[str, Any]:
+        """What is learned, by name."""
+
+    def optimizer(self, hyperparameters: Any) -> optax.GradientTransformation:
+        """Of everything that is learned."""
+        return clipped_adam(hyperparameters)
+
+    def init_learner(self, key: jax.Array, hyperparameters: Any, env_params: Any) -> Learner:
         """Networks, target networks and optimisers."""
+        params, optimizer = self.init_params(key, env_params), self.optimizer(hyperparameters)
+        targets = None if self.one_step else {name: params[name] for name in self.with_targets}
+        return Learner(params, targets, {name: optimizer.init(p) for name, p in params.items()})
 
     @abstractmethod
     def explore(
         self,
-        learner: Any,
+        learner: Learner,
         hyperparameters: Any,
         observation: jax.Array,
         key: jax.Array,
@@ -115,22 +147,26 @@ class OffPolicyAgent(Agent):
     @abstractmethod
     def learn(
         self,
-        learner: Any,
+        learner: Learner,
         hyperparameters: Any,
         batch: Transition,
         key: jax.Array,
         step: jax.Array,
         env_params: Any,
-    ) -> Any:
+    ) -> Learner:
         """One gradient step on [B] transitions with normalised observations; `step` counts them."""
 
-    @abstractmethod
-    def update_targets(self, learner: Any, hyperparameters: Any, iteration: jax.Array) -> Any:
+    def update_targets(
+        self, learner: Learner, hyperparameters: Any, iteration: jax.Array
+    ) -> Learner:
         """Moves the target networks, once an iteration; not called in one-step environments."""
+        online = {name: learner.params[name] for name in self.with_targets}
+        targets = polyak_average(learner.targets, online, hyperparameters.polyak)
+        return replace(learner, targets=targets)
 
     @abstractmethod
     def greedy(
-        self, learner: Any, observation: jax.Array, key: jax.Array, env_params: Any, mode: bool
+        self, learner: Learner, observation: jax.Array, key: jax.Array, env_params: Any, mode: bool
     ) -> jax.Array:
         """[O] normalised observation -> the trained agent's action."""
 

@@ -16,12 +16,11 @@ from jax.typing import ArrayLike
 from scb.agents import networks
 from scb.agents.agent import Algorithm, scale_to_space
 from scb.agents.off_policy import (
+    Learner,
     OffPolicyAgent,
     OffPolicyConfig,
     OffPolicyState,
     Transition,
-    gradient_update,
-    polyak_average,
     target_values,
 )
 from scb.keys import split_key
@@ -54,18 +53,12 @@ class SACHyperparameters:
     target_entropy_ratio: ArrayLike = 0.7
 
 
-@struct.dataclass
-class SACLearner:
-    params: dict[str, Any]  # {"policy", "critics" (two, stacked), "log_temperature"}
-    targets: Any  # of the critics; empty in one-step environments
-    optimizer: dict[str, optax.OptState]
-
-
 @dataclass(frozen=True, eq=False)
 class SAC(OffPolicyAgent):
-    """Soft actor-critic with two critics and an adjusted temperature."""
+    """Soft actor-critic with two critics, which are stacked, and an adjusted temperature."""
 
     config: SACConfig
+    with_targets = ("critics",)
 
     def _space(self, env_params: Any) -> tuple[bool, int]:
         space = self.env.action_space(env_params)
@@ -83,29 +76,24 @@ class SAC(OffPolicyAgent):
         policy = networks.SquashedGaussianPolicy(size, *shape)
         return policy, networks.stacked(networks.Critic, 2)(*shape)
 
-    def init_learner(
-        self, key: jax.Array, hyperparameters: SACHyperparameters, env_params: Any
-    ) -> SACLearner:
+    def optimizer(self, hyperparameters: SACHyperparameters) -> optax.GradientTransformation:
+        return optax.adam(hyperparameters.learning_rate)
+
+    def init_params(self, key: jax.Array, env_params: Any) -> dict[str, Any]:
         policy, critics = self._networks(env_params)
         discrete, size = self._space(env_params)
         key_policy, key_critics = split_key(key)
         observation = jnp.zeros(self.observation_size(env_params))
         inputs = (observation,) if discrete else (observation, jnp.zeros(size))
-        params = {
+        return {
             "policy": policy.init(key_policy, observation),
             "critics": critics.init(key_critics, *inputs),
             "log_temperature": jnp.zeros(()),
         }
-        optimizer = optax.adam(hyperparameters.learning_rate)
-        return SACLearner(
-            params=params,
-            targets=None if self.one_step else params["critics"],
-            optimizer={name: optimizer.init(p) for name, p in params.items()},
-        )
 
     def explore(
         self,
-        learner: SACLearner,
+        learner: Learner,
         hyperparameters: SACHyperparameters,
         observation: jax.Array,
         key: jax.Array,
@@ -116,7 +104,7 @@ class SAC(OffPolicyAgent):
 
     def greedy(
         self,
-        learner: SACLearner,
+        learner: Learner,
         observation: jax.Array,
         key: jax.Array,
         env_params: Any,
@@ -158,19 +146,18 @@ class SAC(OffPolicyAgent):
 
     def learn(
         self,
-        learner: SACLearner,
+        learner: Learner,
         hyperparameters: SACHyperparameters,
         batch: Transition,
         key: jax.Array,
         step: jax.Array,
         env_params: Any,
-    ) -> SACLearner:
+    ) -> Learner:
         discrete, size = self._space(env_params)
         policy, critics = self._networks(env_params)
         key_next, key_policy = split_key(key)
-        params, optimizer_state = dict(learner.params), dict(learner.optimizer)
-        optimizer = optax.adam(hyperparameters.learning_rate)
-        temperature = jnp.exp(params["log_temperature"])
+        optimizer = self.optimizer(hyperparameters)
+        temperature = jnp.exp(learner.params["log_temperature"])
 
         def soft_value(
             policy_params: Any, critic_params: Any, observation: jax.Array, key: Any
@@ -190,7 +177,10 @@ class SAC(OffPolicyAgent):
             target = batch.reward
         else:
             next_value, _ = soft_value(
-                params["policy"], learner.targets, batch.next_observation, key_next
+                learner.params["policy"],
+                learner.targets["critics"],
+                batch.next_observation,
+                key_next,
             )
             target = target_values(batch, next_value, hyperparameters.discount)
 
@@ -203,36 +193,24 @@ class SAC(OffPolicyAgent):
                 q = critics.apply(critic_params, batch.observation, action)
             return 0.5 * jnp.sum(jnp.mean((q - target) ** 2, axis=-1))
 
-        gradient = jax.grad(critic_loss)(params["critics"])
-        params["critics"], optimizer_state["critics"] = gradient_update(
-            optimizer, gradient, optimizer_state["critics"], params["critics"]
-        )
+        gradient = jax.grad(critic_loss)(learner.params["critics"])
+        learner = learner.stepped("critics", optimizer, gradient)
 
         def policy_loss(policy_params: Any) -> tuple[jax.Array, jax.Array]:
             value, entropy = soft_value(
-                policy_params, params["critics"], batch.observation, key_policy
+                policy_params, learner.params["critics"], batch.observation, key_policy
             )
             return -jnp.mean(value), jnp.mean(entropy)
 
-        gradient, entropy = jax.grad(policy_loss, has_aux=True)(params["policy"])
-        params["policy"], optimizer_state["policy"] = gradient_update(
-            optimizer, gradient, optimizer_state["policy"], params["policy"]
-        )
+        gradient, entropy = jax.grad(policy_loss, has_aux=True)(learner.params["policy"])
+        learner = learner.stepped("policy", optimizer, gradient)
         target_entropy = (
             hyperparameters.target_entropy_ratio * np.log(size) if discrete else -float(size)
         )
         # The gradient of exp(log_temperature) * (entropy - target).
-        gradient = temperature * (entropy - target_entropy)
-        params["log_temperature"], optimizer_state["log_temperature"] = gradient_update(
-            optimizer, gradient, optimizer_state["log_temperature"], params["log_temperature"]
+        return learner.stepped(
+            "log_temperature", optimizer, temperature * (entropy - target_entropy)
         )
-        return SACLearner(params, learner.targets, optimizer_state)
-
-    def update_targets(
-        self, learner: SACLearner, hyperparameters: SACHyperparameters, iteration: jax.Array
-    ) -> SACLearner:
-        targets = polyak_average(learner.targets, learner.params["critics"], hyperparameters.polyak)
-        return SACLearner(learner.params, targets, learner.optimizer)
 
 
 def _sample(key: jax.Array, mean: jax.Array, std: jax.Array) -> tuple[jax.Array, jax.Array]:

@@ -7,18 +7,17 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 from flax import struct
 from jax.typing import ArrayLike
 
 from scb.agents import networks
-from scb.agents.agent import Algorithm, clipped_adam, scale_to_space
+from scb.agents.agent import Algorithm, scale_to_space
 from scb.agents.off_policy import (
+    Learner,
     OffPolicyAgent,
     OffPolicyConfig,
     Transition,
     gradient_update,
-    polyak_average,
     require_discrete,
     target_values,
 )
@@ -63,18 +62,12 @@ class TD3Hyperparameters:
     max_grad_norm: ArrayLike = 10.0
 
 
-@struct.dataclass
-class TD3Learner:
-    params: dict[str, Any]  # {"policy", "critics" (stacked)}
-    targets: dict[str, Any] | None  # the same; None in one-step environments
-    optimizer: dict[str, optax.OptState]
-
-
 @dataclass(frozen=True, eq=False)
 class TD3(OffPolicyAgent):
     """Deterministic policy gradients with clipped double Q-learning, target smoothing and delayed updates."""
 
     config: TD3Config
+    with_targets = ("policy", "critics")
 
     def _networks(self, env_params: Any) -> tuple[Any, Any]:
         space = self.env.action_space(env_params)
@@ -86,26 +79,18 @@ class TD3(OffPolicyAgent):
         critics = networks.stacked(networks.Critic, number)(*shape)
         return networks.DeterministicPolicy(int(np.prod(space.shape)), *shape), critics
 
-    def init_learner(
-        self, key: jax.Array, hyperparameters: TD3Hyperparameters, env_params: Any
-    ) -> TD3Learner:
+    def init_params(self, key: jax.Array, env_params: Any) -> dict[str, Any]:
         policy, critics = self._networks(env_params)
         key_policy, key_critics = split_key(key)
         observation = jnp.zeros(self.observation_size(env_params))
-        params = {
+        return {
             "policy": policy.init(key_policy, observation),
             "critics": critics.init(key_critics, observation, jnp.zeros(policy.action_size)),
         }
-        optimizer = clipped_adam(hyperparameters)
-        return TD3Learner(
-            params=params,
-            targets=None if self.one_step else params,
-            optimizer={name: optimizer.init(p) for name, p in params.items()},
-        )
 
     def explore(
         self,
-        learner: TD3Learner,
+        learner: Learner,
         hyperparameters: TD3Hyperparameters,
         observation: jax.Array,
         key: jax.Array,
@@ -121,7 +106,7 @@ class TD3(OffPolicyAgent):
 
     def greedy(
         self,
-        learner: TD3Learner,
+        learner: Learner,
         observation: jax.Array,
         key: jax.Array,
         env_params: Any,
@@ -133,22 +118,20 @@ class TD3(OffPolicyAgent):
 
     def learn(
         self,
-        learner: TD3Learner,
+        learner: Learner,
         hyperparameters: TD3Hyperparameters,
         batch: Transition,
         key: jax.Array,
         step: jax.Array,
         env_params: Any,
-    ) -> TD3Learner:
+    ) -> Learner:
         policy, critics = self._networks(env_params)
         space = self.env.action_space(env_params)
-        params, optimizer_state = dict(learner.params), dict(learner.optimizer)
-        optimizer = clipped_adam(hyperparameters)
+        optimizer = self.optimizer(hyperparameters)
         action = jnp.reshape(batch.action, (-1, policy.action_size))
         if self.one_step:
             target = batch.reward
         else:
-            assert learner.targets is not None
             squashed = policy.apply(learner.targets["policy"], batch.next_observation)
             limit = jnp.asarray(hyperparameters.target_noise_clip)
             noise = hyperparameters.target_noise * jax.random.normal(key, squashed.shape)
@@ -161,35 +144,26 @@ class TD3(OffPolicyAgent):
             q = critics.apply(critic_params, batch.observation, action)
             return 0.5 * jnp.sum(jnp.mean((q - target) ** 2, axis=-1))
 
-        gradient = jax.grad(critic_loss)(params["critics"])
-        params["critics"], optimizer_state["critics"] = gradient_update(
-            optimizer, gradient, optimizer_state["critics"], params["critics"]
-        )
+        gradient = jax.grad(critic_loss)(learner.params["critics"])
+        learner = learner.stepped("critics", optimizer, gradient)
 
         def policy_loss(policy_params: Any) -> jax.Array:
             chosen = scale_to_space(policy.apply(policy_params, batch.observation), space)
-            return -jnp.mean(critics.apply(params["critics"], batch.observation, chosen)[0])
+            return -jnp.mean(critics.apply(learner.params["critics"], batch.observation, chosen)[0])
 
         def update_policy(carry: tuple[Any, Any]) -> tuple[Any, Any]:
             policy_params, state = carry
             gradient = jax.grad(policy_loss)(policy_params)
             return gradient_update(optimizer, gradient, state, policy_params)
 
-        carry = (params["policy"], optimizer_state["policy"])
+        carry = (learner.params["policy"], learner.optimizer["policy"])
         if self.config.policy_delay == 1:
             carry = update_policy(carry)
         else:
             # `step` is no member of a vmapped population: this stays a branch, and skips the work.
             due = step % self.config.policy_delay == self.config.policy_delay - 1
             carry = jax.lax.cond(due, update_policy, lambda carry: carry, carry)
-        params["policy"], optimizer_state["policy"] = carry
-        return TD3Learner(params, learner.targets, optimizer_state)
-
-    def update_targets(
-        self, learner: TD3Learner, hyperparameters: TD3Hyperparameters, iteration: jax.Array
-    ) -> TD3Learner:
-        targets = polyak_average(learner.targets, learner.params, hyperparameters.polyak)
-        return TD3Learner(learner.params, targets, learner.optimizer)
+        return learner.replaced("policy", *carry)
 
 
 TD3_ALGORITHM = Algorithm("td3", TD3, TD3Config, TD3Hyperparameters, actions=("continuous",))

@@ -179,11 +179,11 @@ def test_double_q_learning_picks_by_the_network_and_judges_by_the_target(
     _, learner, *_ = linear(name)
     learner = replace(
         learner,
-        params=constant(learner.params, [1.0, 2.0]),
-        target=constant(learner.target, [5.0, 3.0]),
+        params={"q": constant(learner.params["q"], [1.0, 2.0])},
+        targets={"q": constant(learner.targets["q"], [5.0, 3.0])},
     )
     after = learn_once(name, learner, one_transition(0, terminated), max_grad_norm=1e9)
-    np.testing.assert_allclose(gradient(after.optimizer), [expected, 0.0], atol=1e-5)
+    np.testing.assert_allclose(gradient(after.optimizer["q"]), [expected, 0.0], atol=1e-5)
 
 
 def critics_by_hand(name):
@@ -241,7 +241,7 @@ def test_discrete_sac_bootstraps_from_the_expected_soft_value():
         "critics": constant(learner.params["critics"], 0.0),
         "log_temperature": np.log(np.float32(2.0)),
     }
-    targets = constant(learner.targets, [[4.0, 2.0], [3.0, 5.0]])
+    targets = {"critics": constant(learner.targets["critics"], [[4.0, 2.0], [3.0, 5.0]])}
     learner = replace(learner, params=params, targets=targets)
     for terminated, expected in ((0.0, -2.9373), (1.0, -1.0)):
         after = learn_once("discrete sac", learner, one_transition(0, terminated))
@@ -267,7 +267,7 @@ def test_continuous_sac_bootstraps_from_the_smaller_critic_and_the_entropy():
         "critics": constant(learner.params["critics"], 0.0),
         "log_temperature": np.log(np.float32(2.0)),
     }
-    targets = constant(learner.targets, [[5.0], [3.0]])
+    targets = {"critics": constant(learner.targets["critics"], [[5.0], [3.0]])}
     learner = replace(learner, params=params, targets=targets)
     after = learn_once("continuous sac", learner, one_transition([0.0], 0.0, size=4096))
     found = gradient(after.optimizer["critics"])
@@ -296,7 +296,7 @@ def test_dqns_target_is_copied_every_so_many_environment_steps():
     for iteration in range(6):
         params = jax.tree.map(lambda x: np.asarray(x) + 1, learner.params)
         learner = update(replace(learner, params=params), h, iteration)
-        copied.append(np.array_equal(flat(learner.target), flat(learner.params)))
+        copied.append(np.array_equal(flat(learner.targets), flat(learner.params)))
     assert copied == [False, False, True, False, False, True]
 
 
@@ -419,7 +419,7 @@ def test_epsilon_falls_linearly_over_its_fraction_of_the_training():
     # From 1 to 0.2 over half the training: 0.6 after a quarter. Half of the random actions of two
     # are the greedy one: 0.5, 0.3 and 0.1 are not. The error of a share of 4000 is 0.008.
     agent, learner, _, explore = linear("dqn")
-    learner = replace(learner, params=constant(learner.params, [1.0, 0.0]))
+    learner = replace(learner, params={"q": constant(learner.params["q"], [1.0, 0.0])})
     h = DQNHyperparameters(epsilon_start=1.0, epsilon_end=0.2, epsilon_decay=0.5)
     for progress, expected in ((0.0, 0.5), (0.25, 0.3), (0.5, 0.1), (1.0, 0.1)):
         actions = explore(
@@ -543,7 +543,7 @@ def q_values(agent, learner, params):
     """[critics, cells, actions]."""
     cells = np.eye(3)
     if isinstance(agent, DQN):
-        return agent._network(params).apply(learner.params, cells)[None]
+        return agent._network(params).apply(learner.params["q"], cells)[None]
     _, critics = agent._networks(params)
     if isinstance(agent.env.action_space(params), spaces.Discrete):
         return critics.apply(learner.params["critics"], cells)
@@ -855,7 +855,7 @@ def test_training_normalises_what_it_learns_from():
     h = CASES["dqn"].hyperparameters
     start = jax.jit(agent.init)(jax.random.key(0), h, params)
     end = jax.jit(agent.train_iterations, static_argnums=3)(start, h, params, 5)
-    before, after = (s.learner.params["params"]["MLP_0"]["Dense_0"] for s in (start, end))
+    before, after = (s.learner.params["q"]["params"]["MLP_0"]["Dense_0"] for s in (start, end))
     np.testing.assert_allclose(after["kernel"][0], before["kernel"][0], atol=1e-6)
     assert np.abs(after["bias"] - before["bias"]).max() > 1e-3
 
