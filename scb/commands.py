@@ -13,21 +13,11 @@ from rich.table import Column, Table
 from scb.agents.spec import algorithms_for, bandit_agent
 from scb.command_line import LongRun, Output
 from scb.console import console
-from scb.discovery import (
-    BanditDiscovery,
-    DiscoveryConfig,
-    check_fits,
-    judge,
-)
+from scb.discovery import BanditDiscovery, DiscoveryConfig, check_fits, judge
 from scb.environments.registry import environment_spec
 from scb.environments.synthetic import SyntheticBandit, Weights
 from scb.environments.synthetic_mdp import SyntheticMDP
-from scb.environments.zoo import (
-    bandit_metadata,
-    open_synthetic,
-    save,
-    zoo_names,
-)
+from scb.environments.zoo import bandit_metadata, open_synthetic, save_bandit, zoo_names
 from scb.errors import at_least
 from scb.evolution import EvolutionConfig, evolve
 from scb.measurement import Place
@@ -157,7 +147,7 @@ class Discover(LongRun):
             },
             "command": self.command,
         }
-        path = save(folder.folder / f"{spec.bandit}.npz", problem.bandit, weights, metadata)
+        path = save_bandit(folder.folder / f"{spec.bandit}.npz", problem.bandit, weights, metadata)
         console().print(f"bandit: {path}", soft_wrap=True)
 
 

@@ -5,6 +5,7 @@ An agent is static configuration; its hyperparameters are traced numbers. `init`
 the caller.
 """
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, fields
@@ -207,10 +208,7 @@ class Agent(ABC):
 
     def observation_size(self, env_params: Any) -> int:
         """Of the flattened observation."""
-        size = 1
-        for dimension in self.env.observation_space(env_params).shape:
-            size *= dimension
-        return size
+        return math.prod(self.env.observation_space(env_params).shape)
 
 
 def clip_to_space(action: jax.Array, space: spaces.Box | spaces.Discrete) -> jax.Array:

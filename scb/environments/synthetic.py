@@ -9,24 +9,20 @@ population of bandits is `vmap` over `params` in one program.
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
-from typing import Any, Literal, TypeAlias, TypeVar, cast
+from typing import Any, TypeAlias, TypeVar, cast
 
 import distrax
 import jax
 import jax.numpy as jnp
-from flax import linen as nn
 from flax import struct
 from gymnax.environments import environment, spaces
 from jax.typing import ArrayLike
 
+from scb.agents.networks import ACTIVATIONS, MLP
 from scb.errors import UserError, at_least, unknown_name
 from scb.keys import root_key, split_key
 
-Latent: TypeAlias = Literal["normal", "uniform", "categorical", "softmax_categorical"]
 Weights: TypeAlias = dict[str, dict[str, dict[str, jax.Array]]]
-
-ACTIVATIONS: dict[str, Callable[[jax.Array], jax.Array]] = {"tanh": jnp.tanh, "relu": jax.nn.relu}
 
 
 def _one_hot_latent(logits: jax.Array, key: jax.Array) -> jax.Array:
@@ -64,26 +60,13 @@ class BanditParams(environment.EnvParams):
     max_steps_in_episode: int = 1
 
 
-class TwoLayers(nn.Module):
-    """[..., N] -> [..., output_size]: Dense, activation, Dense; what every learned function here is."""
-
-    hidden_size: int
-    output_size: int
-    activation: str
-
-    @nn.compact
-    def __call__(self, inputs: jax.Array) -> jax.Array:
-        hidden = ACTIVATIONS[self.activation](nn.Dense(self.hidden_size)(inputs))
-        return nn.Dense(self.output_size)(hidden)
-
-
 @dataclass(frozen=True)
 class BanditConfig:
     """What decides a bandit's shapes and program; defaults are the paper's.
 
     Attributes:
       hidden_size: units of each network's hidden layer.
-      activation: tanh or relu.
+      activation: tanh, relu or swish.
       latent: normal, uniform, categorical or softmax_categorical.
       latent_size: numbers that a context is made of; None for the observation's size, as in the paper.
     """
@@ -118,6 +101,12 @@ class SyntheticEnvironment(environment.Environment[_State, _Params]):
     """
 
     config: BanditConfig
+    parameters: type[Any]  # of `params`
+    # What is learned, in the order of the keys that its first weights are drawn with.
+    learned: tuple[str, ...] = ("initial_state", "reward")
+    max_steps = 1
+    # Whether every episode is a single step, whatever the params; a maximum of 1 in params alone is no promise.
+    one_step = True
 
     def __init__(
         self,
@@ -134,11 +123,6 @@ class SyntheticEnvironment(environment.Environment[_State, _Params]):
         self.discrete = isinstance(action_space, spaces.Discrete)
         self._action_size = encoded_size(action_space)
         self.latent_size = config.latent_size or observation_size
-        self._network = partial(
-            TwoLayers, hidden_size=config.hidden_size, activation=config.activation
-        )
-        self._initial_state = self._network(output_size=observation_size)
-        self._reward = self._network(output_size=1)
         self._weights = weights
 
     @property
@@ -149,9 +133,27 @@ class SyntheticEnvironment(environment.Environment[_State, _Params]):
     def num_actions(self) -> int:
         return self._action_size
 
+    @property
+    def default_params(self) -> _Params:
+        if self._weights is None:
+            raise UserError(
+                f"{self.name!r} has no weights of its own: pass params, such as params(weights)."
+            )
+        return self.params(self._weights)
+
+    def params(self, weights: Weights) -> _Params:
+        """These weights, without reward noise and with the maximum episode length that it is made for."""
+        return cast(_Params, self.parameters(weights=weights, max_steps_in_episode=self.max_steps))
+
     def init_weights(self, key: jax.Array) -> Weights:
         """Random weights (Flax's default initialisation), the start of the paper's evolution."""
-        raise NotImplementedError
+        keys = split_key(key, len(self.learned))
+        joined = self.observation_size + self._action_size
+        sizes = [self.latent_size if name == "initial_state" else joined for name in self.learned]
+        return {
+            name: self._network(name).init(k, jnp.zeros(size))["params"]
+            for name, k, size in zip(self.learned, keys, sizes, strict=True)
+        }
 
     def weight_shapes(self) -> dict[str, tuple[int, ...]]:
         """{"reward/Dense_0/kernel": (O + A, hidden), ...}: what an artefact must hold."""
@@ -159,11 +161,25 @@ class SyntheticEnvironment(environment.Environment[_State, _Params]):
         flat = jax.tree_util.tree_flatten_with_path(shapes)[0]
         return {"/".join(str(part.key) for part in path): leaf.shape for path, leaf in flat}
 
+    def context(self, latent: jax.Array, params: _Params) -> jax.Array:
+        """[L] latent -> [O] observation."""
+        return self._learned("initial_state", latent, params)
+
+    def draw_context(self, key: jax.Array, params: _Params) -> jax.Array:
+        """[O] the observation of a random latent."""
+        return self.context(LATENTS[self.config.latent](key, self.latent_size), params)
+
     def mean_reward(self, context: jax.Array, action: ArrayLike, params: Any) -> jax.Array:
         """[O] observation, action -> [] reward without noise: in one-step episodes the Q-function."""
-        inputs = self._inputs(context, action)
-        reward = self._reward.apply({"params": params.weights["reward"]}, inputs)
-        return cast(jax.Array, reward)[0]
+        return self._learned("reward", self._inputs(context, action), params)[0]
+
+    def _network(self, name: str) -> MLP:
+        size = self.observation_size if name in ("initial_state", "transition") else 1
+        return MLP((self.config.hidden_size,), size, self.config.activation)
+
+    def _learned(self, name: str, inputs: jax.Array, params: Any) -> jax.Array:
+        variables = {"params": params.weights[name]}
+        return cast(jax.Array, self._network(name).apply(variables, inputs))
 
     def action_space(self, params: _Params | None = None) -> spaces.Box | spaces.Discrete:
         return self._action_space
@@ -178,7 +194,7 @@ class SyntheticEnvironment(environment.Environment[_State, _Params]):
 class SyntheticBandit(SyntheticEnvironment[BanditState, BanditParams]):
     """A contextual bandit with learned contexts and rewards, as a gymnax 1.x environment."""
 
-    one_step = True
+    parameters = BanditParams
 
     def __init__(
         self,
@@ -190,36 +206,8 @@ class SyntheticBandit(SyntheticEnvironment[BanditState, BanditParams]):
     ) -> None:
         super().__init__(observation_size, action_space, config or BanditConfig(), weights, name)
 
-    @property
-    def default_params(self) -> BanditParams:
-        if self._weights is None:
-            raise UserError(
-                f"bandit {self.name!r} has no weights of its own: pass params=BanditParams(weights=...)."
-            )
-        return BanditParams(weights=self._weights)
-
-    def params(self, weights: Weights) -> BanditParams:
-        """These weights, without reward noise."""
-        return BanditParams(weights=weights)
-
-    def init_weights(self, key: jax.Array) -> Weights:
-        key_state, key_reward = split_key(key)
-        inputs = jnp.zeros(self.observation_size + self._action_size)
-        return {
-            "initial_state": self._initial_state.init(key_state, jnp.zeros(self.latent_size))[
-                "params"
-            ],
-            "reward": self._reward.init(key_reward, inputs)["params"],
-        }
-
-    def context(self, latent: jax.Array, params: BanditParams) -> jax.Array:
-        """[L] latent -> [O] observation."""
-        context = self._initial_state.apply({"params": params.weights["initial_state"]}, latent)
-        return cast(jax.Array, context)
-
     def reset_env(self, key: jax.Array, params: BanditParams) -> tuple[jax.Array, BanditState]:
-        latent = LATENTS[self.config.latent](key, self.latent_size)
-        context = self.context(latent, params)
+        context = self.draw_context(key, params)
         return context, BanditState(time=jnp.int32(0), context=context)
 
     def step_env(
@@ -255,14 +243,9 @@ class SyntheticBandit(SyntheticEnvironment[BanditState, BanditParams]):
         return jnp.std(self.sample_rewards(params, key, num_samples))
 
 
-def flat_size(shape: tuple[int, ...]) -> int:
-    """Number of entries of an array of this shape; 1 for ()."""
-    return math.prod(shape)
-
-
 def encoded_size(space: spaces.Box | spaces.Discrete) -> int:
     """A, the size of `encode_action`."""
-    return int(space.n) if isinstance(space, spaces.Discrete) else max(1, flat_size(space.shape))
+    return int(space.n) if isinstance(space, spaces.Discrete) else max(1, math.prod(space.shape))
 
 
 def encode_action(action: ArrayLike, space: spaces.Box | spaces.Discrete) -> jax.Array:
@@ -276,5 +259,5 @@ def bandit_for(
     env: environment.Environment[Any, Any], env_params: Any, config: BanditConfig, name: str
 ) -> SyntheticBandit:
     """An untrained bandit with the (flattened) observation and action shapes of an evaluation environment."""
-    observation_size = flat_size(env.observation_space(env_params).shape)
+    observation_size = math.prod(env.observation_space(env_params).shape)
     return SyntheticBandit(observation_size, env.action_space(env_params), config, name=name)

@@ -12,8 +12,9 @@ number over long episodes (with tanh it is bounded by the last layer's weights):
 are passed on as they are, and evolution ranks such a candidate last.
 """
 
+import math
 from dataclasses import dataclass, field
-from typing import Any, cast
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -22,16 +23,13 @@ from gymnax.environments import environment, spaces
 from jax.typing import ArrayLike
 
 from scb.environments.synthetic import (
-    LATENTS,
     BanditConfig,
     SyntheticBandit,
     SyntheticEnvironment,
     Weights,
     bandit_for,
-    flat_size,
 )
 from scb.errors import UserError, at_least, unknown_name
-from scb.keys import split_key
 
 MDP_PARAMETERIZATIONS = ("T", "TI")
 PARAMETERIZATIONS = (*MDP_PARAMETERIZATIONS, "I")
@@ -101,6 +99,8 @@ class SyntheticMDP(SyntheticEnvironment[MDPState, MDPParams]):
     """
 
     config: MDPConfig
+    parameters = MDPParams
+    learned = ("initial_state", "reward", "transition", "termination")
 
     def __init__(
         self,
@@ -117,11 +117,7 @@ class SyntheticMDP(SyntheticEnvironment[MDPState, MDPParams]):
         self.env_params = (
             env.default_params if env is not None and env_params is None else env_params
         )
-        self._check_start()
-        self._transition = self._network(output_size=observation_size)
-        self._termination = self._network(output_size=1)
-
-    def _check_start(self) -> None:
+        self.max_steps, self.one_step = config.max_steps, config.max_steps == 1
         if (self.env is None) == (self.config.parameterization == "T"):
             raise UserError(
                 f"{self.name!r} is a synthetic MDP of parameterization {self.config.parameterization} "
@@ -129,63 +125,32 @@ class SyntheticMDP(SyntheticEnvironment[MDPState, MDPParams]):
                 "T, which starts in its start states, and none to TI."
             )
         if self.env is not None:
-            size = flat_size(self.env.observation_space(self.env_params).shape)
+            size = math.prod(self.env.observation_space(self.env_params).shape)
             if size != self.observation_size:
                 raise UserError(
                     f"{self.name!r} has observations of {self.observation_size} entries and "
                     f"{self.env.name} has {size}: give the evaluation environment it was made for."
                 )
 
-    @property
-    def one_step(self) -> bool:
-        """Whether every episode is a single step, whatever the params; a maximum of 1 in params alone is no promise."""
-        return self.config.max_steps == 1
-
-    @property
-    def default_params(self) -> MDPParams:
-        if self._weights is None:
-            raise UserError(
-                f"synthetic MDP {self.name!r} has no weights of its own: pass "
-                f"params=MDPParams(weights=..., max_steps_in_episode={self.config.max_steps})."
-            )
-        return self.params(self._weights)
-
-    def params(self, weights: Weights) -> MDPParams:
-        """These weights with the configured maximum episode length."""
-        return MDPParams(weights=weights, max_steps_in_episode=self.config.max_steps)
-
     def init_weights(self, key: jax.Array) -> Weights:
-        key_state, key_reward, key_transition, key_termination = split_key(key, 4)
-        inputs = jnp.zeros(self.observation_size + self._action_size)
-        weights = {
-            "reward": self._reward.init(key_reward, inputs)["params"],
-            "transition": self._transition.init(key_transition, inputs)["params"],
-            "termination": self._termination.init(key_termination, inputs)["params"],
-        }
-        if self.config.parameterization == "TI":
-            latent = jnp.zeros(self.latent_size)
-            weights["initial_state"] = self._initial_state.init(key_state, latent)["params"]
+        weights = super().init_weights(key)
+        if self.config.parameterization == "T":
+            del weights["initial_state"]
         return weights
 
     def transition(self, observation: jax.Array, action: ArrayLike, params: MDPParams) -> jax.Array:
         """[O] observation, action -> [O] next observation, not bounded in any way."""
-        inputs = self._inputs(observation, action)
-        after = self._transition.apply({"params": params.weights["transition"]}, inputs)
-        return cast(jax.Array, after)
+        return self._learned("transition", self._inputs(observation, action), params)
 
     def termination_logit(
         self, observation: jax.Array, action: ArrayLike, params: MDPParams
     ) -> jax.Array:
         """[O] observation, action -> [] logit; the step terminates where it is positive, and not where it is NaN."""
-        inputs = self._inputs(observation, action)
-        logit = self._termination.apply({"params": params.weights["termination"]}, inputs)
-        return cast(jax.Array, logit)[0]
+        return self._learned("termination", self._inputs(observation, action), params)[0]
 
     def reset_env(self, key: jax.Array, params: MDPParams) -> tuple[jax.Array, MDPState]:
         if self.env is None:
-            latent = LATENTS[self.config.latent](key, self.latent_size)
-            weights = {"params": params.weights["initial_state"]}
-            observation = cast(jax.Array, self._initial_state.apply(weights, latent))
+            observation = self.draw_context(key, params)
         else:
             start, _ = self.env.reset_env(key, self.env_params)
             observation = jnp.ravel(start).astype(jnp.float32)
@@ -249,7 +214,7 @@ def synthetic_for(
     if max_steps is None:
         max_steps = int(env_params.max_steps_in_episode)
     mdp_config = MDPConfig(*layers, parameterization=parameterization, max_steps=max_steps)
-    observation_size = flat_size(env.observation_space(env_params).shape)
+    observation_size = math.prod(env.observation_space(env_params).shape)
     start = {"env": env, "env_params": env_params} if parameterization == "T" else {}
     return SyntheticMDP(
         observation_size, env.action_space(env_params), mdp_config, name=name, **start

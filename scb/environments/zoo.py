@@ -8,7 +8,6 @@ imported, and read when one is made.
 import dataclasses
 from collections.abc import Mapping, Sequence
 from functools import partial
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -26,12 +25,13 @@ from scb.environments.synthetic_mdp import MDPConfig, SyntheticMDP
 from scb.errors import UserError, unknown_name
 
 PREFIX = "Synthetic-"
+_ZOO = Path(__file__).parents[1] / "zoo"
+_KINDS = {BANDIT: "bandit", SYNTHETIC_MDP: "synthetic MDP"}
 
 
 def zoo_names() -> list[str]:
     """Names of the bandits that ship with the library, as registered with gymnax."""
-    folder = resources.files("scb") / "zoo"
-    return sorted(p.name.removesuffix(".npz") for p in folder.iterdir() if p.name.endswith(".npz"))
+    return sorted(path.stem for path in _ZOO.glob("*.npz"))
 
 
 class SyntheticFamily(Family):
@@ -67,43 +67,19 @@ def register_zoo() -> None:
     """Registers every bandit of the zoo, so that `gymnax.make("Synthetic-Pendulum-v1")` works."""
     for name in zoo_names():
         if name not in gymnax.registered_envs:
-            gymnax.register(name, partial(_make_zoo_bandit, name))
-
-
-def _make_zoo_bandit(name: str) -> SyntheticBandit:
-    with resources.as_file(resources.files("scb") / "zoo") as folder:
-        return load_bandit(folder / f"{name}.npz")
+            gymnax.register(name, partial(open_bandit, name))
 
 
 def bandit_metadata(name: str) -> Mapping[str, Any]:
     """What the .json of a bandit or synthetic MDP (a zoo name, or path.npz) says: config, seeds, results, cost."""
-    if name.endswith(".npz"):
-        return artefacts.load(name, BANDIT, SYNTHETIC_MDP).metadata
-    with resources.as_file(resources.files("scb") / "zoo") as folder:
-        return artefacts.load(folder / f"{name}.npz", BANDIT).metadata
+    path = name if name.endswith(".npz") else _ZOO / f"{name}.npz"
+    return artefacts.load(path, BANDIT, SYNTHETIC_MDP).metadata
 
 
 def load_bandit(path: str | Path) -> SyntheticBandit:
     """A bandit from its file; a UserError says what is wrong with it."""
-    return _bandit(artefacts.load(path, BANDIT), path)
-
-
-def _bandit(artefact: artefacts.Artefact, path: str | Path) -> SyntheticBandit:
-    config = artefact.metadata["config"]
-    try:
-        bandit = SyntheticBandit(
-            observation_size=config["observation_size"],
-            action_space=_space(config["action_space"]),
-            config=BanditConfig(**config["bandit"]),
-            weights=jax.tree.map(jnp.asarray, dict(artefact.arrays)),
-            name=artefact.name,
-        )
-        shapes = bandit.weight_shapes()
-    except (KeyError, TypeError) as error:
-        raise UserError(
-            f"{path} does not describe a bandit: its .json lacks or garbles a config entry ({error})."
-        ) from error
-    artefacts.expect_shapes(artefact, shapes)
+    bandit = _load(path, BANDIT)
+    assert isinstance(bandit, SyntheticBandit)
     return bandit
 
 
@@ -112,28 +88,29 @@ def load(path: str | Path) -> SyntheticBandit | SyntheticMDP:
 
     An MDP that starts in its evaluation environment's start states makes that environment by name.
     """
-    artefact = artefacts.load(path, BANDIT, SYNTHETIC_MDP)
-    if artefact.metadata["kind"] == BANDIT:
-        return _bandit(artefact, path)
-    config = artefact.metadata["config"]
+    return _load(path, BANDIT, SYNTHETIC_MDP)
+
+
+def _load(path: str | Path, *kinds: str) -> SyntheticBandit | SyntheticMDP:
+    artefact = artefacts.load(path, *kinds)
+    config, kind = artefact.metadata["config"], artefact.metadata["kind"]
+    weights = jax.tree.map(jnp.asarray, dict(artefact.arrays))
+    made: SyntheticBandit | SyntheticMDP
     try:
-        mdp_config = MDPConfig(**config["mdp"])
-        start = _start(config["start"]) if mdp_config.parameterization == "T" else (None, None)
-        mdp = SyntheticMDP(
-            config["observation_size"],
-            _space(config["action_space"]),
-            mdp_config,
-            jax.tree.map(jnp.asarray, dict(artefact.arrays)),
-            artefact.name,
-            *start,
-        )
-        shapes = mdp.weight_shapes()
+        shape = config["observation_size"], _space(config["action_space"])
+        if kind == BANDIT:
+            made = SyntheticBandit(*shape, BanditConfig(**config["bandit"]), weights, artefact.name)
+        else:
+            mdp_config = MDPConfig(**config["mdp"])
+            start = _start(config["start"]) if mdp_config.parameterization == "T" else (None, None)
+            made = SyntheticMDP(*shape, mdp_config, weights, artefact.name, *start)
+        shapes = made.weight_shapes()
     except (KeyError, TypeError) as error:
         raise UserError(
-            f"{path} does not describe a synthetic MDP: its .json lacks or garbles a config entry ({error})."
+            f"{path} does not describe a {_KINDS[kind]}: its .json lacks or garbles a config entry ({error})."
         ) from error
     artefacts.expect_shapes(artefact, shapes)
-    return mdp
+    return made
 
 
 def _start(description: Mapping[str, Any]) -> Made:
@@ -146,7 +123,7 @@ def open_bandit(name: str) -> SyntheticBandit:
         return load_bandit(name)
     if name not in zoo_names():
         raise unknown_name("bandit", name, [*zoo_names(), "path/to/bandit.npz"])
-    return _make_zoo_bandit(name)
+    return load_bandit(_ZOO / f"{name}.npz")
 
 
 def open_synthetic(name: str) -> SyntheticBandit | SyntheticMDP:
@@ -154,77 +131,48 @@ def open_synthetic(name: str) -> SyntheticBandit | SyntheticMDP:
     return load(name) if name.endswith(".npz") else open_bandit(name)
 
 
-def save(
+def save_bandit(
     path: str | Path,
     synthetic: SyntheticBandit | SyntheticMDP,
     weights: Weights,
     metadata: Mapping[str, Any],
 ) -> Path:
-    """Writes a bandit or a synthetic MDP: `save_bandit` or `save_synthetic_mdp`."""
-    if isinstance(synthetic, SyntheticMDP):
-        return save_synthetic_mdp(path, synthetic, weights, metadata)
-    return save_bandit(path, synthetic, weights, metadata)
-
-
-def save_bandit(
-    path: str | Path, bandit: SyntheticBandit, weights: Weights, metadata: Mapping[str, Any]
-) -> Path:
-    """Writes a bandit.
+    """Writes a bandit or a synthetic MDP.
 
     Args:
       path: NAME.npz; NAME.json is written beside it, and NAME is the bandit's name.
-      bandit: whose shapes are stored.
-      weights: as in `BanditParams.weights`.
-      metadata: config (of the discovery), seeds, results, cost, command.
-    """
-    config = {
-        **metadata.get("config", {}),
-        "observation_size": bandit.observation_size,
-        "action_space": space_description(bandit.action_space()),
-        "bandit": {
-            "hidden_size": bandit.config.hidden_size,
-            "activation": bandit.config.activation,
-            "latent": bandit.config.latent,
-            "latent_size": bandit.latent_size,
-        },
-    }
-    full = {**metadata, "kind": BANDIT, "config": config}
-    return artefacts.save(path, jax.device_get(weights), full)
-
-
-def save_synthetic_mdp(
-    path: str | Path, mdp: SyntheticMDP, weights: Weights, metadata: Mapping[str, Any]
-) -> Path:
-    """Writes a synthetic MDP.
-
-    Args:
-      path: NAME.npz; NAME.json is written beside it, and NAME is the MDP's name.
-      mdp: whose shapes, parameterisation and maximum episode length are stored.
-      weights: as in `MDPParams.weights`.
-      metadata: as for `save_bandit`; `config["evaluation_environment"]` is the name by which to make
-        the environment in whose start states a "T" starts, where it isn't the environment's own.
+      synthetic: whose shapes are stored, and of an MDP parameterisation and maximum episode length.
+      weights: as in its parameters.
+      metadata: config (of the discovery), seeds, results, cost, command. Of a "T",
+        `config["evaluation_environment"]` is the name by which to make the environment in whose start
+        states it starts, where it isn't the environment's own.
 
     Raises:
       UserError: a "T" whose evaluation environment would not come back the same.
     """
+    kind = SYNTHETIC_MDP if isinstance(synthetic, SyntheticMDP) else BANDIT
     config = {
         **metadata.get("config", {}),
-        "observation_size": mdp.observation_size,
-        "action_space": space_description(mdp.action_space()),
-        "mdp": {**dataclasses.asdict(mdp.config), "latent_size": mdp.latent_size},
+        "observation_size": synthetic.observation_size,
+        "action_space": space_description(synthetic.action_space()),
+        "bandit" if kind == BANDIT else "mdp": {
+            **dataclasses.asdict(synthetic.config),
+            "latent_size": synthetic.latent_size,
+        },
     }
-    if mdp.env is not None:
-        name = config.setdefault("evaluation_environment", mdp.env.name)
+    if isinstance(synthetic, SyntheticMDP) and synthetic.env is not None:
+        env = synthetic.env
+        name = config.setdefault("evaluation_environment", env.name)
         # What has physics to choose from says which it has.
-        backend = {"backend": mdp.env.backend} if environment_spec(name).backends else {}
+        backend = {"backend": env.backend} if environment_spec(name).backends else {}
         config["start"] = {"environment": name, "arguments": backend}
         made, params = _start(config["start"])
-        if type(made) is not type(mdp.env) or not _equal(params, mdp.env_params):
+        if type(made) is not type(env) or not _equal(params, synthetic.env_params):
             raise UserError(
                 f"{path} was not written, since {name!r} by its name is not the environment that the MDP "
                 "starts in: give its own name and default parameters."
             )
-    full = {**metadata, "kind": SYNTHETIC_MDP, "config": config}
+    full = {**metadata, "kind": kind, "config": config}
     return artefacts.save(path, jax.device_get(weights), full)
 
 

@@ -39,7 +39,8 @@ def params_of(bandit, seed=0, **values):
 
 def mlp(layers, inputs, activation):
     hidden = inputs @ np.asarray(layers["Dense_0"]["kernel"]) + layers["Dense_0"]["bias"]
-    hidden = {"tanh": np.tanh, "relu": lambda x: np.maximum(x, 0.0)}[activation](hidden)
+    functions = {"relu": lambda x: np.maximum(x, 0.0), "swish": lambda x: x / (1 + np.exp(-x))}
+    hidden = {"tanh": np.tanh, **functions}[activation](hidden)
     return hidden @ np.asarray(layers["Dense_1"]["kernel"]) + layers["Dense_1"]["bias"]
 
 

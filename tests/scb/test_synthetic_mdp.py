@@ -20,7 +20,7 @@ from scb.environments.synthetic_mdp import (
     SyntheticMDP,
     synthetic_for,
 )
-from scb.environments.zoo import load, load_bandit, save_bandit, save_synthetic_mdp
+from scb.environments.zoo import load, load_bandit, save_bandit
 from scb.errors import UserError
 from scb.evaluation import evaluate
 from tests.scb.probes import Corridor
@@ -445,8 +445,7 @@ def test_only_a_t_takes_an_evaluation_environment():
 
 def test_an_mdp_without_weights_asks_for_params():
     mdp = SyntheticMDP(3, BOX, MDPConfig(max_steps=7))
-    message = r"'SyntheticMDP' has no weights of its own: pass .*max_steps_in_episode=7"
-    with pytest.raises(UserError, match=message):
+    with pytest.raises(UserError, match="'SyntheticMDP' has no weights of its own: pass params"):
         mdp.reset(jax.random.key(0))
 
 
@@ -460,7 +459,7 @@ def saved(folder, parameterization="TI", name="Pendulum-v1", max_steps=7, metada
         env, env_params, parameterization, BanditConfig(**SMALL), "x", max_steps=max_steps
     )
     weights = jax.jit(mdp.init_weights)(jax.random.key(1))
-    return save_synthetic_mdp(folder / "Synthetic-Test.npz", mdp, weights, metadata), mdp, weights
+    return save_bandit(folder / "Synthetic-Test.npz", mdp, weights, metadata), mdp, weights
 
 
 def edit(path, change):
@@ -493,7 +492,7 @@ def test_a_saved_t_starts_in_the_same_physics_of_brax(tmp_path):
     config = MDPConfig(**SMALL, parameterization="T", max_steps=7)
     mdp = SyntheticMDP(4, env.action_space(), config, env=env)
     weights = mdp.init_weights(jax.random.key(1))
-    loaded = load(save_synthetic_mdp(tmp_path / "a.npz", mdp, weights, METADATA))
+    loaded = load(save_bandit(tmp_path / "a.npz", mdp, weights, METADATA))
     assert isinstance(loaded, SyntheticMDP) and loaded.env == env
 
 
@@ -513,7 +512,7 @@ def test_a_t_whose_evaluation_environment_would_not_come_back_is_not_written(tmp
     mdp = synthetic_for(env, changed, "T", BanditConfig(**SMALL), "x")
     weights = mdp.init_weights(jax.random.key(0))
     with pytest.raises(UserError, match=r"a\.npz was not written, since 'Pendulum-v1' by its name"):
-        save_synthetic_mdp(tmp_path / "a.npz", mdp, weights, METADATA)
+        save_bandit(tmp_path / "a.npz", mdp, weights, METADATA)
     assert not list(tmp_path.iterdir())
 
 
