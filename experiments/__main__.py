@@ -22,7 +22,7 @@ import tyro
 from experiments import claims, harness, rendering
 from experiments.harness import DATA, DOCS, Experiment, Files
 from scb.errors import UserError
-from scb.runs import make_folder
+from scb.files import make_folder
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ from scb import plotting
 from scb.artefacts import machine_description, package_versions
 from scb.environments.registry import families
 from scb.errors import UserError
-from scb.runs import make_folder, write_json
+from scb.files import make_folder, write_json
 
 CLASSIC_CONTROL = tuple(sorted(families()["classic"].suite))
 DATA = Path("docs/data")

@@ -39,8 +39,9 @@ from scb.command_line import LongRun, Output, flags, listed
 from scb.console import console
 from scb.environments.registry import environment_spec
 from scb.errors import UserError, at_least
+from scb.files import make_folder, write_json
 from scb.measurement import Place, Rows, check_seeds
-from scb.runs import config_dict, make_folder, write_json
+from scb.runs import config_dict
 from scb.statistics import estimate
 
 _DISTILL = DistillConfig()

@@ -31,8 +31,9 @@ from scb.command_line import LongRun, Output
 from scb.console import console
 from scb.environments.registry import make
 from scb.evolution import EnvironmentSteps
+from scb.files import write_json
 from scb.measurement import Rows
-from scb.runs import Run, Stopwatch, config_dict, write_json
+from scb.runs import Run, Stopwatch, config_dict
 from scb.seeds import reporting
 
 

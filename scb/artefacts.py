@@ -12,11 +12,9 @@ import io
 import json
 import os
 import platform
-import struct
 import subprocess
 import sys
 import zipfile
-import zlib
 from collections.abc import Mapping, Sequence
 from importlib import metadata as distributions
 from pathlib import Path
@@ -24,8 +22,10 @@ from typing import Any, NoReturn, TypeAlias
 
 import jax
 import numpy as np
+from flax import traverse_util
 
 from scb.errors import UserError, unknown_name
+from scb.files import write_bytes
 
 SCHEMA_VERSION = 1
 KINDS = ("bandit", "drift", "synthetic_mdp")
@@ -49,23 +49,6 @@ _FIELDS: dict[str, tuple[type, ...]] = {
 }
 
 _PACKAGES = ("jax", "jaxlib", "flax", "optax", "evosax", "gymnax", "brax", "numpy", "lpo")
-
-# All that a damaged .npz was seen to raise inside zipfile and NumPy.
-_DAMAGE = (
-    EOFError,
-    KeyError,
-    MemoryError,
-    NotImplementedError,
-    OSError,
-    OverflowError,
-    RuntimeError,
-    SyntaxError,
-    TypeError,
-    ValueError,
-    struct.error,
-    zipfile.BadZipFile,
-    zlib.error,
-)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -123,8 +106,8 @@ def save(path: str | Path, arrays: Mapping[str, Any], metadata: Mapping[str, Any
     _check_metadata(json_path, json.loads(text))
 
     npz_path.parent.mkdir(parents=True, exist_ok=True)
-    _replace(npz_path, data)
-    _replace(json_path, (text + "\n").encode())
+    write_bytes(npz_path, data)
+    write_bytes(json_path, (text + "\n").encode())
     return npz_path
 
 
@@ -205,8 +188,17 @@ def flatten(arrays: Mapping[str, Any]) -> dict[str, np.ndarray]:
       UserError: a name is empty, is no text or holds a "/", or a dictionary is empty: none of
         these would come back from a file.
     """
-    flat: dict[str, np.ndarray] = {}
-    _flatten_into(flat, "", arrays)
+    flat = {}
+    for path, array in traverse_util.flatten_dict({"": arrays}, keep_empty_nodes=True).items():
+        wrong = [x for x in path[1:] if not isinstance(x, str) or not x or "/" in x]
+        if wrong:
+            raise UserError(
+                f"{wrong[0]!r} cannot name an array: use text that is not empty and has no '/'."
+            )
+        name = "/".join(path[1:])
+        if array is traverse_util.empty_node:
+            raise UserError(f"the group {name!r} holds no arrays: leave it out.")
+        flat[name] = np.asarray(array)
     return dict(sorted(flat.items()))
 
 
@@ -216,18 +208,10 @@ def unflatten(path: Path, flat: Mapping[str, np.ndarray]) -> ArrayTree:
     Raises:
       UserError: a name is both an array and the dictionary of others; `path` is for the message.
     """
-    tree: ArrayTree = {}
-    for name, array in flat.items():
-        *folders, leaf = name.split("/")
-        inner = tree
-        for folder in folders:
-            child = inner.setdefault(folder, {})
-            if not isinstance(child, dict):
-                raise _damaged(path, f"array {name!r} lies inside another array")
-            inner = child
-        if leaf in inner:
+    for name in flat:
+        if any(other.startswith(f"{name}/") for other in flat):
             raise _damaged(path, f"{name!r} is both an array and a group of arrays")
-        inner[leaf] = array
+    tree: ArrayTree = traverse_util.unflatten_dict(dict(flat), sep="/")
     return tree
 
 
@@ -247,7 +231,7 @@ def machine_description() -> dict[str, str | int]:
     devices = jax.devices()
     return {
         "processor": _processor(),
-        "cores": _usable_cores(),
+        "cores": usable_cores(),
         "accelerator": devices[0].device_kind if devices[0].platform != "cpu" else "none",
         "jax_platform": devices[0].platform,
         "jax_devices": len(devices),
@@ -276,19 +260,6 @@ def _read(path: Path) -> bytes:
         raise UserError(f"{path} cannot be read: {error}.") from error
 
 
-def _replace(path: Path, data: bytes) -> None:
-    # In the same folder, since a rename is atomic within one file system only.
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        with open(temporary, "wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
-
-
 def _npz_bytes(flat: Mapping[str, np.ndarray]) -> bytes:
     # numpy.savez stamps the time into the archive; compression differs between zlib versions.
     buffer = io.BytesIO()
@@ -309,7 +280,7 @@ def _parse_npz(path: Path, data: bytes) -> dict[str, np.ndarray]:
             raise zipfile.BadZipFile("no zip archive")
         with np.load(io.BytesIO(data), allow_pickle=False) as archive:
             flat = {name: archive[name] for name in archive.files}
-    except _DAMAGE as error:
+    except Exception as error:  # zipfile and NumPy raise a dozen kinds for damaged files
         raise _damaged(path, f"{error or type(error).__name__}") from error
     if not flat:
         raise _damaged(path, "it holds no arrays")
@@ -385,20 +356,6 @@ def _as_json(value: object) -> object:
     raise TypeError(f"a {type(value).__name__} is no JSON")
 
 
-def _flatten_into(flat: dict[str, np.ndarray], prefix: str, tree: Mapping[str, Any]) -> None:
-    if not tree:
-        raise UserError(f"the group {prefix!r} holds no arrays: leave it out.")
-    for name, value in tree.items():
-        if not isinstance(name, str) or not name or "/" in name:
-            raise UserError(
-                f"{name!r} cannot name an array: use text that is not empty and has no '/'."
-            )
-        if isinstance(value, Mapping):
-            _flatten_into(flat, f"{prefix}{name}/", value)
-        else:
-            flat[f"{prefix}{name}"] = np.asarray(value)
-
-
 def _processor() -> str:
     if sys.platform.startswith("linux"):
         try:
@@ -421,8 +378,8 @@ def _processor() -> str:
     return platform.processor() or platform.machine() or "unknown"
 
 
-def _usable_cores() -> int:
-    # A container or a batch system may allow fewer cores than the machine has.
+def usable_cores() -> int:
+    """Cores that this process may use, which in a container or a batch system are fewer than the machine's."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1

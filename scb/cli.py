@@ -17,14 +17,14 @@ def configure_jax() -> None:
     """One CPU device a core and a compilation cache, unless the environment's own settings say otherwise."""
     import jax
 
+    from scb.artefacts import usable_cores
+
     if "JAX_NUM_CPU_DEVICES" not in os.environ and "host_platform_device_count" not in (
         os.environ.get("XLA_FLAGS", "")
     ):
-        # The cores that this process may use, which in a container are fewer than the machine's.
-        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
         # A caller that has used JAX already keeps its devices: by then their number is settled.
         with contextlib.suppress(RuntimeError):
-            jax.config.update("jax_num_cpu_devices", cores or 1)
+            jax.config.update("jax_num_cpu_devices", usable_cores())
     if jax.config.values["jax_compilation_cache_dir"] is None:
         base = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"))
         jax.config.update("jax_compilation_cache_dir", str(base / "lpo" / "jax"))

@@ -7,16 +7,17 @@ when they are opened, and are never read here.
 
 import hashlib
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import tyro
 
-from scb.artefacts import read_arrays, unflatten
+from scb.artefacts import Artefact, expect_shapes, read_arrays, unflatten
 from scb.environments.registry import environment_spec, make
-from scb.environments.synthetic import BanditConfig, SyntheticBandit, Weights, bandit_for
+from scb.environments.spec import BANDIT
+from scb.environments.synthetic import BanditConfig, SyntheticBandit, bandit_for
 from scb.environments.zoo import save_bandit
 from scb.errors import UserError, unknown_name
 
@@ -62,11 +63,9 @@ def published_bandit(path: str | Path, environment: str | None = None) -> Synthe
     home = _environment_of(path) if environment is None else environment
     env, env_params = make(home)
     bandit = bandit_for(env, env_params, _CONFIG, environment_spec(home).bandit)
-    arrays = _arrays(path)
-    _check_arrays(path, arrays, bandit, home)
-    # Checked above to be exactly what `Weights` is.
-    tree = cast(Weights, unflatten(path, arrays))
-    weights = jax.tree.map(lambda array: jnp.asarray(array, jnp.float32), tree)
+    artefact = Artefact(str(path), unflatten(path, _arrays(path)), {"kind": BANDIT})
+    expect_shapes(artefact, bandit.weight_shapes())
+    weights: Any = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), artefact.arrays)
     return SyntheticBandit(
         bandit.observation_size, bandit.action_space(), _CONFIG, weights, bandit.name
     )
@@ -164,28 +163,6 @@ def _pickle(path: Path) -> UserError:
         f"{path} holds pickled objects, which run code when they are opened: only plain arrays in "
         "an .npz file are read, so convert it where you trust it."
     )
-
-
-def _check_arrays(
-    path: Path, arrays: dict[str, np.ndarray], bandit: SyntheticBandit, environment: str
-) -> None:
-    shapes = bandit.weight_shapes()
-    for kind, names in (
-        ("lacks", [name for name in shapes if name not in arrays]),
-        ("has an unknown", [name for name in arrays if name not in shapes]),
-    ):
-        if names:
-            raise UserError(
-                f"{path} {kind} array {names[0]!r}: a published bandit holds exactly "
-                f"{', '.join(shapes)}, so fetch or convert it again."
-            )
-    for name, expected in shapes.items():
-        if arrays[name].shape != expected:
-            raise UserError(
-                f"array {name!r} of {path} has shape {arrays[name].shape} where a bandit of "
-                f"{environment}, with {bandit.observation_size} observations and "
-                f"{bandit.num_actions} actions, has {expected}: give the file of this environment."
-            )
 
 
 def _metadata(path: Path) -> dict[str, Any]:

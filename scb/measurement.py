@@ -30,8 +30,9 @@ from scb.environments.registry import environment_spec
 from scb.errors import UserError, at_least
 from scb.evaluation import Episodes
 from scb.evolution import map_population
+from scb.files import write_json, write_text
 from scb.keys import root_key, split_key
-from scb.runs import first_difference, write_json, write_text
+from scb.runs import first_difference
 
 Row = dict[str, Any]
 MODE, SAMPLED = "mode", "sampled"

@@ -10,7 +10,6 @@ runs/NAME/checkpoints/      orbax
 
 import hashlib
 import json
-import os
 import shutil
 import time
 from collections.abc import Mapping
@@ -24,27 +23,7 @@ import orbax.checkpoint as ocp
 from tensorboardX import SummaryWriter
 
 from scb.errors import UserError
-
-
-def make_folder(folder: Path, flag: str = "--out") -> None:
-    """Makes a folder for what a command will write, so that it fails before the work and not after it.
-
-    Raises:
-      UserError: nothing can be written there, or read; `flag` says where.
-    """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise _cannot_write(folder, flag, error.strerror) from error
-    if not os.access(folder, os.R_OK | os.W_OK | os.X_OK):
-        raise _cannot_write(folder, flag)
-
-
-def _cannot_write(folder: Path, flag: str, reason: str | None = None) -> UserError:
-    said = f" ({reason})" if reason else ""
-    return UserError(
-        f"cannot write to {folder}{said}: choose another {flag}, a folder that you may write to."
-    )
+from scb.files import cannot_write, make_folder, write_text
 
 
 class Run:
@@ -98,7 +77,7 @@ class Run:
         try:
             stored_config.write_text(json.dumps(config, indent=2) + "\n")
         except OSError as error:
-            raise _cannot_write(folder, "--out", error.strerror) from error
+            raise cannot_write(folder, reason=error.strerror) from error
         return cls(folder, resumed=False, wandb_project=wandb_project)
 
     def rewind(self, step: int) -> None:
@@ -166,18 +145,6 @@ def read_config(folder: str | Path) -> dict[str, Any]:
 def config_dict(config: Any) -> dict[str, Any]:
     """A configuration's dataclass as plain JSON types."""
     return dict(json.loads(json.dumps(asdict(config))))
-
-
-def write_text(path: Path, content: str) -> None:
-    """Writes a file so that a kill leaves the old one or the new one, never half of one."""
-    temporary = path.with_name(path.name + ".tmp")
-    temporary.write_text(content)
-    os.replace(temporary, path)
-
-
-def write_json(path: Path, content: Mapping[str, Any]) -> None:
-    """Writes JSON as `write_text` writes text."""
-    write_text(path, json.dumps(content, indent=2) + "\n")
 
 
 class Checkpoints:

@@ -20,8 +20,8 @@ from scb.environments.registry import environment_spec, make
 from scb.environments.synthetic import SyntheticBandit
 from scb.environments.zoo import open_bandit
 from scb.errors import at_least
+from scb.files import make_folder, write_json
 from scb.keys import root_key, split_key
-from scb.runs import make_folder, write_json
 from scb.statistics import estimate
 
 STATES = 2000  # of either distribution, as in the paper

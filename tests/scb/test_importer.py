@@ -260,21 +260,19 @@ def test_a_changed_byte_is_noticed(tmp_path):
 def test_every_missing_array_is_said_by_name(tmp_path, name):
     arrays = released()
     del arrays[name]
-    assert f"lacks array '{name}'" in refusal(write(tmp_path, arrays=arrays))
+    assert f"has no array '{name}'" in refusal(write(tmp_path, arrays=arrays))
 
 
-@pytest.mark.parametrize("name", ["transition/Dense_0/kernel", "reward", "reward/Dense_0/bias/x"])
-def test_an_array_too_many_is_said_by_name(tmp_path, name):
-    arrays = {**released(), name: np.zeros(3)}
-    assert f"has an unknown array '{name}'" in refusal(write(tmp_path, arrays=arrays))
+def test_an_array_too_many_is_said_by_name(tmp_path):
+    arrays = {**released(), "transition/Dense_0/kernel": np.zeros(3)}
+    assert "has an array 'transition/Dense_0/kernel'" in refusal(write(tmp_path, arrays=arrays))
 
 
 def test_sizes_of_another_environment_are_refused(tmp_path):
     # Acrobot's observation has 6 numbers, MountainCar's 2.
     message = refusal(write(tmp_path, "mountaincar", released("acrobot")))
     assert "array 'initial_state/Dense_0/kernel' of " in message
-    assert "has shape (6, 32) where a bandit of MountainCar-v0" in message
-    assert "with 2 observations and 3 actions, has (2, 32)" in message
+    assert "mountaincar.npz' has shape (6, 32) where (2, 32) is expected" in message
 
 
 def test_another_number_of_actions_is_refused(tmp_path):
@@ -282,7 +280,7 @@ def test_another_number_of_actions_is_refused(tmp_path):
     arrays = {**released(), "reward/Dense_0/kernel": np.zeros((5, 32))}
     message = refusal(write(tmp_path, arrays=arrays))
     assert "'reward/Dense_0/kernel'" in message and "has shape (5, 32)" in message
-    assert "has (4, 32)" in message
+    assert "where (4, 32) is expected" in message
 
 
 def test_numbers_that_are_not_finite_are_refused(tmp_path):

@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 from scb.errors import UserError
-from scb.runs import Checkpoints, Run, Stopwatch, read_config, write_json
+from scb.files import write_json
+from scb.runs import Checkpoints, Run, Stopwatch, read_config
 
 CONFIG = {"seed": 0, "evolution": {"sigma": 0.05, "strategy": "SNES"}, "hidden_sizes": (8, 8)}
 

@@ -1,0 +1,55 @@
+"""Files and folders that commands write."""
+
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from scb.errors import UserError
+
+
+def make_folder(folder: Path, flag: str = "--out") -> None:
+    """Makes a folder for what a command will write, so that it fails before the work and not after it.
+
+    Raises:
+      UserError: nothing can be written there, or read; `flag` says where.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise cannot_write(folder, flag, error.strerror) from error
+    if not os.access(folder, os.R_OK | os.W_OK | os.X_OK):
+        raise cannot_write(folder, flag)
+
+
+def cannot_write(folder: Path, flag: str = "--out", reason: str | None = None) -> UserError:
+    """The error for a folder that refuses."""
+    said = f" ({reason})" if reason else ""
+    return UserError(
+        f"cannot write to {folder}{said}: choose another {flag}, a folder that you may write to."
+    )
+
+
+def write_bytes(path: Path, content: bytes) -> None:
+    """Writes a file so that a kill leaves the old one or the new one, never half of one."""
+    # In the same folder, since a rename is atomic within one file system only.
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        with temporary.open("wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def write_text(path: Path, content: str) -> None:
+    """Writes text as `write_bytes` writes bytes."""
+    write_bytes(path, content.encode())
+
+
+def write_json(path: Path, content: Mapping[str, Any]) -> None:
+    """Writes JSON as `write_bytes` writes bytes."""
+    write_text(path, json.dumps(content, indent=2) + "\n")
