@@ -154,10 +154,7 @@ class MetaTrainingConfig:
                     "their own."
                 )
         at_least(1, self, "agents_per_candidate", "evaluation_episodes", "contexts")
-        if not 0 <= self.reward_noise < math.inf:
-            raise UserError(
-                f"reward_noise is {self.reward_noise}: it must be 0 or larger, and finite."
-            )
+        at_least(0, self, "reward_noise", "initial_scale")
 
     @property
     def judgement(self) -> Fitness:

@@ -5,7 +5,6 @@ hyperparameters drawn from the paper's lists so that the bandit suits any of the
 their return in the evaluation environment. The same search finds the paper's fully synthetic MDPs.
 """
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -45,7 +44,7 @@ from scb.environments.synthetic import (
 )
 from scb.environments.synthetic_mdp import PARAMETERIZATIONS, SyntheticMDP, synthetic_for
 from scb.environments.zoo import open_bandit
-from scb.errors import UserError, at_least, unknown_name
+from scb.errors import UserError, at_least, positive, unknown_name
 from scb.evolution import EnvironmentSteps, EvolutionConfig, Outcome, evolve
 from scb.keys import named_key, root_key, split_key
 from scb.lists import read_lists, write_lists
@@ -160,10 +159,7 @@ class DiscoveryConfig:
             raise UserError(
                 "fixed hyperparameters are not drawn from lists: leave out the lists, or draw."
             )
-        if self.reward_std is not None and not 0 < self.reward_std < math.inf:
-            raise UserError(
-                f"reward_std is {self.reward_std}: it must be larger than 0, and finite."
-            )
+        positive(self, "reward_std")
         if self.reward_std is not None and self.parameterization != "I":
             raise UserError(
                 f"reward_std is for bandits, and parameterization {self.parameterization} is none: leave it out."

@@ -1,6 +1,7 @@
 """The one exception that means "the input was wrong", so that a command line can tell it from a bug."""
 
-from collections.abc import Iterable
+import math
+from collections.abc import Callable, Iterable, Mapping
 from difflib import get_close_matches
 
 
@@ -12,11 +13,30 @@ class UserError(Exception):
 
 
 def at_least(minimum: int, of: object = None, *names: str, **values: float | None) -> None:
-    """Raises a UserError where a value, or an attribute `of` something by these names, is smaller; None is not."""
+    """Raises a UserError where a value, or an attribute `of` something by these names, is smaller or not finite.
+
+    None is neither.
+    """
+    allowed = f"at least {minimum}" if minimum else "0 or larger"
+    _check(lambda value: minimum <= value < math.inf, allowed, of, names, values)
+
+
+def positive(of: object = None, *names: str, **values: float | None) -> None:
+    """As `at_least`, where a value is not larger than 0, or not finite."""
+    _check(lambda value: 0 < value < math.inf, "positive", of, names, values)
+
+
+def _check(
+    holds: Callable[[float], bool],
+    allowed: str,
+    of: object,
+    names: Iterable[str],
+    values: Mapping[str, float | None],
+) -> None:
     for name, value in {**{name: getattr(of, name) for name in names}, **values}.items():
-        if value is not None and not value >= minimum:
-            allowed = f"at least {minimum}" if minimum else "0 or larger"
-            raise UserError(f"{name} is {value}: it must be {allowed}.")
+        if value is not None and not holds(value):
+            finite = ", and finite" if isinstance(value, float) else ""
+            raise UserError(f"{name} is {value}: it must be {allowed}{finite}.")
 
 
 def unknown_name(kind: str, name: str, known: Iterable[str]) -> UserError:

@@ -25,7 +25,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, Ti
 from scipy.stats import rankdata
 
 from scb.artefacts import machine_description
-from scb.errors import UserError, at_least, unknown_name
+from scb.errors import UserError, at_least, positive, unknown_name
 from scb.keys import key_at, root_key, split_key
 from scb.runs import Checkpoints, Run, Stopwatch
 from scb.seeds import VALIDATING, searching
@@ -108,9 +108,8 @@ class EvolutionConfig:
         counts = ("num_generations", "mean_evaluations", "evaluate_mean_every", "checkpoint_every")
         at_least(1, self, *counts)
         searching(self.seed)
-        for field in ("sigma", "learning_rate", "sigma_decay", "learning_rate_decay"):
-            if not getattr(self, field) > 0:
-                raise UserError(f"{field} is {getattr(self, field)}: it must be positive.")
+        positive(self, "sigma", "sigma_decay", "learning_rate", "learning_rate_decay")
+        at_least(0, self, "sigma_limit", "learning_rate_limit")
 
 
 @dataclass(frozen=True)

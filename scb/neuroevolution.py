@@ -15,7 +15,7 @@ from gymnax.environments import environment, spaces
 
 from scb.agents import networks
 from scb.agents.agent import clip_to_space, scale_to_space
-from scb.errors import UserError
+from scb.errors import at_least
 from scb.evaluation import Policy, evaluate
 from scb.keys import split_key
 
@@ -38,9 +38,8 @@ class NeuroevolutionConfig:
     activation: str = "tanh"
 
     def __post_init__(self) -> None:
-        for name, least in (("population_size", 2), ("num_generations", 1), ("episodes", 1)):
-            if getattr(self, name) < least:
-                raise UserError(f"{name} is {getattr(self, name)}: it must be at least {least}.")
+        at_least(2, self, "population_size")
+        at_least(1, self, "num_generations", "episodes")
 
 
 def policy_network(

@@ -76,8 +76,9 @@ class WarmStartConfig:
         experts = ("auto", "evolution", *ALGORITHMS)
         if self.expert not in experts:
             raise unknown_name("expert", self.expert, experts)
-        if not 0 <= self.min_spread < np.inf:
-            raise UserError(f"min_spread is {self.min_spread}: it must be 0 or larger, and finite.")
+        at_least(0, self, "min_spread")
+        if not 0 <= self.discount <= 1:
+            raise UserError(f"discount is {self.discount}: it must be between 0 and 1.")
         if self.min_spread > 0 and self.construction != "action_distance":
             raise UserError(
                 f"min_spread is {self.min_spread}, which the construction {self.construction} cannot use: "

@@ -1,6 +1,5 @@
 """What every drift is, and the shape that learned ones and formulas share: a correction of a base."""
 
-import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
@@ -12,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from scb.agents.ppo import clipped_surrogate_drift, relu
-from scb.errors import UserError, unknown_name
+from scb.errors import UserError, at_least, unknown_name
 from scb.keys import root_key
 
 # Any: an array of JAX, NumPy or PyTorch; `xp` below is its library.
@@ -116,8 +115,7 @@ class CorrectedDrift(Drift):
     gate: float = 0.1
 
     def __post_init__(self) -> None:
-        if not 0 <= self.gate < math.inf:
-            raise UserError(f"gate is {self.gate}: it must be 0 or larger, and finite.")
+        at_least(0, self, "gate")
         if self.base not in BASES:
             raise unknown_name("drift base", self.base, BASES)
         if not (self.clip > 0 and self.xi > 0):

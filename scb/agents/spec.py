@@ -4,7 +4,6 @@
 trains in an environment itself.
 """
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cache
@@ -105,8 +104,8 @@ class AgentSpec:
                 raise UserError(
                     f"{self.algorithm} has no {name}: known are {', '.join((*static, *traced))}."
                 )
-            if isinstance(value, int | float) and not 0 <= value < math.inf:
-                raise UserError(f"{name} is {value}: it must be 0 or larger, and finite.")
+            if isinstance(value, int | float):
+                at_least(0, **{name: value})
         return replace(
             self,
             config=replace(self.config, **{k: v for k, v in values.items() if k in static}),

@@ -498,6 +498,10 @@ def test_physics_go_to_the_environment_and_not_to_its_bandit(
         ({"evaluation_episodes": -1}, "evaluation_episodes is -1: it must be at least 1."),
         ({"contexts": 0}, "contexts is 0: it must be at least 1."),
         ({"reward_noise": -0.1}, "reward_noise is -0.1: it must be 0 or larger, and finite."),
+        (
+            {"initial_scale": float("nan")},
+            "initial_scale is nan: it must be 0 or larger, and finite.",
+        ),
         ({"reward_noise": float("nan")}, "reward_noise is nan"),
         ({"reward_noise": float("inf")}, "reward_noise is inf"),
     ],

@@ -25,7 +25,6 @@ from scb.environments.zoo import (
     bandit_metadata,
     load_bandit,
     save_bandit,
-    save_synthetic_mdp,
     zoo_names,
 )
 from scb.errors import UserError
@@ -435,7 +434,7 @@ def test_a_synthetic_mdp_is_discovered_and_opens_as_an_environment(parameterizat
     assert [line["failed"] for line in outcome.metrics] == [0, 0]
     assert shapes(outcome.mean) == problem.bandit.weight_shapes()
     metadata = {**METADATA, "config": {"evaluation_environment": "CartPole-v1"}}
-    path = save_synthetic_mdp(tmp_path / "mdp.npz", problem.bandit, outcome.mean, metadata)
+    path = save_bandit(tmp_path / "mdp.npz", problem.bandit, outcome.mean, metadata)
     env, env_params = make(str(path))
     assert env.config.parameterization == parameterization
     assert env_params.max_steps_in_episode == 5
@@ -613,8 +612,8 @@ def test_the_inner_loop_is_the_papers_where_no_agent_is_given():
             "unknown environment 'Pendulum-v2': did you mean Pendulum",
         ),
         ({"start": "Synthetic-Pendulum"}, "unknown bandit 'Synthetic-Pendulum'"),
-        ({"reward_std": 0.0}, "reward_std is 0.0: it must be larger than 0, and finite."),
-        ({"reward_std": float("inf")}, "reward_std is inf: it must be larger than 0"),
+        ({"reward_std": 0.0}, "reward_std is 0.0: it must be positive, and finite."),
+        ({"reward_std": float("inf")}, "reward_std is inf: it must be positive, and finite"),
         ({"reward_std": 1.0, "parameterization": "TI"}, "reward_std is for bandits, and"),
         ({"mode": "al"}, "unknown mode 'al': did you mean all"),
         ({"parameterization": "IT"}, "unknown parameterization 'IT': did you mean"),

@@ -591,6 +591,7 @@ def test_progress_says_fitness_failures_and_time_left(capsys):
         ({"sigma": math.nan}, "sigma is nan: it must be positive"),
         ({"learning_rate": -1.0}, "learning_rate is -1.0: it must be positive"),
         ({"sigma_decay": 0.0}, "sigma_decay is 0.0: it must be positive"),
+        ({"sigma_limit": math.nan}, "sigma_limit is nan: it must be 0 or larger, and finite"),
     ],
 )
 def test_impossible_configurations_are_refused(arguments, message):

@@ -434,6 +434,7 @@ def test_evolution_gets_the_papers_curriculum_at_its_own_length(monkeypatch):
         ({"expert": "pop"}, "unknown expert 'pop': did you mean ppo"),
         ({"min_spread": -1.0}, "min_spread is -1.0: it must be 0 or larger, and finite"),
         ({"min_spread": float("nan")}, "min_spread is nan: it must be 0 or larger, and finite"),
+        ({"discount": 2.0}, "discount is 2.0: it must be between 0 and 1."),
         ({"min_spread": float("inf")}, "min_spread is inf: it must be 0 or larger, and finite"),
         ({"min_spread": 1.0, "construction": "q"}, "which the construction q cannot use"),
         ({"min_spread": 1.0, "construction": "advantage"}, "construction advantage cannot use"),
