@@ -77,7 +77,10 @@ def test_what_cannot_be_ranked_is_refused(fitness, outcome, message, one_sentenc
         ({"bandit": "Pendulum-v1"}, "a regime asks for a bandit, and 'Pendulum-v1' is none"),
         ({"iterations": 0}, "iterations is 0: it must be at least 1."),
         ({"reward_noise": -1.0}, "reward_noise is -1.0: it must be 0 or larger, and finite."),
-        ({"reward_noise": float("inf")}, "reward_noise is inf: it must be 0 or larger, and finite."),
+        (
+            {"reward_noise": float("inf")},
+            "reward_noise is inf: it must be 0 or larger, and finite.",
+        ),
     ],
 )
 def test_a_regime_that_cannot_be_is_refused(arguments, message, one_sentence):
