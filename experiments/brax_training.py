@@ -26,6 +26,7 @@ from scb.agents.spec import AgentSpec, bandit_agent, environment_agent
 from scb.environments.registry import environment_spec
 from scb.environments.zoo import bandit_metadata, open_bandit
 from scb.importer import PUBLISHED_BANDITS, published_bandit
+from scb.rows import pivot
 from scb.seeds import REPORTING
 from scb.statistics import estimate
 
@@ -121,7 +122,7 @@ def _curves(
     size = {"points": plan["points"], "episodes": plan["episodes"]}
     rows = measurement.measure(spec, train_in, judge_in, agents, **size)
     seconds = time.monotonic() - start
-    returns = measurement.pivot(rows, "agent", "step")
+    returns = pivot(rows, "agent", "step")
     # What is no number counts as the agent before its training.
     usable = np.isfinite(returns)
     return {

@@ -31,8 +31,9 @@ from scb.environments.zoo import bandit_metadata, open_bandit
 from scb.evaluation import evaluate
 from scb.evolution import map_population
 from scb.keys import root_key, split_key
-from scb.measurement import Agents, Place, pivot
+from scb.measurement import Agents, Place
 from scb.neuroevolution import NeuroevolutionConfig, evolve_policy
+from scb.rows import pivot
 from scb.seeds import REPORTING
 from scb.statistics import (
     Estimate,

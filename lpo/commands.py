@@ -40,7 +40,8 @@ from scb.console import console
 from scb.environments.registry import environment_spec
 from scb.errors import UserError, at_least
 from scb.files import make_folder, write_json
-from scb.measurement import Place, Rows, check_seeds
+from scb.measurement import Place, check_seeds
+from scb.rows import Rows
 from scb.runs import config_dict
 from scb.statistics import estimate
 

@@ -14,7 +14,8 @@ import numpy as np
 from lpo.objectives import Objective
 from scb.agents.spec import AgentSpec, environment_agent
 from scb.errors import UserError
-from scb.measurement import MODE, SAMPLED, Place, Rows, measure, pivot
+from scb.measurement import MODE, SAMPLED, Place, measure
+from scb.rows import Rows, pivot
 from scb.statistics import Estimate, estimate, paired_difference
 
 

@@ -32,7 +32,7 @@ from scb.console import console
 from scb.environments.registry import make
 from scb.evolution import EnvironmentSteps
 from scb.files import write_json
-from scb.measurement import Rows
+from scb.rows import Rows
 from scb.runs import Run, Stopwatch, config_dict
 from scb.seeds import reporting
 

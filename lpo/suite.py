@@ -16,7 +16,7 @@ from lpo.objectives import Objective
 from scb.agents.spec import environment_agent
 from scb.environments.registry import environment_spec, families
 from scb.errors import UserError, unknown_name
-from scb.measurement import Rows
+from scb.rows import Rows
 from scb.statistics import Estimate, iqm, normalized_score
 
 # Resampling is over seeds within environments, on [objectives, environments, seeds].

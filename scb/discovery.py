@@ -48,7 +48,8 @@ from scb.errors import UserError, at_least, positive, unknown_name
 from scb.evolution import EnvironmentSteps, EvolutionConfig, Outcome, evolve
 from scb.keys import named_key, root_key, split_key
 from scb.lists import read_lists, write_lists
-from scb.measurement import MODE, SAMPLED, Agents, Judge, Place, measure, pivot, train_and_judge
+from scb.measurement import MODE, SAMPLED, Agents, Judge, Place, measure, train_and_judge
+from scb.rows import pivot
 from scb.runs import Run, Stopwatch
 from scb.warm_start import (
     WarmStartConfig,

@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from scb.errors import UserError
 
 
@@ -29,6 +31,13 @@ def cannot_write(folder: Path, flag: str = "--out", reason: str | None = None) -
     return UserError(
         f"cannot write to {folder}{said}: choose another {flag}, a folder that you may write to."
     )
+
+
+def plain(number: Any) -> float | int | None:
+    """A number as JSON takes it, which has no NaN and no infinity."""
+    if not np.isfinite(number):
+        return None
+    return int(number) if isinstance(number, int | np.integer) else float(number)
 
 
 def write_bytes(path: Path, content: bytes) -> None:

@@ -2,19 +2,13 @@
 
 `train_and_judge` is the traced core, of one agent: pure, so that searches call it inside their own
 `vmap`. `measure` maps it over agents and devices and keeps a row for every agent and point of its
-training, agent by agent, so that a measurement that was killed goes on where it stopped.
-
-A file of rows is JSON Lines: `pandas.read_json("rows.jsonl", lines=True)`. Under which configuration a
-row was measured is in the .json beside it, by the digest in its column `configuration`.
+training, agent by agent (`scb.rows`), so that a measurement that was killed goes on where it stopped.
 """
 
-import hashlib
-import json
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields, is_dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 from operator import itemgetter
-from pathlib import Path
 from typing import Any, NamedTuple, Protocol, TypeVar
 
 import jax
@@ -30,11 +24,10 @@ from scb.environments.registry import environment_spec
 from scb.errors import UserError, at_least
 from scb.evaluation import Episodes
 from scb.evolution import map_population
-from scb.files import write_json, write_text
+from scb.files import plain
 from scb.keys import root_key, split_key
-from scb.runs import first_difference
+from scb.rows import Row, Rows
 
-Row = dict[str, Any]
 MODE, SAMPLED = "mode", "sampled"
 # Steps of a training from which a CPU trains only as many agents at a time as it has devices.
 LONG = 250_000
@@ -209,7 +202,7 @@ def measure(
     points: int | None = None,
     episodes: int = 20,
     actions: Sequence[str] = (MODE,),
-    rows: "Rows | None" = None,
+    rows: Rows | None = None,
     side_by_side: int | None = None,
     tell: Callable[[str], None] = lambda line: None,
 ) -> list[Row]:
@@ -261,6 +254,7 @@ def measure(
     configuration = {
         "agent": {n: getattr(spec, n) for n in ("config", "hyperparameters", "lists")},
         "trained_in": params[0],
+        "judged_in": params[1],
         "points": points,
         "episodes": episodes,
         "actions": list(actions),
@@ -309,8 +303,8 @@ def measure(
                         {
                             "step": step,
                             "actions": kind,
-                            "return": _plain(np.ravel(earned[kind][0][position])[point]),
-                            "length": _plain(np.ravel(earned[kind][1][position])[point]),
+                            "return": plain(np.ravel(earned[kind][0][position])[point]),
+                            "length": plain(np.ravel(earned[kind][1][position])[point]),
                             **drawn,
                         }
                         for point, step in enumerate(steps)
@@ -376,149 +370,3 @@ def _program(
         return {k: (x.returns.mean(-1), x.lengths.mean(-1)) for k, x in earned.items()}
 
     return map_population(one, size, (0, 0, *(None for x in numbers if x is None)))
-
-
-# -- rows -----------------------------------------------------------------------------------------
-
-
-_AGENT = ("environment", "backend", "trained_in", "algorithm", "objective", "seed", "agent")
-
-
-class Rows:
-    """Tidy rows, in memory or in a file that grows an agent at a time.
-
-    Args:
-      path: of a .jsonl file, new or with rows to go on from; the half line that a kill left at its end
-        is dropped. None: memory alone.
-
-    Raises:
-      UserError: the file cannot be read, or holds something else.
-    """
-
-    def __init__(self, path: str | Path | None = None) -> None:
-        self.path = None if path is None else Path(path)
-        self.rows: list[Row] = []
-        self._configurations: dict[str, Any] = {}
-        if self.path is None or not self.path.exists():
-            return
-        try:
-            self._configurations = dict(json.loads(self._described.read_text()))
-            lines = self.path.read_text().split("\n")
-            self.rows = [json.loads(line) for line in lines[:-1]]
-            complete = all(
-                row.keys() >= {*_AGENT, "configuration"}
-                and row["configuration"] in self._configurations
-                for row in self.rows
-            )
-        except (OSError, TypeError, ValueError, AttributeError) as error:
-            raise UserError(
-                f"{self.path} cannot be read, with the .json beside it ({error}): choose another file."
-            ) from error
-        if not complete:
-            raise UserError(f"{self.path} holds no rows of a measurement: choose another file.")
-        if lines[-1]:
-            self._write()
-
-    @property
-    def _described(self) -> Path:
-        assert self.path is not None
-        return self.path.with_suffix(".json")
-
-    def cell(self, columns: Mapping[str, Any], configuration: Any, number: int) -> "Cell":
-        """What is there of agents with these columns, each of `number` rows; a part of an agent is dropped."""
-        described = json.loads(json.dumps(configuration, default=_description, sort_keys=True))
-        digest = hashlib.sha256(json.dumps(described, sort_keys=True).encode()).hexdigest()[:12]
-        there = [row for row in self.rows if all(row[n] == x for n, x in columns.items())]
-        for row in there:
-            if row["configuration"] != digest:
-                other = self._configurations[row["configuration"]]
-                raise UserError(
-                    f"{self.path or 'the rows'} were measured under another configuration: it differs at "
-                    f"{first_difference(other, described)}; choose another file, or measure as then."
-                )
-        if self.path is not None and digest not in self._configurations:
-            self._configurations[digest] = described
-            write_json(self._described, self._configurations)
-        done: dict[tuple[int, int], list[Row]] = {}
-        for row in there:
-            done.setdefault((row["seed"], row["agent"]), []).append(row)
-        if parts := [name for name, of_it in done.items() if len(of_it) != number]:
-            dropped = {id(row) for name in parts for row in done.pop(name)}
-            self.rows = [row for row in self.rows if id(row) not in dropped]
-            self._write()
-        return Cell(self, {**columns}, digest, done)
-
-    def add(self, rows: Sequence[Row]) -> None:
-        """Appends an agent's rows."""
-        if self.path is not None:
-            with self.path.open("a") as file:
-                file.write("".join(_line(row) for row in rows))
-        self.rows += rows
-
-    def _write(self) -> None:
-        if self.path is not None:
-            write_text(self.path, "".join(map(_line, self.rows)))
-
-
-@dataclass(frozen=True)
-class Cell:
-    """The agents of one environment, algorithm and objective, and their rows: {(seed, number): rows}."""
-
-    rows: Rows
-    columns: Row
-    digest: str
-    done: dict[tuple[int, int], list[Row]]
-
-    def add(self, agent: tuple[int, int], results: Sequence[Row]) -> None:
-        """Keeps an agent's results."""
-        seed, number = agent
-        self.done[agent] = [
-            {**self.columns, "seed": seed, "agent": number, **row, "configuration": self.digest}
-            for row in results
-        ]
-        self.rows.add(self.done[agent])
-
-
-def pivot(rows: Iterable[Row], *axes: str, value: str = "return") -> np.ndarray:
-    """One column of the rows as an array with an axis for each of these columns, such as objective, seed, step.
-
-    Along an axis labels stand as they first appear. What is no number is NaN.
-
-    Raises:
-      ValueError: two rows for one place, or none.
-    """
-    rows = list(rows)
-    labels = [list(dict.fromkeys(row[axis] for row in rows)) for axis in axes]
-    positions = [{label: i for i, label in enumerate(of_it)} for of_it in labels]
-    filled = np.zeros([len(of_it) for of_it in labels], int)
-    array = np.full(filled.shape, np.nan)
-    for row in rows:
-        place = tuple(at[row[axis]] for at, axis in zip(positions, axes, strict=True))
-        filled[place] += 1
-        array[place] = np.nan if row[value] is None else row[value]
-    if not (filled == 1).all():
-        raise ValueError(f"the rows are not one for every combination of {', '.join(axes)}.")
-    return array
-
-
-def _line(row: Row) -> str:
-    return json.dumps(row, allow_nan=False) + "\n"
-
-
-def _plain(number: Any) -> float | None:
-    return float(number) if np.isfinite(number) else None  # JSON has no NaN
-
-
-def _description(value: Any) -> Any:
-    """Of what JSON doesn't know: large arrays by their digest."""
-    if is_dataclass(value) and not isinstance(value, type):
-        parts = {field.name: getattr(value, field.name) for field in fields(value)}
-        return {"class": type(value).__name__, **parts}
-    if isinstance(value, Mapping):
-        return dict(value)
-    array = np.asarray(value)
-    if array.dtype == object:
-        return repr(value)
-    if array.size > 8:
-        return {"shape": array.shape, "sha256": hashlib.sha256(array.tobytes()).hexdigest()}
-    return array.tolist()

@@ -23,7 +23,7 @@ import orbax.checkpoint as ocp
 from tensorboardX import SummaryWriter
 
 from scb.errors import UserError
-from scb.files import cannot_write, make_folder, write_text
+from scb.files import cannot_write, make_folder, plain, write_text
 
 
 class Run:
@@ -98,7 +98,7 @@ class Run:
 
     def log(self, generation: int, metrics: Mapping[str, float], seconds: float) -> None:
         """Appends one generation to every log."""
-        line = {"generation": generation, **{k: _plain(v) for k, v in metrics.items()}}
+        line = {"generation": generation, **{k: plain(v) for k, v in metrics.items()}}
         with (self.folder / "metrics.jsonl").open("a") as file:
             file.write(json.dumps(line) + "\n")
         with (self.folder / "timing.jsonl").open("a") as file:
@@ -242,13 +242,6 @@ def _digest(leaves: Mapping[str, Any]) -> str:
         digest.update(f"{name}:{array.dtype}:{array.shape}".encode())
         digest.update(np.ascontiguousarray(array).tobytes())
     return digest.hexdigest()
-
-
-def _plain(value: Any) -> float | int | None:
-    number = float(value)
-    if not np.isfinite(number):
-        return None  # JSON has no NaN
-    return int(number) if isinstance(value, int | np.integer) else number
 
 
 def first_difference(stored: Any, given: Any, path: str = "") -> str:

@@ -13,7 +13,7 @@ from lpo.objectives import load_objective
 from lpo.pipeline import RunAll
 from scb.agents.ppo import PPOConfig, PPOHyperparameters
 from scb.agents.spec import AgentSpec
-from scb.measurement import pivot
+from scb.rows import pivot
 from tests.recording import recorded_seeds
 
 

@@ -14,7 +14,8 @@ from scb import measurement
 from scb.agents.ppo import PPOConfig, PPOHyperparameters, clipped_surrogate_drift
 from scb.agents.spec import AgentSpec
 from scb.errors import UserError
-from scb.measurement import Agents, Judge, Place, Rows, measure, pivot, spaced, train_and_judge
+from scb.measurement import Agents, Judge, Place, measure, spaced, train_and_judge
+from scb.rows import Rows, pivot
 
 # Seven batches of eight contexts, which have no divisor near three points: nine are trained.
 CONFIG = PPOConfig(
@@ -172,6 +173,28 @@ def test_rows_of_another_configuration_are_refused(copy, measured, changes, diff
         measured(copy, **changes)
     assert f"it differs at {difference}" in str(error.value)
     assert copy.read_bytes() == before
+
+
+def test_rows_of_another_evaluation_environment_are_refused(copy, measured, bandit):
+    noisy = Place(bandit.name, bandit.env, bandit.params.replace(reward_noise=1.0))
+    with pytest.raises(
+        UserError, match=r"differs at judged_in\.reward_noise \(0\.0 there, 1\.0 now"
+    ):
+        measured(copy, judge_in=noisy)
+
+
+def test_rows_from_before_the_evaluation_environment_was_written_down_are_taken(
+    copy, file, measured, monkeypatch
+):
+    described, text = json.loads(copy.with_suffix(".json").read_text()), copy.read_text()
+    for i, digest in enumerate(list(described)):
+        del described[digest]["judged_in"]
+        described[f"old {i}"] = described.pop(digest)
+        text = text.replace(digest, f"old {i}")
+    copy.with_suffix(".json").write_text(json.dumps(described))
+    copy.write_text(text)
+    monkeypatch.delattr(measurement, "_program_of")
+    assert [row["return"] for row in measured(copy)] == [row["return"] for row in file[1]]
 
 
 @pytest.mark.parametrize("content", ["[1]\n", "no rows\n", '{"a": 1}\n'])

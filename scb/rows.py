@@ -1,0 +1,159 @@
+"""Tidy rows: what a measurement keeps, agent by agent, in memory or in a file that survives a kill.
+
+A file of rows is JSON Lines: `pandas.read_json("rows.jsonl", lines=True)`. Under which configuration a
+row was measured is in the .json beside it, by the digest in its column `configuration`.
+"""
+
+import hashlib
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, fields, is_dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from scb.errors import UserError
+from scb.files import write_json, write_text
+from scb.runs import first_difference
+
+Row = dict[str, Any]
+_AGENT = ("environment", "backend", "trained_in", "algorithm", "objective", "seed", "agent")
+
+
+class Rows:
+    """Tidy rows, in memory or in a file that grows an agent at a time.
+
+    Args:
+      path: of a .jsonl file, new or with rows to go on from; the half line that a kill left at its end
+        is dropped. None: memory alone.
+
+    Raises:
+      UserError: the file cannot be read, or holds something else.
+    """
+
+    def __init__(self, path: str | Path | None = None) -> None:
+        self.path = None if path is None else Path(path)
+        self.rows: list[Row] = []
+        self._configurations: dict[str, Any] = {}
+        if self.path is None or not self.path.exists():
+            return
+        try:
+            self._configurations = dict(json.loads(self._described.read_text()))
+            lines = self.path.read_text().split("\n")
+            self.rows = [json.loads(line) for line in lines[:-1]]
+            complete = all(
+                row.keys() >= {*_AGENT, "configuration"}
+                and row["configuration"] in self._configurations
+                for row in self.rows
+            )
+        except (OSError, TypeError, ValueError, AttributeError) as error:
+            raise UserError(
+                f"{self.path} cannot be read, with the .json beside it ({error}): choose another file."
+            ) from error
+        if not complete:
+            raise UserError(f"{self.path} holds no rows of a measurement: choose another file.")
+        if lines[-1]:
+            self._write()
+
+    @property
+    def _described(self) -> Path:
+        assert self.path is not None
+        return self.path.with_suffix(".json")
+
+    def cell(self, columns: Mapping[str, Any], configuration: Any, number: int) -> "Cell":
+        """What is there of agents with these columns, each of `number` rows; a part of an agent is dropped."""
+        described = json.loads(json.dumps(configuration, default=_description, sort_keys=True))
+        digest = hashlib.sha256(json.dumps(described, sort_keys=True).encode()).hexdigest()[:12]
+        there = [row for row in self.rows if all(row[n] == x for n, x in columns.items())]
+        for other in {row["configuration"] for row in there} - {digest}:
+            stored = self._configurations[other]
+            # What an earlier version did not write down is not compared.
+            difference = first_difference(stored, {name: described.get(name) for name in stored})
+            if difference:
+                raise UserError(
+                    f"{self.path or 'the rows'} were measured under another configuration: it differs at "
+                    f"{difference}; choose another file, or measure as then."
+                )
+        if self.path is not None and digest not in self._configurations:
+            self._configurations[digest] = described
+            write_json(self._described, self._configurations)
+        done: dict[tuple[int, int], list[Row]] = {}
+        for row in there:
+            done.setdefault((row["seed"], row["agent"]), []).append(row)
+        if parts := [name for name, of_it in done.items() if len(of_it) != number]:
+            dropped = {id(row) for name in parts for row in done.pop(name)}
+            self.rows = [row for row in self.rows if id(row) not in dropped]
+            self._write()
+        return Cell(self, {**columns}, digest, done)
+
+    def add(self, rows: Sequence[Row]) -> None:
+        """Appends an agent's rows."""
+        if self.path is not None:
+            with self.path.open("a") as file:
+                file.write("".join(_line(row) for row in rows))
+        self.rows += rows
+
+    def _write(self) -> None:
+        if self.path is not None:
+            write_text(self.path, "".join(map(_line, self.rows)))
+
+
+@dataclass(frozen=True)
+class Cell:
+    """The agents of one environment, algorithm and objective, and their rows: {(seed, number): rows}."""
+
+    rows: Rows
+    columns: Row
+    digest: str
+    done: dict[tuple[int, int], list[Row]]
+
+    def add(self, agent: tuple[int, int], results: Sequence[Row]) -> None:
+        """Keeps an agent's results."""
+        seed, number = agent
+        self.done[agent] = [
+            {**self.columns, "seed": seed, "agent": number, **row, "configuration": self.digest}
+            for row in results
+        ]
+        self.rows.add(self.done[agent])
+
+
+def pivot(rows: Iterable[Row], *axes: str, value: str = "return") -> np.ndarray:
+    """One column of the rows as an array with an axis for each of these columns, such as objective, seed, step.
+
+    Along an axis labels stand as they first appear. What is no number is NaN.
+
+    Raises:
+      ValueError: two rows for one place, or none.
+    """
+    rows = list(rows)
+    labels = [list(dict.fromkeys(row[axis] for row in rows)) for axis in axes]
+    positions = [{label: i for i, label in enumerate(of_it)} for of_it in labels]
+    filled = np.zeros([len(of_it) for of_it in labels], int)
+    array = np.full(filled.shape, np.nan)
+    for row in rows:
+        place = tuple(at[row[axis]] for at, axis in zip(positions, axes, strict=True))
+        filled[place] += 1
+        array[place] = np.nan if row[value] is None else row[value]
+    if not (filled == 1).all():
+        raise ValueError(f"the rows are not one for every combination of {', '.join(axes)}.")
+    return array
+
+
+def _line(row: Row) -> str:
+    return json.dumps(row, allow_nan=False) + "\n"
+
+
+def _description(value: Any) -> Any:
+    """Of what JSON doesn't know: large arrays by their digest."""
+    if is_dataclass(value) and not isinstance(value, type):
+        parts = {field.name: getattr(value, field.name) for field in fields(value)}
+        return {"class": type(value).__name__, **parts}
+    if isinstance(value, Mapping):
+        return dict(value)
+    array = np.asarray(value)
+    if array.dtype == object:
+        return repr(value)
+    if array.size > 8:
+        return {"shape": array.shape, "sha256": hashlib.sha256(array.tobytes()).hexdigest()}
+    return array.tolist()
