@@ -10,7 +10,7 @@ makes it rank objectives almost as the environment does.
 """
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Annotated, Any
@@ -27,7 +27,7 @@ from lpo.objectives import Objective, load_objective, save_objective
 from scb.agents.ppo import PPOConfig, PPOHyperparameters
 from scb.agents.spec import AgentSpec, check_lists, environment_agent
 from scb.command_line import listed, numbers, text
-from scb.environments.registry import environment_spec, families
+from scb.environments.registry import environment_spec
 from scb.environments.spec import EnvironmentSpec, Made
 from scb.environments.zoo import bandit_metadata
 from scb.errors import UserError, at_least, unknown_name
@@ -131,8 +131,12 @@ class MetaTrainingConfig:
                     f"fitness {self.fitness!r} asks for a bandit, and {name!r} is none: use 'return' or 'area', or "
                     f"train on {environment_spec(name).bandit!r}."
                 )
-        if self.validation and len(self.homes) > 1:
-            _check_references(self.homes, self.backend)
+        known = {n: environment_spec(n).reference(self.backend) is not None for n in self.homes}
+        if self.validation and len(known) > 1 and not all(known.values()):
+            raise UserError(
+                "validation on several environments needs a reference return of each, and "
+                f"{', '.join(n for n in known if not known[n])} has none: leave out its task, or validation."
+            )
         if self.agent is not None and len(self.tasks) > 1:
             raise UserError(
                 "one agent configuration does not fit several tasks: leave it out, and each takes its own."
@@ -172,20 +176,9 @@ class MetaTrainingConfig:
         """Where fitness is earned."""
         return self.homes if self.judgement.at_home else self.tasks
 
-
-def _check_references(names: Sequence[str], backend: str | None) -> None:
-    known = [
-        name
-        for family in families().values()
-        for name in family.suite
-        if environment_spec(name).reference(backend)
-    ]
-    unknown = [name for name in names if environment_spec(name).reference(backend) is None]
-    if unknown:
-        raise UserError(
-            f"validation on several environments needs a reference return of each, and {', '.join(unknown)} has "
-            f"none: take {', '.join(known)}, or leave validation out."
-        )
+    def at_home(self) -> "MetaTrainingConfig":
+        """The same on the tasks' evaluation environments themselves."""
+        return replace(self, tasks=self.homes, fitness="return", agent=None)
 
 
 def task_agent(task: str, contexts: int) -> AgentSpec:
@@ -304,22 +297,16 @@ class MetaTraining:
         self.config = config
         self.tasks = {name: TaskTraining(config, name) for name in config.tasks}
         self.judges = self.tasks
-        # {judge: (return that counts as 0, return that counts as 1)}.
-        self.scales = dict.fromkeys(config.tasks, (0.0, 1.0))
         if config.validation:
-            homes = config.homes
-            own = replace(config, tasks=homes, fitness="return", agent=None, horizons=())
-            self.judges = {name: TaskTraining(own, name) for name in homes}
-            self.scales = dict.fromkeys(homes, (0.0, 1.0))
-            if len(homes) > 1:
-                specs = map(environment_spec, homes)
-                self.scales = {
-                    spec.name: (
-                        spec.random_return(config.backend),
-                        spec.reference_return(config.backend),
-                    )
-                    for spec in specs
-                }
+            own = replace(config.at_home(), horizons=())
+            self.judges = {name: TaskTraining(own, name) for name in own.tasks}
+        # {judge: (return that counts as 0, return that counts as 1)}.
+        self.scales = dict.fromkeys(self.judges, (0.0, 1.0))
+        if config.validation and len(self.judges) > 1:
+            specs, backend = map(environment_spec, self.judges), config.backend
+            self.scales = {
+                s.name: (s.random_return(backend), s.reference_return(backend)) for s in specs
+            }
 
     def initial_solution(self, key: jax.Array) -> Any:
         return self.config.drift.init(key, self.config.initial_scale)
@@ -338,22 +325,20 @@ class MetaTraining:
             name: task.fitness(candidate, key_task, config.agents_per_candidate, horizon)
             for key_task, (name, task) in zip(keys, self.tasks.items(), strict=True)
         }
-        apart = {} if len(fitness) == 1 else {f"fitness/{n}": x.mean() for n, x in fitness.items()}
-        return {"fitness": jnp.concatenate(list(fitness.values())), **apart}
+        combined = jnp.concatenate(list(fitness.values()))
+        return {"fitness": combined, **_apart({name: x.mean() for name, x in fitness.items()})}
 
     def evaluate_mean(self, candidate: Any, key: jax.Array) -> dict[str, jax.Array]:
+        keys = split_key(key, len(self.judges))
         fitness = {
             name: task.fitness(candidate, key_judge, 1)[0]
-            for key_judge, (name, task) in zip(
-                split_key(key, len(self.judges)), self.judges.items(), strict=True
-            )
+            for key_judge, (name, task) in zip(keys, self.judges.items(), strict=True)
         }
-        apart = {} if len(fitness) == 1 else {f"fitness/{n}": x for n, x in fitness.items()}
         scores = [
             (x - zero) / (one - zero)
             for x, (zero, one) in zip(fitness.values(), self.scales.values(), strict=True)
         ]
-        return {"fitness": jnp.stack(scores).mean(), **apart}
+        return {"fitness": jnp.stack(scores).mean(), **_apart(fitness)}
 
     def steps(self) -> EnvironmentSteps:
         """Of one candidate; with random horizons the mean over them."""
@@ -368,9 +353,14 @@ class MetaTraining:
         return _sum(judge.steps(1) for judge in self.judges.values())
 
 
+def _apart(fitness: Mapping[str, jax.Array]) -> dict[str, jax.Array]:
+    """For the log, where there are several."""
+    return {} if len(fitness) == 1 else {f"fitness/{name}": x for name, x in fitness.items()}
+
+
 def _sum(counts: Iterable[EnvironmentSteps]) -> EnvironmentSteps:
-    training, evaluation = zip(*((c.training, c.evaluation) for c in counts), strict=True)
-    return EnvironmentSteps(sum(training), sum(evaluation))
+    counts = list(counts)
+    return EnvironmentSteps(sum(c.training for c in counts), sum(c.evaluation for c in counts))
 
 
 def meta_train(config: MetaTrainingConfig, run: Run | None = None, quiet: bool = False) -> Outcome:
@@ -400,7 +390,7 @@ def learn_objective(
 
 def environment_problem(config: MetaTrainingConfig) -> MetaTraining:
     """The same meta-training on the bandits' evaluation environments themselves."""
-    return MetaTraining(replace(config, tasks=config.homes, fitness="return", agent=None))
+    return MetaTraining(config.at_home())
 
 
 def _story(problem: MetaTraining, outcome: Outcome, mean: Any, command: str) -> dict[str, Any]:

@@ -173,15 +173,6 @@ def run_pipeline(run: Run, config: PipelineConfig, preset: str, command: str) ->
     return report.write_report(folder, results, paths)
 
 
-def check_pipeline(config: PipelineConfig) -> None:
-    """Raises the UserError that `run_pipeline` would, without doing anything."""
-    if config.objective is None:
-        for name in config.meta_training.tasks:
-            make(name)
-    else:
-        _with_references(load_objective(config.objective))
-
-
 def reporting_seeds(seed: int, count: int) -> list[int]:
     """The seeds that judge a run of this seed."""
     return reporting(count, offset=1000 * (seed % 20))
@@ -266,6 +257,11 @@ class RunAll(LongRun):
     output: Output = field(default_factory=lambda: Output(Path("runs/quick")))
 
     def run(self) -> None:
-        check_pipeline(self.config)  # a mistake must not leave a folder behind
+        # A mistake must not leave a folder behind.
+        if self.config.objective is None:
+            for task in self.config.meta_training.tasks:
+                make(task)
+        else:
+            _with_references(load_objective(self.config.objective))
         report = run_pipeline(self.open(), self.config, self.preset, self.command)
         console().print(f"report: {report}", soft_wrap=True)

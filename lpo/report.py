@@ -10,25 +10,17 @@ import struct
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import jinja2
 
 from lpo.certificate import LARGEST_KINK, Certificate
-from scb.errors import UserError
 from scb.plotting import ratio_text, thousands
-
-if TYPE_CHECKING:
-    pass
-
-SCHEMA_VERSION = 1
 
 Verdict = Literal["better", "worse", "undecided", "one seed", "not compared"]
 
 # Below this many seeds the bootstrap's intervals are too narrow (see `scb.statistics`).
 _FEW_SEEDS = 10
-_PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
-_OWN_FIGURES = ("meta_training", "environment_steps", "drift_heatmaps")
 _NAMES = {"ppo": "PPO's clip"}
 
 
@@ -50,23 +42,25 @@ class Headline:
         return f"{self.before}{self.number}{self.after}"
 
 
-def headline(results: Mapping[str, Any]) -> Headline:
-    """The difference between the learned objective and the reference, where it was learned for.
+def headlines(results: Mapping[str, Any]) -> list[Headline]:
+    """The differences between the learned objective and the references; first where it was learned for.
 
     That is the meta-training's environment, or the one that its bandit stands for; without a
-    comparison there, the first comparison that holds the objective.
+    comparison there, the first comparison that holds the objective. The rest must not be hidden.
 
     Args:
       results: as in `write_report`.
     """
     name = results["objective"]["name"]
-    comparisons = results["comparisons"]
-    home = results.get("meta_training", {}).get("evaluation_environment")
-    for environment in [e for e in (home, *comparisons) if e in comparisons]:
-        comparison = comparisons[environment]
-        if name in comparison["paired_differences"]:
-            return _sentence(name, environment, comparison)
-    return Headline("not compared", f"{name} was compared with no other objective.")
+    compared = {
+        environment: _sentence(name, environment, comparison)
+        for environment, comparison in results["comparisons"].items()
+        if name in comparison["paired_differences"]
+    }
+    home = results["meta_training"].get("evaluation_environment")
+    first = [compared.pop(home)] if home in compared else []
+    said = [*first, *compared.values()]
+    return said or [Headline("not compared", f"{name} was compared with no other objective.")]
 
 
 def write_report(folder: Path, results: Mapping[str, Any], figures: Mapping[str, Path]) -> Path:
@@ -77,37 +71,21 @@ def write_report(folder: Path, results: Mapping[str, Any], figures: Mapping[str,
     Args:
       folder: must exist.
       results: plain JSON types:
-        schema_version: 1.
         preset, command: strings; the command reproduces the run.
         versions, machine: {name: text}.
-        seconds: wall-clock of the whole run.
-        objective: {"name", "certificate": `Certificate.as_dict()`}; the certificate is optional.
-        meta_training (optional): {"environment", "evaluation_environment", "config" (nested), "seconds", "generations",
+        seconds: wall-clock of the whole run (optional).
+        objective: {"name", "certificate": `Certificate.as_dict()`}.
+        meta_training: {"environment", "evaluation_environment", "config" (nested), "seconds", "generations",
           "steps": {"training", "evaluation", "total"} of all candidates, "environment_steps":
-          the same for meta-training on the environment itself (optional)}.
+          the same for meta-training on the environment itself}; empty where nothing was learned.
         comparisons: {environment: `Comparison.as_dict()`}.
       figures: PNG files by the function that drew them ("meta_training" for the curve,
         "environment_steps", "drift_heatmaps"), and learning curves by their environment, as in
-        `comparisons`. Any may be missing; others are shown at the end under their name.
+        `comparisons`. Any may be missing.
 
     Returns:
       The path of the page.
-
-    Raises:
-      UserError: another schema version, a missing part of `results`, or a figure that is no PNG.
     """
-    version = results.get("schema_version")
-    if version != SCHEMA_VERSION:
-        raise UserError(
-            f"the results have schema version {version}, this version reads {SCHEMA_VERSION}: "
-            "write the report with the version that made them, or run again."
-        )
-    missing = [key for key in ("objective", "comparisons") if key not in results]
-    if missing:
-        raise UserError(
-            f"the results lack {' and '.join(missing)}: a report shows an objective and its "
-            "comparisons, so run both first."
-        )
     page = _environment().get_template("report.html.j2").render(_context(results, figures))
     path = Path(folder) / "report.html"
     path.write_text(page, encoding="utf-8")
@@ -118,21 +96,22 @@ def _sentence(name: str, environment: str, comparison: Mapping[str, Any]) -> Hea
     difference = comparison["paired_differences"][name]
     reference = _NAMES.get(comparison["reference"], comparison["reference"])
     verdict = _verdict(difference)
-    openings = {
-        "better": f"{name} ends better than {reference} on {environment}",
-        "worse": f"{name} ends worse than {reference} on {environment}",
-        "undecided": f"No difference between {name} and {reference} could be shown on "
-        f"{environment}",
-        "one seed": f"One seed cannot tell {name} from {reference} on {environment}",
-    }
-    protocols = {
-        "one seed": "a single seed, so no interval",
-        "undecided": f"{difference['n']} paired seeds; the 95 % interval includes zero",
-    }
-    protocol = protocols.get(verdict, f"{difference['n']} paired seeds, 95 % interval")
+    seeds = f"{difference['n']} paired seeds"
+    opening, protocol = {
+        "better": (f"{name} ends better than {reference}", f"{seeds}, 95 % interval"),
+        "worse": (f"{name} ends worse than {reference}", f"{seeds}, 95 % interval"),
+        "undecided": (
+            f"No difference between {name} and {reference} could be shown",
+            f"{seeds}; the 95 % interval includes zero",
+        ),
+        "one seed": (
+            f"One seed cannot tell {name} from {reference}",
+            "a single seed, so no interval",
+        ),
+    }[verdict]
     return Headline(
         verdict,
-        f"{openings[verdict]}: the difference in final return is ",
+        f"{opening} on {environment}: the difference in final return is ",
         _interval(difference, signed=True),
         f" ({name} minus {comparison['reference']}; interquartile means of {protocol}).",
     )
@@ -234,15 +213,8 @@ def _flatten(value: Any, name: str = "") -> Iterator[tuple[str, str]]:
 
 
 def _embed(path: Path) -> dict[str, Any]:
-    try:
-        data = Path(path).read_bytes()
-    except OSError as error:
-        raise UserError(
-            f"cannot read the figure {path} ({error.strerror}): save it before writing the report."
-        ) from error
-    if not data.startswith(_PNG_SIGNATURE) or len(data) < 24:
-        raise UserError(f"{path} is no PNG: save figures with scb.plotting.save.")
-    width, height = struct.unpack(">II", data[16:24])
+    data = path.read_bytes()
+    width, height = struct.unpack(">II", data[16:24])  # of a PNG
     encoded = base64.b64encode(data).decode("ascii")
     return {"source": f"data:image/png;base64,{encoded}", "width": width, "height": height}
 
@@ -271,16 +243,7 @@ def _certificate_rows(certificate: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 
 def _meta_training(meta: Mapping[str, Any]) -> dict[str, Any]:
-    steps, other = meta["steps"], meta.get("environment_steps")
-    rows = [
-        {
-            "what": kind,
-            "here": thousands(steps[kind]),
-            "there": thousands(other[kind]) if other else "",
-            "ratio": ratio_text(steps[kind], other[kind]) if other else "",
-        }
-        for kind in ("training", "evaluation", "total")
-    ]
+    steps, other = meta["steps"], meta["environment_steps"]
     return {
         "environment": meta["environment"],
         "home": meta["evaluation_environment"],
@@ -288,8 +251,15 @@ def _meta_training(meta: Mapping[str, Any]) -> dict[str, Any]:
         "duration": _duration(meta["seconds"]),
         "total": thousands(steps["total"]),
         "config": list(_flatten(meta["config"])),
-        "rows": rows,
-        "compared": other is not None,
+        "rows": [
+            (
+                kind,
+                thousands(steps[kind]),
+                thousands(other[kind]),
+                ratio_text(steps[kind], other[kind]),
+            )
+            for kind in ("training", "evaluation", "total")
+        ],
     }
 
 
@@ -306,46 +276,25 @@ def _comparison(name: str, comparison: Mapping[str, Any], learned: str) -> dict[
     }
 
 
-def _elsewhere(results: Mapping[str, Any], said: Headline) -> list[Headline]:
-    # The headline must not hide where the objective did worse.
-    name = results["objective"]["name"]
-    sentences = [
-        _sentence(name, environment, comparison)
-        for environment, comparison in results["comparisons"].items()
-        if name in comparison["paired_differences"]
-    ]
-    return [sentence for sentence in sentences if sentence != said]
-
-
 def _context(results: Mapping[str, Any], figures: Mapping[str, Path]) -> dict[str, Any]:
-    objective = results["objective"]
-    certificate = objective.get("certificate")
-    comparisons = results["comparisons"]
-    meta = results.get("meta_training")
-    embedded = {name: _embed(path) for name, path in figures.items()}
-    first = headline(results)
-    known = {*_OWN_FIGURES, *comparisons}
+    objective, meta = results["objective"], results["meta_training"]
+    first, *elsewhere = headlines(results)
     return {
         "name": objective["name"],
-        "preset": results.get("preset"),
+        "preset": results["preset"],
         "headline": first,
-        "elsewhere": _elsewhere(results, first),
+        "elsewhere": elsewhere,
         "comparisons": [
             _comparison(name, comparison, objective["name"])
-            for name, comparison in comparisons.items()
+            for name, comparison in results["comparisons"].items()
         ],
         "meta": _meta_training(meta) if meta else None,
-        "certificate": Certificate(**certificate) if certificate else None,
-        "certificate_rows": _certificate_rows(certificate) if certificate else [],
-        "figures": embedded,
-        "further": [name for name in embedded if name not in known],
-        "command": results.get("command"),
+        "certificate": Certificate(**objective["certificate"]),
+        "certificate_rows": _certificate_rows(objective["certificate"]),
+        "figures": {name: _embed(path) for name, path in figures.items()},
+        "command": results["command"],
         "duration": _duration(results["seconds"]) if "seconds" in results else None,
-        "tables": {
-            name: list(_flatten(results[name]))
-            for name in ("versions", "machine")
-            if results.get(name)
-        },
+        "tables": {name: list(_flatten(results[name])) for name in ("versions", "machine")},
     }
 
 

@@ -66,15 +66,17 @@ class SuiteScores:
         return self._estimates(1.0)
 
     def _estimates(self, times_reference: float) -> list[Estimate]:
-        value, drawn = _aggregate(self.scores), _resampled(self.scores)
-        value = value - times_reference * value[0]
-        low, high = np.percentile(drawn - times_reference * drawn[:, :1], [2.5, 97.5], axis=0)
-        size = int(self.scores[0].size)
+        generator = np.random.default_rng(0)
+        drawn = [_aggregate(_draw(self.scores, generator)) for _ in range(RESAMPLES)]
+        # Resampled or not, alike.
+        found = np.stack([_aggregate(self.scores), *drawn])
+        found = found - times_reference * found[:, :1]
+        size, ends = int(self.scores[0].size), np.percentile(found[1:], [2.5, 97.5], axis=0)
         if self.scores.shape[2] == 1:  # one seed says nothing of its spread
-            return [Estimate(float(v), None, None, size) for v in value]
+            return [Estimate(float(v), None, None, size) for v in found[0]]
         return [
-            Estimate(float(v), float(a), float(b), size)
-            for v, a, b in zip(value, low, high, strict=True)
+            Estimate(float(v), float(low), float(high), size)
+            for v, low, high in zip(found[0], *ends, strict=True)
         ]
 
     def profile(self, thresholds: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -122,15 +124,7 @@ def _aggregate(scores: np.ndarray) -> np.ndarray:
     return np.asarray(iqm(scores.reshape(scores.shape[0], -1), axis=1))
 
 
-def _resampled(scores: np.ndarray) -> np.ndarray:
-    generator = np.random.default_rng(0)
-    return np.stack([_aggregate(_draw(scores, generator)) for _ in range(RESAMPLES)])
-
-
-def suite_scores(
-    comparisons: Mapping[str, Comparison],
-    random: Mapping[str, float],
-) -> SuiteScores:
+def suite_scores(comparisons: Mapping[str, Comparison], random: Mapping[str, float]) -> SuiteScores:
     """Normalises the final returns of comparisons that share objectives and numbers of seeds.
 
     Args:
@@ -140,30 +134,24 @@ def suite_scores(
     Raises:
       UserError: other objectives or numbers of seeds in one than in another; no environment left.
     """
-    kept: list[str] = []
-    left_out: list[str] = []
-    scores, floors, ceilings, sources = [], [], [], []
+    normalisation, scores = [], []
     objectives = [c.objective for c in next(iter(comparisons.values())).curves]
     for name, comparison in comparisons.items():
         if [c.objective for c in comparison.curves] != objectives:
             raise UserError(f"{name} was run with other objectives than the rest: run all alike.")
         finals = np.stack([c.final for c in comparison.curves])
         reference, source = reference_of(name, comparison)
-        if not reference > random[name]:
-            left_out.append(name)
-            continue
-        kept.append(name)
-        scores.append(normalized_score(finals, random[name], reference))
-        floors.append(random[name])
-        ceilings.append(reference)
-        sources.append(source)
-    if not kept:
+        if reference > random[name]:
+            normalisation.append((name, random[name], reference, source))
+            scores.append(normalized_score(finals, random[name], reference))
+    if not scores:
         raise UserError("no objective is better than random actions anywhere: train longer.")
     if len({s.shape for s in scores}) > 1:
         raise UserError("environments were run with different numbers of seeds: run all alike.")
-    return SuiteScores(
-        kept, objectives, np.stack(scores, axis=1), floors, ceilings, sources, left_out
-    )
+    kept, floors, ceilings, sources = map(list, zip(*normalisation, strict=True))
+    left_out = [name for name in comparisons if name not in kept]
+    stacked = np.stack(scores, axis=1)
+    return SuiteScores(kept, objectives, stacked, floors, ceilings, sources, left_out)
 
 
 def reference_of(name: str, comparison: Comparison) -> tuple[float, str]:

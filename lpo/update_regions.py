@@ -50,7 +50,6 @@ class Analysis:
       log_ratios, advantages: [R] in nats, and [A] in standard deviations of a minibatch; neither
         holds a 0, where there is no direction to judge.
       drift: [A, R] f.
-      slope: [A, R] df/dr.
       gradient: [A, R] d(r A - f)/d(log r), of the whole objective.
       relative: [A, R] h, the share of the surrogate's gradient that is left.
       regions: [A, R] index into the names of `REGIONS`.
@@ -68,7 +67,6 @@ class Analysis:
     log_ratios: NDArray[np.floating]
     advantages: NDArray[np.floating]
     drift: NDArray[np.floating]
-    slope: NDArray[np.floating]
     gradient: NDArray[np.floating]
     relative: NDArray[np.floating]
     regions: NDArray[np.integer]
@@ -113,8 +111,7 @@ def analyze(
         if not values.all():
             raise UserError(f"the {name} hold a 0, where no direction can be judged: leave it out.")
     drift, gradient = surface(objective, x, a, progress)
-    surrogate = np.exp(x) * a[:, None]
-    relative = gradient / surrogate
+    relative = gradient / (np.exp(x) * a[:, None])
     regions = classify(relative, x, a)
     weights = np.broadcast_to(np.exp(-0.5 * a**2)[:, None], regions.shape)
     past = (x * a[:, None] > 0.0) & (np.abs(np.expm1(x)) > CLIP)
@@ -125,7 +122,6 @@ def analyze(
         log_ratios=x,
         advantages=a,
         drift=drift,
-        slope=(surrogate - gradient) / np.exp(x),
         gradient=gradient,
         relative=relative,
         regions=regions,

@@ -487,7 +487,7 @@ def test_physics_go_to_the_environment_and_not_to_its_bandit(
                 "validation": True,
                 "backend": "spring",
             },
-            "needs a reference return of each, and hopper has none: take CartPole-v1",
+            "needs a reference return of each, and hopper has none: leave out its task",
         ),
         ({"horizons": (0.5, 0.0)}, "a horizon is 0.0: it must be larger than 0"),
         (

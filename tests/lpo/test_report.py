@@ -14,7 +14,6 @@ from matplotlib.figure import Figure
 from lpo import report
 from lpo.comparison import Comparison, LearningCurves
 from scb import plotting
-from scb.errors import UserError
 
 VOID = {"meta", "link", "img", "br", "hr"}
 
@@ -89,7 +88,6 @@ def results(**changes: Any) -> dict[str, Any]:
         "grid": "11 log-ratios",
     }
     made: dict[str, Any] = {
-        "schema_version": 1,
         "preset": "quick",
         "command": "lpo run --preset quick",
         "versions": {"jax": "0.10.2"},
@@ -162,7 +160,7 @@ def test_the_page_shows_cost_certificate_configuration_and_how_to_repeat_it(tmp_
 def test_names_are_escaped(tmp_path):
     evil = "<script>alert('x')</script>"
     made = results(
-        objective={"name": evil},
+        objective=results()["objective"] | {"name": evil},
         comparisons={f"<b>{evil}": comparison(learned=evil).as_dict()},
         command=f"lpo run --objective {evil}",
         machine={evil: "<img src=x>"},
@@ -188,13 +186,10 @@ def test_images_are_embedded_whole_and_once(tmp_path, picture):
     assert 'width="200" height="200"' in page.source  # 1 inch at 200 dpi
 
 
-def test_learning_curves_stand_with_their_environment_and_strangers_at_the_end(tmp_path, picture):
-    page = write(tmp_path, hopper=picture, **{"something else": picture})
-    own, stranger = (
-        page.source.index(f'alt="{start}') for start in ("Return on hopper", "something else")
-    )
+def test_learning_curves_stand_with_their_environment(tmp_path, picture):
+    page = write(tmp_path, hopper=picture)
+    own = page.source.index('alt="Return on hopper')
     assert page.source.index("<h3>hopper</h3>") < own < page.source.index("Meta-training</h2>")
-    assert page.source.index("Further figures") < stranger
 
 
 @pytest.mark.parametrize(
@@ -210,7 +205,7 @@ def test_learning_curves_stand_with_their_environment_and_strangers_at_the_end(t
 )
 def test_the_headline_claims_only_what_the_interval_allows(tmp_path, low, high, verdict, said):
     made = results(comparisons={"Pendulum-v1": difference(low, high)})
-    headline = report.headline(made)
+    headline = report.headlines(made)[0]
     assert headline.verdict == verdict
     assert said in str(headline)
     assert ("better" in str(headline)) == (verdict == "better")
@@ -218,21 +213,21 @@ def test_the_headline_claims_only_what_the_interval_allows(tmp_path, low, high, 
 
 def test_the_headline_gives_the_difference_with_its_sign_and_interval():
     made = results(comparisons={"Pendulum-v1": difference(-31.2, -8.9, value=-20.4)})
-    assert "−20 [−31, −9] (mine minus ppo" in str(report.headline(made))
-    assert "20 paired seeds, 95 % interval" in str(report.headline(made))
+    assert "−20 [−31, −9] (mine minus ppo" in str(report.headlines(made)[0])
+    assert "20 paired seeds, 95 % interval" in str(report.headlines(made)[0])
 
 
 def test_the_headline_is_about_the_environment_that_the_bandit_stands_for():
     made = results(comparisons={"hopper": difference(1, 2), "Pendulum-v1": difference(-2, -1)})
-    assert report.headline(made).verdict == "worse"
+    assert report.headlines(made)[0].verdict == "worse"
     # Learned elsewhere altogether: the first comparison.
-    del made["meta_training"]
-    assert report.headline(made).verdict == "better"
+    made["meta_training"] = {}
+    assert report.headlines(made)[0].verdict == "better"
 
 
 def test_a_worse_result_elsewhere_stands_beside_a_good_headline(tmp_path):
     page = write(tmp_path)
-    assert report.headline(results()).verdict == "better"
+    assert report.headlines(results())[0].verdict == "better"
     before_the_results = page.text.partition("Results")[0]
     assert "mine ends worse than PPO's clip on hopper" in before_the_results
 
@@ -247,7 +242,7 @@ def test_an_objective_that_was_not_compared_is_not_praised(tmp_path):
 def test_an_end_of_an_interval_is_never_rounded_to_zero():
     # Two digits of the half-width 20 are no decimals, which would print the lower end as 0.
     made = results(comparisons={"Pendulum-v1": difference(0.04, 40.0, value=20.0)})
-    assert "+20.00 [+0.04, +40.00]" in str(report.headline(made))
+    assert "+20.00 [+0.04, +40.00]" in str(report.headlines(made)[0])
 
 
 @pytest.mark.parametrize(("seeds", "warned"), [(1, True), (5, True), (20, False)])
@@ -273,36 +268,8 @@ def test_a_failed_certificate_is_not_hidden(tmp_path):
     assert "smallest penalty f -0.25 ≥ 0 no" in text
 
 
-def test_what_was_not_done_is_not_shown(tmp_path):
-    made = results(objective={"name": "mine"})
-    del made["meta_training"]
-    text = write(tmp_path, made).text
-    for absent in ("Meta-training", "Certificate", "The objective", "Further figures"):
-        assert absent not in text
-
-
-def test_a_meta_training_without_its_counterpart_shows_its_own_steps(tmp_path):
-    made = results()
-    del made["meta_training"]["environment_steps"]
-    text = write(tmp_path, made).text
-    assert "on Synthetic-Pendulum-v1 training 1" in text
-    assert "fewer" not in text
-
-
 def test_results_read_from_a_file_give_the_same_bytes(tmp_path, picture):
     made = results()
     first = report.write_report(tmp_path, made, {"hopper": picture}).read_bytes()
     again = json.loads(json.dumps(made))
     assert report.write_report(tmp_path, again, {"hopper": picture}).read_bytes() == first
-
-
-def test_what_cannot_be_reported_is_refused_in_one_sentence(tmp_path, picture):
-    with pytest.raises(UserError, match="schema version 2"):
-        report.write_report(tmp_path, results(schema_version=2), {})
-    with pytest.raises(UserError, match="lack objective and comparisons"):
-        report.write_report(tmp_path, {"schema_version": 1}, {})
-    with pytest.raises(UserError, match=r"cannot read the figure .*absent\.png"):
-        report.write_report(tmp_path, results(), {"hopper": tmp_path / "absent.png"})
-    picture.write_bytes(b"<svg/>")
-    with pytest.raises(UserError, match="is no PNG"):
-        report.write_report(tmp_path, results(), {"hopper": picture})

@@ -50,9 +50,8 @@ def test_ppo_is_flat_beyond_its_clip_and_free_elsewhere():
     assert analysis.fractions["flat"] == pytest.approx(2 / 8)
     assert analysis.fractions["free"] == pytest.approx(6 / 8)
     assert analysis.beyond["positive"]["flat"] == analysis.beyond["negative"]["flat"] == 1.0
-    # f = (0.8 - 0.6) 1 and (1.5 - 1.2) 1, with slopes df/dr of A; the gradient is r A elsewhere.
+    # f = (0.8 - 0.6) 1 and (1.5 - 1.2) 1; the gradient is r A elsewhere.
     np.testing.assert_allclose(analysis.drift, [[0.2, 0, 0, 0], [0, 0, 0, 0.3]], atol=1e-6)
-    np.testing.assert_allclose(analysis.slope, [[-1, 0, 0, 0], [0, 0, 0, 1]], atol=1e-6)
     np.testing.assert_allclose(
         analysis.gradient, [[0, -0.9, -1.1, -1.5], [0.6, 0.9, 1.1, 0]], atol=1e-6
     )
