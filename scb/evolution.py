@@ -1,56 +1,33 @@
 """The outer loop of both discoveries: evolve a pytree of weights by what it is worth after an inner training.
 
 Bandit discovery and objective discovery differ only in what a candidate is. This module owns what
-they share: the strategy (any of evosax's by name), common random numbers across a population, what
+they share: common random numbers across a population, what
 a failed candidate gets, the sign, sharding over devices, the evaluation of the search
 distribution's mean, checkpoints, resume, and logs.
 """
 
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from functools import lru_cache
+from dataclasses import dataclass
 from typing import Annotated, Any, Protocol
 
-import evosax.algorithms
 import jax
-import jax.flatten_util
 import jax.numpy as jnp
 import numpy as np
-import optax
 import tyro
 from jax.sharding import NamedSharding, PartitionSpec
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from scipy.stats import rankdata
 
 from scb.artefacts import machine_description
+from scb.console import Progress
 from scb.errors import UserError, at_least, positive, unknown_name
+from scb.files import plain
 from scb.keys import key_at, root_key, split_key
 from scb.runs import Checkpoints, Run, Stopwatch
 from scb.seeds import VALIDATING, searching
 from scb.statistics import iqm
-
-# These take constructor arguments of their own that no common configuration can supply.
-_UNSUPPORTED = {"RandomSearch", "SV_CMA_ES", "SV_Open_ES"}
-# These estimate a gradient and hand it to an optimiser; the others' update rules set their own
-# step.
-_GRADIENT_ESTIMATING = {
-    "ARS",
-    "ASEBO",
-    "ESMC",
-    "GuidedES",
-    "NoiseReuseES",
-    "Open_ES",
-    "PersistentES",
-    "PGPE",
-}
-STRATEGIES: dict[str, Any] = {
-    name: algorithm
-    for name, algorithm in evosax.algorithms.algorithms.items()
-    if name not in _UNSUPPORTED
-}
-
+from scb.strategies import STRATEGIES, has_mean, strategy_for
 
 COMBINATIONS = ("mean", "ranks")
 
@@ -186,11 +163,6 @@ class Outcome:
         }
 
 
-def has_mean(config: EvolutionConfig) -> bool:
-    """Whether the strategy has a mean; others keep a population, and have nothing to judge before the first tell."""
-    return config.strategy in evosax.algorithms.distribution_based_algorithms
-
-
 def combine_tasks(fitness: np.ndarray, how: str) -> np.ndarray:
     """One number a candidate from one number a candidate and task.
 
@@ -263,90 +235,6 @@ def map_population(
     return call
 
 
-class _Strategy:
-    """An evosax strategy behind one interface. Runs on one device; fitness comes and goes through the host."""
-
-    def __init__(self, config: EvolutionConfig, solution: Any) -> None:
-        algorithm = STRATEGIES[config.strategy]
-        self.has_mean = has_mean(config)
-        arguments: dict[str, Any] = {}
-        accepted = algorithm.__init__.__annotations__
-        scheduled = "std_schedule" in accepted
-        if scheduled:
-            arguments["std_schedule"] = lambda generation: jnp.maximum(
-                config.sigma * config.sigma_decay**generation, config.sigma_limit
-            )
-        if config.strategy in _GRADIENT_ESTIMATING:
-            arguments["optimizer"] = optax.adam(
-                lambda count: jnp.maximum(
-                    config.learning_rate * config.learning_rate_decay**count,
-                    config.learning_rate_limit,
-                )
-            )
-        try:
-            self._algorithm = algorithm(config.population_size, solution, **arguments)
-        except AssertionError as error:
-            # Antithetic pairs, groups, subspaces: what each strategy asserts about sizes.
-            weights = sum(np.size(leaf) for leaf in jax.tree.leaves(solution))
-            raise UserError(
-                f"{config.strategy} does not take a population_size of {config.population_size} for {weights} weights "
-                f"({error}): choose another size or strategy."
-            ) from error
-        self._params = self._algorithm.default_params
-        if hasattr(self._params, "std_init"):
-            # evosax starts SNES at a standard deviation of 1; the paper's is 0.05.
-            self._params = self._params.replace(std_init=config.sigma)
-        self._sigma = config.sigma
-        self._size = config.population_size
-
-    def start(self, key: jax.Array, solution: Any) -> Any:
-        if self.has_mean:
-            return self._algorithm.init(key, solution, self._params)
-        key_population, key_init = split_key(key)
-        flat, unravel = jax.flatten_util.ravel_pytree(solution)
-        noise = jax.random.normal(key_population, (self._size, flat.size))
-        population = jax.vmap(unravel)(flat + self._sigma * noise.at[0].set(0.0))
-        # Worse than anything evaluated, but finite: strategies that standardise would make NaN of
-        # infinity.
-        unknown = jnp.full(self._size, 1e9)
-        return self._algorithm.init(key_init, population, unknown, self._params)
-
-    def ask(self, key: jax.Array, state: Any) -> tuple[Any, Any]:
-        return self._algorithm.ask(key, state, self._params)
-
-    def tell(self, key: jax.Array, population: Any, fitness: np.ndarray, state: Any) -> Any:
-        # The one negation of the project: fitness is maximised everywhere, evosax minimises.
-        state, _ = self._algorithm.tell(key, population, -jnp.asarray(fitness), state, self._params)
-        return state
-
-    def mean(self, state: Any) -> Any:
-        """The search distribution's mean; for strategies that keep a population, the best solution told so far."""
-        if self.has_mean:
-            return self._algorithm.get_mean(state)
-        return self._algorithm._unravel_solution(state.best_solution)
-
-
-def _strategy(config: EvolutionConfig, solution: Any) -> _Strategy:
-    """One for all searches that differ in nothing it sees: evosax compiles anew for every algorithm made."""
-    leaves, structure = jax.tree.flatten(solution)
-    shapes = tuple((np.shape(leaf), jnp.result_type(leaf)) for leaf in leaves)
-    config = replace(
-        config,
-        num_generations=1,
-        combine="mean",
-        mean_evaluations=1,
-        evaluate_mean_every=1,
-        checkpoint_every=1,
-        seed=0,
-    )
-    return _shared_strategy(config, structure, shapes)
-
-
-@lru_cache(maxsize=8)
-def _shared_strategy(config: EvolutionConfig, structure: Any, shapes: Any) -> _Strategy:
-    return _Strategy(config, jax.tree.unflatten(structure, [jnp.zeros(*x) for x in shapes]))
-
-
 def evolve(
     problem: Problem,
     config: EvolutionConfig,
@@ -374,7 +262,7 @@ def evolve(
     key = root_key(config.seed) if key is None else key
     key_solution, key_strategy, key_generations, key_mean = split_key(key, 4)
     solution = problem.initial_solution(key_solution)
-    strategy = _strategy(config, solution)
+    strategy = strategy_for(config, solution)
     state = {
         "strategy": strategy.start(key_strategy, solution),
         "best_mean": solution,
@@ -385,22 +273,19 @@ def evolve(
     checkpoints = Checkpoints(run.folder) if run else None
     first = 0
     if run and checkpoints and run.resumed:
-        restored = checkpoints.restore(state)
-        if restored is not None:
-            first, state, damaged = restored
-        for step in [] if restored is None else damaged:
+        first, state, damaged = checkpoints.restore(state)
+        if not first:
+            console.print("no checkpoint could be read: starting again at generation 0.")
+        for step in damaged if first else ():
             console.print(
                 f"checkpoint {step} is damaged: resuming from checkpoint {first} before it."
             )
-        if restored is None:
-            console.print("no checkpoint could be read: starting again at generation 0.")
         run.rewind(first)
 
     evaluate = map_population(problem.evaluate, config.population_size, (0, None, None))
     evaluate_mean = map_population(problem.evaluate_mean, config.mean_evaluations, (None, 0))
     steps = problem.steps()
-    history: list[dict[str, Any]] = [] if run is None else run.metrics()
-    total_seconds = 0.0
+    history, total_seconds = (run.metrics(), run.seconds()) if run else ([], 0.0)
     watch = Stopwatch()
 
     def judged(solution: Any, key: jax.Array) -> dict[str, np.ndarray]:
@@ -423,7 +308,7 @@ def evolve(
             state["best_mean_generation"] = jnp.int32(generation)
         return {f"mean/{name}": value for name, value in {**outcome, **middles}.items()}
 
-    with _progress(console, config.num_generations, first) as advance:
+    with Progress(console, config.num_generations, first) as advance:
         for generation in range(first, config.num_generations):
             key_ask, key_evaluate, key_tell = split_key(key_at(key_generations, generation), 3)
             metrics: dict[str, Any] = {}
@@ -470,7 +355,7 @@ def evolve(
             total_seconds += seconds
             if run:
                 run.log(generation, metrics, seconds)
-            history.append({"generation": generation, **metrics})
+            history.append({"generation": generation, **{k: plain(v) for k, v in metrics.items()}})
             if checkpoints and (last or (generation + 1) % config.checkpoint_every == 0):
                 checkpoints.save(generation + 1, state)
             advance(metrics, seconds)
@@ -480,48 +365,7 @@ def evolve(
         mean=jax.device_get(strategy.mean(state["strategy"])),
         best_mean=jax.device_get(state["best_mean"]),
         best_mean_generation=int(state["best_mean_generation"]),
-        metrics=run.metrics() if run else history,
-        seconds=run.seconds() if run else total_seconds,
+        metrics=history,
+        seconds=total_seconds,
         validate=lambda solution: judged(solution, root_key(VALIDATING.start)),
     )
-
-
-class _progress:
-    """A bar with fitness and time left on a terminal; a line now and then elsewhere (a log file, CI)."""
-
-    def __init__(self, console: Console, total: int, first: int) -> None:
-        self._console, self._total, self._done = console, total, first
-        self._seconds: list[float] = []
-        self._bar = Progress(
-            TextColumn("generation {task.completed}/{task.total}"),
-            BarColumn(),
-            TextColumn("{task.fields[fitness]}"),
-            TimeElapsedColumn(),
-            TimeRemainingColumn(),
-            console=console,
-            disable=console.quiet or not console.is_terminal,
-        )
-
-    def __enter__(self) -> Callable[[dict[str, Any], float], None]:
-        self._bar.start()
-        self._task = self._bar.add_task("", total=self._total, completed=self._done, fitness="")
-        return self._advance
-
-    def _advance(self, metrics: dict[str, Any], seconds: float) -> None:
-        self._done += 1
-        self._seconds = [*self._seconds, seconds][-20:]
-        judged = [v for k, v in metrics.items() if k.endswith("mean/fitness")]
-        parts = [f"fitness {metrics['fitness/mean']:.4g}"] if "fitness/mean" in metrics else []
-        parts += [f"mean {value:.4g}" for value in judged[-1:]]
-        parts += [f"{metrics['failed']} failed"] if metrics["failed"] else []
-        text = ", ".join(parts)
-        self._bar.update(self._task, advance=1, fitness=text)
-        milestone = judged or self._done in (1, self._total)
-        if not self._console.is_terminal and milestone:
-            left = float(np.median(self._seconds)) * (self._total - self._done)
-            self._console.print(
-                f"generation {self._done}/{self._total}: {text}, {left / 60:.1f} min left"
-            )
-
-    def __exit__(self, *_: object) -> None:
-        self._bar.stop()

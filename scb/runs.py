@@ -154,14 +154,13 @@ class Checkpoints:
     over for the one before it, and the caller is told.
     """
 
-    def __init__(self, folder: Path, keep: int = 3) -> None:
+    def __init__(self, folder: Path) -> None:
         self.folder = (folder / "checkpoints").resolve()
-        self._keep = keep
         self._manager = self._open()
 
     def _open(self) -> ocp.CheckpointManager:
         return ocp.CheckpointManager(
-            self.folder, options=ocp.CheckpointManagerOptions(max_to_keep=self._keep)
+            self.folder, options=ocp.CheckpointManagerOptions(max_to_keep=3)
         )
 
     def save(self, step: int, state: Any) -> None:
@@ -176,8 +175,8 @@ class Checkpoints:
         )
         self._manager.wait_until_finished()
 
-    def restore(self, template: Any) -> tuple[int, Any, list[int]] | None:
-        """(step, state, steps of unreadable newer checkpoints), or None where no checkpoint can be read."""
+    def restore(self, template: Any) -> tuple[int, Any, list[int]]:
+        """(step, state, steps of unreadable newer checkpoints); step 0 and the template where none can be read."""
         expected = _leaves(template)
         damaged: list[int] = []
         for step in sorted(self._manager.all_steps(), reverse=True):
@@ -189,16 +188,17 @@ class Checkpoints:
                     ),
                 )
                 intact = _digest(restored["state"]) == restored["digest"]["sha256"]
-            except (
-                Exception
-            ):  # orbax and tensorstore raise many kinds for a file that is cut or altered
+                state = _from_leaves(template, restored["state"])
+            # Orbax and tensorstore raise many kinds for a file that is cut or altered.
+            except Exception:
                 intact = False
             if intact:
-                self._discard(damaged)
-                return step, _from_leaves(template, restored["state"]), damaged
+                break
             damaged.append(step)
+        else:
+            step, state = 0, template
         self._discard(damaged)
-        return None
+        return step, state, damaged
 
     def _discard(self, steps: list[int]) -> None:
         # Orbax refuses to save a step that exists, so a damaged one must make room for its

@@ -19,7 +19,6 @@ import scb
 from scb.errors import UserError
 from scb.evolution import (
     COMBINATIONS,
-    STRATEGIES,
     EnvironmentSteps,
     EvolutionConfig,
     combine_tasks,
@@ -28,6 +27,7 @@ from scb.evolution import (
     rank_failed_last,
 )
 from scb.runs import Run, config_dict
+from scb.strategies import STRATEGIES
 from tests.scb.probes import Parabola
 
 CONFIG = EvolutionConfig(

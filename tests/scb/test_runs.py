@@ -183,7 +183,7 @@ def test_the_newest_checkpoint_is_restored_and_only_three_are_kept(tmp_path):
 
 def test_without_checkpoints_there_is_nothing_to_restore(tmp_path):
     checkpoints = Checkpoints(tmp_path)
-    assert checkpoints.restore(state(0)) is None
+    assert_is(checkpoints.restore(state(0)), 0)
     checkpoints.close()
 
 
@@ -229,7 +229,9 @@ def test_where_all_checkpoints_are_damaged_none_is_restored(tmp_path):
     checkpoints.close()
     cut_in_half(tmp_path / "checkpoints" / "1")
     again = Checkpoints(tmp_path)
-    assert again.restore(state(0)) is None
+    step, tree, damaged = again.restore(state(0))
+    assert (step, damaged) == (0, [1])
+    np.testing.assert_array_equal(tree["mean"], state(0)["mean"])
     again.close()
 
 

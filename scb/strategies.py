@@ -1,0 +1,125 @@
+"""Evolution strategies: any of evosax's by name, behind one interface that maximises."""
+
+from dataclasses import replace
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any
+
+import evosax.algorithms
+import jax
+import jax.flatten_util
+import jax.numpy as jnp
+import numpy as np
+import optax
+
+from scb.errors import UserError
+from scb.keys import split_key
+
+if TYPE_CHECKING:
+    from scb.evolution import EvolutionConfig
+
+# These take constructor arguments of their own that no common configuration can supply.
+_UNSUPPORTED = {"RandomSearch", "SV_CMA_ES", "SV_Open_ES"}
+# These estimate a gradient and hand it to an optimiser; the others' update rules set their own
+# step.
+_GRADIENT_ESTIMATING = {
+    "ARS",
+    "ASEBO",
+    "ESMC",
+    "GuidedES",
+    "NoiseReuseES",
+    "Open_ES",
+    "PersistentES",
+    "PGPE",
+}
+STRATEGIES: dict[str, Any] = {
+    name: algorithm
+    for name, algorithm in evosax.algorithms.algorithms.items()
+    if name not in _UNSUPPORTED
+}
+
+
+def has_mean(config: "EvolutionConfig") -> bool:
+    """Whether the strategy has a mean; others keep a population, and have nothing to judge before the first tell."""
+    return config.strategy in evosax.algorithms.distribution_based_algorithms
+
+
+class Strategy:
+    """An evosax strategy behind one interface. Runs on one device; fitness comes and goes through the host."""
+
+    def __init__(self, config: "EvolutionConfig", solution: Any) -> None:
+        algorithm = STRATEGIES[config.strategy]
+        self.has_mean = has_mean(config)
+        arguments: dict[str, Any] = {}
+        if "std_schedule" in algorithm.__init__.__annotations__:
+            arguments["std_schedule"] = lambda generation: jnp.maximum(
+                config.sigma * config.sigma_decay**generation, config.sigma_limit
+            )
+        if config.strategy in _GRADIENT_ESTIMATING:
+            arguments["optimizer"] = optax.adam(
+                lambda count: jnp.maximum(
+                    config.learning_rate * config.learning_rate_decay**count,
+                    config.learning_rate_limit,
+                )
+            )
+        try:
+            self._algorithm = algorithm(config.population_size, solution, **arguments)
+        except AssertionError as error:
+            # Antithetic pairs, groups, subspaces: what each strategy asserts about sizes.
+            weights = sum(np.size(leaf) for leaf in jax.tree.leaves(solution))
+            raise UserError(
+                f"{config.strategy} does not take a population_size of {config.population_size} for {weights} weights "
+                f"({error}): choose another size or strategy."
+            ) from error
+        self._params = self._algorithm.default_params
+        if hasattr(self._params, "std_init"):
+            # evosax starts SNES at a standard deviation of 1; the paper's is 0.05.
+            self._params = self._params.replace(std_init=config.sigma)
+        self._sigma = config.sigma
+        self._size = config.population_size
+
+    def start(self, key: jax.Array, solution: Any) -> Any:
+        if self.has_mean:
+            return self._algorithm.init(key, solution, self._params)
+        key_population, key_init = split_key(key)
+        flat, unravel = jax.flatten_util.ravel_pytree(solution)
+        noise = jax.random.normal(key_population, (self._size, flat.size))
+        population = jax.vmap(unravel)(flat + self._sigma * noise.at[0].set(0.0))
+        # Worse than anything evaluated, but finite: strategies that standardise would make NaN of
+        # infinity.
+        unknown = jnp.full(self._size, 1e9)
+        return self._algorithm.init(key_init, population, unknown, self._params)
+
+    def ask(self, key: jax.Array, state: Any) -> tuple[Any, Any]:
+        return self._algorithm.ask(key, state, self._params)
+
+    def tell(self, key: jax.Array, population: Any, fitness: np.ndarray, state: Any) -> Any:
+        # The one negation of the project: fitness is maximised everywhere, evosax minimises.
+        state, _ = self._algorithm.tell(key, population, -jnp.asarray(fitness), state, self._params)
+        return state
+
+    def mean(self, state: Any) -> Any:
+        """The search distribution's mean; for strategies that keep a population, the best solution told so far."""
+        if self.has_mean:
+            return self._algorithm.get_mean(state)
+        return self._algorithm._unravel_solution(state.best_solution)
+
+
+def strategy_for(config: "EvolutionConfig", solution: Any) -> Strategy:
+    """One for all searches that differ in nothing it sees: evosax compiles anew for every algorithm made."""
+    leaves, structure = jax.tree.flatten(solution)
+    shapes = tuple((np.shape(leaf), jnp.result_type(leaf)) for leaf in leaves)
+    config = replace(
+        config,
+        num_generations=1,
+        combine="mean",
+        mean_evaluations=1,
+        evaluate_mean_every=1,
+        checkpoint_every=1,
+        seed=0,
+    )
+    return _shared_strategy(config, structure, shapes)
+
+
+@lru_cache(maxsize=8)
+def _shared_strategy(config: "EvolutionConfig", structure: Any, shapes: Any) -> Strategy:
+    return Strategy(config, jax.tree.unflatten(structure, [jnp.zeros(*x) for x in shapes]))
