@@ -62,47 +62,29 @@ FITNESS = "return, mode actions"
 CHOICES = ("pendulum", "pendulum_small_last_layer")
 
 
-def recommendation(report: Mapping[str, Any]) -> str:
-    """The regime that ranks best under both initialisations, and where the default stands."""
-    stages = [report["stages"][name] for name in CHOICES if name in report["stages"]]
-    found = {
-        row["name"]: [
-            stage["regimes"][i]["alignment"][FITNESS]["spearman"] or 0.0 for stage in stages
-        ]
-        for i, row in enumerate(stages[0]["regimes"])
-    }
-    means = {name: sum(values) / len(values) for name, values in found.items()}
-    best = max(means, key=lambda name: means[name])
-    default = means["default"]
-    better = sum(value > default for value in means.values())
-    said = (
-        f"By the fitness that `lpo meta-train` uses ({FITNESS}), averaged over both initialisations of the policy on "
-        f"Pendulum, the best of {len(means)} regimes is *{best}* with {means[best]:.2f}; the default has {default:.2f}"
-        + (
-            ", the best."
-            if best == "default"
-            else f", and {better} {'regime is' if better == 1 else 'regimes are'} above it."
-        )
-    )
-    confirmed, carried = [], []
-    for name, stage in report["stages"].items():
-        if name in CHOICES:
-            continue
+def recommendation(report: Mapping[str, Any]) -> dict[str, Any]:
+    """Correlations of the fitness that meta-training uses: each regime's over both choices, and the confirmations'."""
+    stages = report["stages"]
+    chosen = [
+        [x["alignment"][FITNESS]["spearman"] or 0.0 for x in stages[name]["regimes"]]
+        for name in CHOICES
+        if name in stages
+    ]
+    names = [x["name"] for x in stages[CHOICES[0]]["regimes"]]
+    confirmed = {}
+    for name in stages.keys() - set(CHOICES):
         of_regime = {
-            (row["bandit"], row["reward_noise"]): row["alignment"][FITNESS]["spearman"] or 0.0
-            for row in stage["regimes"]
+            (x["bandit"], x["reward_noise"]): x["alignment"][FITNESS]["spearman"] or 0.0
+            for x in stages[name]["regimes"]
         }
-        own, noise = environment_spec(stage["environment"]).bandit, Regime().reward_noise
-        confirmed.append(
-            f"{name} {of_regime[own, noise]:.2f} (without noise {of_regime[own, 0.0]:.2f})"
-        )
-        if own != PENDULUM:
-            carried.append(f"{name} {of_regime[PENDULUM, noise]:.2f}")
-    if confirmed:
-        said += f" Where nothing was chosen, the default on the environment's own bandit has: {', '.join(confirmed)}."
-    if carried:
-        said += f" On Pendulum's bandit: {', '.join(carried)}."
-    return said.replace(" -", " \u2212")
+        own, noise = environment_spec(stages[name]["environment"]).bandit, Regime().reward_noise
+        carried = None if own == PENDULUM else of_regime[PENDULUM, noise]
+        confirmed[name] = (of_regime[own, noise], of_regime[own, 0.0], carried)
+    return {
+        "means": dict(zip(names, np.mean(chosen, axis=0).tolist(), strict=True)),
+        "confirmed": {name: confirmed[name] for name in stages if name in confirmed},
+        "fitness": FITNESS,
+    }
 
 
 def facts(report: Mapping[str, Any]) -> dict[str, Any]:
@@ -118,7 +100,7 @@ def facts(report: Mapping[str, Any]) -> dict[str, Any]:
         for name, stage in report["stages"].items()
     }
     return {
-        "recommendation": recommendation(report),
+        **recommendation(report),
         "tables": tables,
         "fitnesses": list(LABELS),
         "files": {name: figure_name(name) for name in tables},

@@ -20,13 +20,13 @@ from matplotlib.figure import Figure
 
 from experiments import zoo_table, zoo_table_page
 from experiments.claims import Claim
-from experiments.harness import Experiment, Preset, Report, Save
+from experiments.harness import Experiment, Preset, Report, Save, fill
 from scb import measurement, plotting
 from scb.agents.spec import AgentSpec, bandit_agent, environment_agent
 from scb.environments.registry import environment_spec
 from scb.environments.zoo import bandit_metadata, open_bandit
 from scb.importer import PUBLISHED_BANDITS, published_bandit
-from scb.rows import pivot
+from scb.rows import Rows, pivot
 from scb.seeds import REPORTING
 from scb.statistics import estimate
 
@@ -70,21 +70,17 @@ def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None
         bandits.pop(name, None)  # a part of its algorithms can't be shown
     measured = [x for x in plan["bandits"] if x not in left_out]
     for kind, environment, backend in measured:
+        in_bandit = partial(_in_bandit, kind, environment, backend, plan)
         entry = bandits.setdefault(task(kind, environment, backend), {})
-        for algorithm in plan["bandit_algorithms"]:
-            if algorithm not in entry:
-                entry[algorithm] = _in_bandit(kind, environment, backend, algorithm, plan)
-                save()
+        fill(entry, plan["bandit_algorithms"], in_bandit, save)
     for _, environment, backend in measured:
+        in_environment = partial(_in_environment, environment, backend, plan)
         entry = environments.setdefault(place(environment, backend), {})
-        for algorithm in plan["environment_algorithms"]:
-            if algorithm not in entry:
-                entry[algorithm] = _in_environment(environment, backend, algorithm, plan)
-                save()
+        fill(entry, plan["environment_algorithms"], in_environment, save)
 
 
 def _in_bandit(
-    kind: str, environment: str, backend: str | None, algorithm: str, plan: Mapping[str, Any]
+    kind: str, environment: str, backend: str | None, plan: Mapping[str, Any], algorithm: str
 ) -> dict[str, Any]:
     if kind == OURS:
         bandit = open_bandit(environment_spec(environment).bandit)
@@ -102,7 +98,7 @@ def _in_bandit(
 
 
 def _in_environment(
-    environment: str, backend: str | None, algorithm: str, plan: Mapping[str, Any]
+    environment: str, backend: str | None, plan: Mapping[str, Any], algorithm: str
 ) -> dict[str, Any]:
     spec = environment_agent(algorithm, environment).with_steps(plan["environment_steps"])
     place = measurement.Place.named(environment, backend)
@@ -120,8 +116,11 @@ def _curves(
     start = time.monotonic()
     agents = measurement.Agents.drawn_from(spec, REPORTING.start, number)
     size = {"points": plan["points"], "episodes": plan["episodes"]}
-    rows = measurement.measure(spec, train_in, judge_in, agents, **size)
-    seconds = time.monotonic() - start
+    kept = Rows(plan.get("rows"))
+    known = len(kept.rows)
+    rows = measurement.measure(spec, train_in, judge_in, agents, **size, rows=kept)
+    # Of a measurement that was killed, those agents tell the time that it did not keep.
+    seconds = (time.monotonic() - start) * len(rows) / max(1, len(kept.rows) - known)
     returns = pivot(rows, "agent", "step")
     # What is no number counts as the agent before its training.
     usable = np.isfinite(returns)

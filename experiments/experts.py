@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 
 import scb
 from experiments.claims import Claim
-from experiments.harness import Experiment, Report, Save
+from experiments.harness import Experiment, Report, Save, fill
 from scb import plotting
 from scb.agents.spec import environment_agent
 from scb.analysis.components import SACExpert, train_sac_expert
@@ -41,27 +41,25 @@ def train(environment: str, number: int, episodes: int) -> tuple[SACExpert, Any,
 def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None:
     """An environment at a time."""
     found = report.setdefault("environments", {})
-    for environment in plan["environments"]:
-        if environment in found:
-            continue
-        start = time.monotonic()
-        expert, env, env_params = train(environment, plan["agents"], plan["selection_episodes"])
-        seconds = time.monotonic() - start
-        returns = jax.jit(
-            lambda key, expert=expert, env=env, env_params=env_params: (
-                evaluate(env, env_params, expert.policy(), key, plan["evaluations"]).returns
-            )
-        )(root_key(REPORTING.start))
-        spec = environment_agent("sac", environment)
-        found[environment] = {
-            "returns": np.round(np.asarray(returns), 2).tolist(),
-            "selection": round(expert.mean_return, 2),
-            "steps": spec.steps,
-            "episode_limit": spec.episode_limit,
-            "setting": spec.source,
-            "seconds": round(seconds, 1),
-        }
-        save()
+    fill(found, plan["environments"], lambda name: _trained(name, plan), save)
+
+
+def _trained(environment: str, plan: Mapping[str, Any]) -> dict[str, Any]:
+    start = time.monotonic()
+    expert, env, env_params = train(environment, plan["agents"], plan["selection_episodes"])
+    seconds = time.monotonic() - start
+    returns = jax.jit(
+        lambda key: evaluate(env, env_params, expert.policy(), key, plan["evaluations"]).returns
+    )(root_key(REPORTING.start))
+    spec = environment_agent("sac", environment)
+    return {
+        "returns": np.round(np.asarray(returns), 2).tolist(),
+        "selection": round(expert.mean_return, 2),
+        "steps": spec.steps,
+        "episode_limit": spec.episode_limit,
+        "setting": spec.source,
+        "seconds": round(seconds, 1),
+    }
 
 
 def paper(environment: str) -> Reference:

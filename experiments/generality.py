@@ -9,7 +9,7 @@ and the bandits' optimal policies need no training. The searches are run folders
 runs/generality and are resumed.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -22,7 +22,7 @@ from experiments import searches
 from experiments.claims import OF_THE_WAY, TENTH, Claim
 from experiments.harness import Experiment, Report, Save, finite
 from scb import measurement, plotting
-from scb.agents.spec import AgentSpec, algorithms_for, bandit_agent
+from scb.agents.spec import algorithms_for, bandit_agent
 from scb.analysis.optimal_actions import optimal_policy
 from scb.curriculum import paper_curriculum
 from scb.discovery import DiscoveryConfig
@@ -54,6 +54,11 @@ ZOO, DRAWN, FIXED, ENVIRONMENT = SOURCES = (
 TOGETHER = "all algorithms"
 WIDE, SWISH = "1 x 512 network", "swish"
 EVOLVED, OPTIMAL = "neuroevolution", "CB-optimal policy"
+NETWORKS: dict[str, dict[str, Any]] = {
+    "": {},
+    WIDE: {"hidden_sizes": (512,)},
+    SWISH: {"activation": "swish"},
+}
 # Not in the paper's inner loop: what it calls out of distribution.
 UNSEEN = (WIDE, SWISH, EVOLVED, OPTIMAL)
 TICKS = {
@@ -94,6 +99,7 @@ def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None
             digests[environment] = bandit_metadata(environment_spec(environment).bandit)["sha256"]
         entry = found.setdefault(environment, {source: {} for source in SOURCES})
         chosen = generations.setdefault(environment, {})
+        judge_in = Place.named(environment)
         for source in SOURCES:
             lacking = [
                 agent
@@ -102,96 +108,61 @@ def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None
             ]
             if not lacking and source in chosen:
                 continue
-            trainer = _Trainer(environment, source, plan)
-            chosen[source] = trainer.generation
+            train_in, chosen[source] = _source(judge_in, source, plan)
             save()
             for agent in lacking:
-                returns = trainer.returns(agent)
+                returns = _returns(agent, train_in, judge_in, plan)
                 entry[source][agent], number = finite(returns, random[environment])
                 if number:
                     failed[f"{environment}, {source}, {agent}"] = number
                 save()
 
 
-def algorithms_of(environment: str) -> tuple[str, ...]:
-    """The paper's inner-loop algorithms."""
-    env, env_params = scb.make(environment)
-    return algorithms_for(env.action_space(env_params))
-
-
 def agents_of(environment: str) -> list[str]:
     """Every kind of agent that is trained: the algorithms, each with other networks too, and those without any."""
-    algorithms = algorithms_of(environment)
+    env, env_params = scb.make(environment)
+    algorithms = algorithms_for(env.action_space(env_params))
     others = [f"{name}, {kind}" for kind in (WIDE, SWISH) for name in algorithms]
     return [*algorithms, *others, EVOLVED, OPTIMAL]
 
 
-class _Trainer:
-    """What trains agents in one source and judges them in the environment."""
+def _source(judge_in: Place, source: str, plan: Mapping[str, Any]) -> tuple[Place, int | None]:
+    """Where agents are trained, and of a search the generation at which its mean was judged best."""
+    if source == ENVIRONMENT:
+        return judge_in, None
+    if source == ZOO:
+        bandit = open_bandit(environment_spec(judge_in.name).bandit)
+        return Place(source, bandit, bandit.default_params), None
+    kind = "drawn" if source == DRAWN else "fixed"
+    problem, outcome = searches.search(
+        config_of(judge_in.name, source, plan), f"{plan['runs']}/{judge_in.name}-{kind}"
+    )
+    weights = problem.bandit.params(outcome.best_mean)
+    return Place(source, problem.bandit, weights), outcome.best_mean_generation
 
-    def __init__(self, environment: str, source: str, plan: Mapping[str, Any]) -> None:
 
-        self.environment, self.plan = environment, plan
-        self.env, self.env_params = scb.make(environment)
-        self.space = self.env.action_space(self.env_params)
-        self.generation: int | None = None  # of a search, at which its mean was judged best
-        self.trained_in: Any = self.env
-        self.trained_in_params: Any = self.env_params
-        if source == ZOO:
-            self.trained_in = open_bandit(environment_spec(environment).bandit)
-            self.trained_in_params = self.trained_in.default_params
-        elif source != ENVIRONMENT:
-            kind = "drawn" if source == DRAWN else "fixed"
-            problem, outcome = searches.search(
-                config_of(environment, source, plan), f"{plan['runs']}/{environment}-{kind}"
-            )
-            self.generation = outcome.best_mean_generation
-            self.trained_in = problem.bandit
-            self.trained_in_params = problem.bandit.params(outcome.best_mean)
-
-    def returns(self, agent: str) -> np.ndarray:
-        """[N] mean returns of agents of one kind, most likely actions."""
-        key = root_key(REPORTING.start)
-        if agent == OPTIMAL:
-            return self._optimal(key)
-        if agent == EVOLVED:
-            return self._evolved(key)
+def _returns(agent: str, train_in: Place, judge_in: Place, plan: Mapping[str, Any]) -> np.ndarray:
+    """[N] mean returns of agents of one kind, most likely actions."""
+    number, episodes = plan["agents"], plan["episodes"]
+    if agent not in (OPTIMAL, EVOLVED):
         algorithm, _, network = agent.partition(", ")
-        return self._trained(with_network(bandit_agent(algorithm, self.environment), network))
-
-    def _trained(self, spec: AgentSpec) -> np.ndarray:
-        rows = measurement.measure(
-            spec,
-            Place("trained in", self.trained_in, self.trained_in_params),
-            Place(self.environment, self.env, self.env_params),
-            Agents.drawn_from(spec, REPORTING.start, self.plan["agents"]),
-            episodes=self.plan["episodes"],
+        spec = bandit_agent(algorithm, judge_in.name).with_values(**NETWORKS[network])
+        agents = Agents.drawn_from(spec, REPORTING.start, number)
+        return pivot(
+            measurement.measure(spec, train_in, judge_in, agents, episodes=episodes), "agent"
         )
-        return pivot(rows, "agent")
+    config = NeuroevolutionConfig(**plan["neuroevolution"])
+    if train_in is judge_in:
+        config = in_environment(config, int(judge_in.params.max_steps_in_episode))
+    optimal = optimal_policy(train_in.env, train_in.params) if agent == OPTIMAL else None
 
-    def _evolved(self, key: Any) -> np.ndarray:
+    def judged(key: Any) -> Any:
+        key_make, key_judge = split_key(key)
+        policy = optimal or evolve_policy(train_in.env, train_in.params, key_make, config)
+        return evaluate(judge_in.env, judge_in.params, policy, key_judge, episodes).returns.mean()
 
-        config = NeuroevolutionConfig(**self.plan["neuroevolution"])
-        if self.trained_in is self.env:
-            config = in_environment(config, int(self.env_params.max_steps_in_episode))
-        return self._judged_policies(
-            lambda key: evolve_policy(self.trained_in, self.trained_in_params, key, config), key
-        )
-
-    def _optimal(self, key: Any) -> np.ndarray:
-
-        policy = optimal_policy(self.trained_in, self.trained_in_params)
-        return self._judged_policies(lambda key: policy, key)
-
-    def _judged_policies(self, make: Callable[[Any], Any], key: Any) -> np.ndarray:
-
-        def judged(key: Any) -> Any:
-            key_make, key_judge = split_key(key)
-            policy, episodes = make(key_make), self.plan["episodes"]
-            return evaluate(self.env, self.env_params, policy, key_judge, episodes).returns.mean()
-
-        number = self.plan["agents"]
-        return np.asarray(map_population(judged, number, (0,))(split_key(key, number)))
+    keys = split_key(root_key(REPORTING.start), number)
+    return np.asarray(map_population(judged, number, (0,))(keys))
 
 
 def in_environment(config: NeuroevolutionConfig, limit: int) -> NeuroevolutionConfig:
@@ -199,16 +170,6 @@ def in_environment(config: NeuroevolutionConfig, limit: int) -> NeuroevolutionCo
     steps = config.population_size * config.num_generations * config.episodes
     generations = max(1, steps // (config.population_size * limit))
     return replace(config, episodes=1, num_generations=generations)
-
-
-def with_network(spec: AgentSpec, network: str) -> AgentSpec:
-    """The same algorithm with one of the networks that no search saw, or with its own."""
-    changes: dict[str, dict[str, Any]] = {
-        "": {},
-        WIDE: {"hidden_sizes": (512,)},
-        SWISH: {"activation": "swish"},
-    }
-    return spec.with_values(**changes[network])
 
 
 def columns(entry: Mapping[str, list[float]]) -> dict[str, np.ndarray]:
@@ -290,12 +251,12 @@ def facts(report: Report) -> dict[str, Any]:
 
 def draw(report: Mapping[str, Any]) -> Figure:
     """A panel an environment; right of the dashed line what the paper's inner loop does not have."""
-    looks = (
-        (plotting.BLUE, "o"),
-        (plotting.SKY_BLUE, "s"),
-        (plotting.GREEN, "^"),
-        (plotting.VERMILLION, "D"),
-    )
+    looks = {
+        ZOO: {"color": plotting.BLUE, "marker": "o"},
+        DRAWN: {"color": plotting.SKY_BLUE, "marker": "s"},
+        FIXED: {"color": plotting.GREEN, "marker": "^"},
+        ENVIRONMENT: {"color": plotting.VERMILLION, "marker": "D"},
+    }
     names = list(report["environments"])
     figure = Figure(figsize=(12.0, 3.1 * -(-len(names) // 2)))
     panels = figure.subplots(-(-len(names) // 2), 2, squeeze=False).ravel()
@@ -304,19 +265,17 @@ def draw(report: Mapping[str, Any]) -> Figure:
     for axes, name in zip(panels, names, strict=False):
         entry = report["environments"][name]
         shown = list(columns(entry[ZOO]))
-        for i, (source, (color, marker)) in enumerate(zip(SOURCES, looks, strict=True)):
-            for column, values in columns(entry[source]).items():
-                found = estimate(values)
-                x = shown.index(column) + 0.17 * (i - 1.5)
-                axes.errorbar(
-                    x,
-                    found.value,
-                    plotting.error_bar(found),
-                    fmt=marker,
-                    color=color,
-                    capsize=2,
-                    markersize=4,
-                )
+        for i, (source, look) in enumerate(looks.items()):
+            found = {c: estimate(x) for c, x in columns(entry[source]).items()}
+            axes.errorbar(
+                [shown.index(column) + 0.17 * (i - 1.5) for column in found],
+                [x.value for x in found.values()],
+                plotting.error_bar(*found.values()),
+                **look,
+                linestyle="",
+                capsize=2,
+                markersize=4,
+            )
         axes.axvline(shown.index(TOGETHER) + 0.5, color=plotting.BLACK, linestyle="--", linewidth=1)
         axes.set_xticks(
             range(len(shown)),
@@ -325,8 +284,8 @@ def draw(report: Mapping[str, Any]) -> Figure:
         )
         axes.set_ylabel("return")
         axes.set_title(name)
-    handles: list[Any] = [panels[0].plot([], [], marker, color=color)[0] for color, marker in looks]
-    plotting.legend_below(figure, (handles, list(SOURCES)), columns=4)
+    dots = {source: {**look, "linestyle": ""} for source, look in looks.items()}
+    plotting.legend_of(figure, dots, columns=4)
     plotting.figure_title(
         figure,
         "Judged in the environment after training in ...; right of the line: not in the paper's inner loop",

@@ -214,10 +214,14 @@ class Experiment:
             saved = json.dumps(report)
 
         further = {k: v for k, v in asdict(options).items() if k != "preset"}
-        self.measure({**plan, **further} if self.presets else options, report, save)
+        # Where a measurement may keep its agents until its part of the report is saved.
+        rows = out.with_suffix(".rows.jsonl")
+        self.measure({**plan, **further, "rows": rows} if self.presets else options, report, save)
         if self.presets:
             report["complete"] = True
         write_json(out, report)
+        for kept in (rows, rows.with_suffix(".json")):
+            kept.unlink(missing_ok=True)
 
     def render(self, report: Report, docs: Path) -> None:
         """Writes docs/NAME.md and docs/figures/NAME.png.
@@ -265,6 +269,16 @@ def read(path: Path, missing_is_new: bool = False, keys: Iterable[str] = ()) -> 
             f"{path} is no report of this command ({error}): measure first, or choose another --out."
         ) from error
     return report
+
+
+def fill(
+    part: dict[str, Any], names: Iterable[str], measured: Callable[[str], Any], save: Save
+) -> None:
+    """Measures what a part of the report lacks, by name, and saves after each."""
+    for name in names:
+        if name not in part:
+            part[name] = measured(name)
+            save()
 
 
 def packed(rows: Any) -> list[str]:

@@ -10,6 +10,7 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 import scb
@@ -19,6 +20,7 @@ from experiments.harness import (
     Experiment,
     Report,
     Save,
+    fill,
     packed,
     unpacked,
 )
@@ -48,10 +50,8 @@ HARDLY = 0.1
 
 def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None:
     """Everything of an environment at a time."""
-    for name in CLASSIC_CONTROL:
-        if name not in report.setdefault("environments", {}):
-            report["environments"][name] = _examine(name, plan)
-            save()
+    found = report.setdefault("environments", {})
+    fill(found, CLASSIC_CONTROL, lambda name: _examine(name, plan), save)
 
 
 def _examine(name: str, plan: Mapping[str, Any]) -> dict[str, Any]:
@@ -149,22 +149,33 @@ def facts(report: Report) -> dict[str, Any]:
     }
 
 
+def draw_actions(axes: Axes, entry: Mapping[str, Any], actions: str) -> tuple[Plane, Any]:
+    """Best actions of a report over their plane, and what their colour bar is made from."""
+    limits: Any = tuple(map(tuple, entry["limits"]))
+    # Whatever a report holds is in the plane already.
+    plane = Plane(tuple(entry["labels"]), limits, lambda x: x, lambda x: x)
+    space = entry["num_actions"], entry["bounds"]
+    return plane, figures.action_grid(axes, plane, unpacked(entry[actions]), *space)
+
+
+def action_bar(
+    figure: Figure, axes: Axes, drawn: Any, environment: str, num_actions: int | None
+) -> None:
+    """The colour bar below a map of best actions."""
+    bar = figure.colorbar(drawn, ax=axes, location="bottom", aspect=30)
+    bar.set_label(f"best action: {ACTIONS[environment]}", fontsize=8)
+    if num_actions:
+        bar.set_ticks(range(num_actions))
+
+
 def draw(report: Mapping[str, Any]) -> Figure:
     """Best actions above, importance below, a column an environment."""
     figure = Figure(figsize=(15.0, 6.0))
     panels: Any = figure.subplots(2, len(CLASSIC_CONTROL), height_ratios=[1.6, 1.0])
     for column, (name, found) in enumerate(report["environments"].items()):
         top, bottom = panels[:, column]
-        limits: Any = tuple(map(tuple, found["limits"]))
-        # Already in the plane, both the actions and the episode.
-        plane = Plane(tuple(found["labels"]), limits, lambda x: x, lambda x: x)
-        drawn = figures.action_grid(
-            top, plane, unpacked(found["actions"]), found["num_actions"], found["bounds"]
-        )
-        bar = figure.colorbar(drawn, ax=top, location="bottom", aspect=30)
-        bar.set_label(f"best action: {ACTIONS[name]}", fontsize=8)
-        if found["num_actions"]:
-            bar.set_ticks(range(found["num_actions"]))
+        plane, drawn = draw_actions(top, found, "actions")
+        action_bar(figure, top, drawn, name, found["num_actions"])
         figures.draw_trajectory(top, plane, unpacked(found["episode"]))
         top.set_title(name, fontsize=10)
         shares = [x["value"] for x in found["importance"].values()]

@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from experiments.claims import Claim
-from experiments.harness import Experiment, Report, Save
+from experiments.harness import Experiment, Report, Save, fill
 from scb import plotting
 
 Floats = NDArray[np.floating]
@@ -94,32 +94,12 @@ def random_mdp(rng: np.random.Generator, states: int, actions: int) -> MDP:
 
 # What the bandit's reward may be: the same maximisers as Q* in three forms, and two that the lemma does
 # not cover.
-def _q(mdp: MDP, q: Floats) -> Floats:
-    return q
-
-
-def _advantage(mdp: MDP, q: Floats) -> Floats:
-    return q - q.max(axis=1, keepdims=True)
-
-
-def _indicator(mdp: MDP, q: Floats) -> Floats:
-    return one_hot(q.argmax(axis=1), q.shape[1])
-
-
-def _immediate(mdp: MDP, q: Floats) -> Floats:
-    return mdp.reward
-
-
-def _q_of_random_policy(mdp: MDP, q: Floats) -> Floats:
-    return mdp.q(mdp.values(np.full(q.shape, 1 / q.shape[1])))
-
-
 REWARDS: dict[str, Callable[[MDP, Floats], Floats]] = {
-    "Q*": _q,
-    "Q* - max Q*": _advantage,
-    "1 where a = a*": _indicator,
-    "immediate reward": _immediate,
-    "Q of the random policy": _q_of_random_policy,
+    "Q*": lambda mdp, q: q,
+    "Q* - max Q*": lambda mdp, q: q - q.max(axis=1, keepdims=True),
+    "1 where a = a*": lambda mdp, q: one_hot(q.argmax(axis=1), q.shape[1]),
+    "immediate reward": lambda mdp, q: mdp.reward,
+    "Q of the random policy": lambda mdp, q: mdp.q(mdp.values(np.full(q.shape, 1 / q.shape[1]))),
 }
 COVERED = ("Q*", "Q* - max Q*", "1 where a = a*")
 ONE, ANY, EVERY, HALF = CONTEXTS = (
@@ -161,21 +141,19 @@ def regret(
 
 def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None:
     """Regrets of every construction with every set of contexts, over random MDPs."""
-    for construction in REWARDS:
-        for contexts in CONTEXTS:
-            key = f"{construction} | {contexts}"
-            if key in report.setdefault("regrets", {}):
-                continue
-            # The same MDPs for each, however many numbers their policies take.
-            regrets = []
-            for number in range(plan["mdps"]):
-                rng, rng_policies = np.random.default_rng([plan["seed"], number]).spawn(2)
-                states, actions = int(rng.integers(3, 30)), int(rng.integers(2, 6))
-                mdp = random_mdp(rng, states, actions)
-                regrets.append(regret(mdp, construction, contexts, rng_policies, POLICIES))
-            optimal = float(np.mean(np.asarray(regrets) < 1e-6))
-            report["regrets"][key] = {"optimal": optimal, "largest": max(regrets)}
-            save()
+    cells = {f"{c} | {x}": (c, x) for c in REWARDS for x in CONTEXTS}
+
+    def measured(name: str) -> dict[str, float]:
+        # The same MDPs for each, however many numbers their policies take.
+        regrets = []
+        for number in range(plan["mdps"]):
+            rng, rng_policies = np.random.default_rng([plan["seed"], number]).spawn(2)
+            states, actions = int(rng.integers(3, 30)), int(rng.integers(2, 6))
+            mdp = random_mdp(rng, states, actions)
+            regrets.append(regret(mdp, *cells[name], rng_policies, POLICIES))
+        return {"optimal": float(np.mean(np.asarray(regrets) < 1e-6)), "largest": max(regrets)}
+
+    fill(report.setdefault("regrets", {}), cells, measured, save)
     report["mdps"], report["policies"] = plan["mdps"], POLICIES
 
 

@@ -71,35 +71,35 @@ def claims(report: Report) -> list[Claim]:
     steps = f"a candidate's agent takes {ROUGHLY} times fewer steps on the bandit, roughly two orders of magnitude"
     found = [Claim(steps, cheaper(report) >= ROUGHLY)]
     for place, table in report["evaluations"].items():
-        finals, areas = table["finals"], table["areas"]
-
-        def above(one: list[Any], other: list[Any]) -> partial[Estimate] | Estimate:
-            evidence = partial(pooled_estimate, one, other)
-            return evidence if len(one) > 1 else replace(evidence(), low=None, high=None)
-
+        finals, learned = table["finals"], (BANDIT, ENVIRONMENT)
         if place.startswith("Hopper"):
-            ppo = abs(float(np.mean(finals["ppo"])))
-            for name in (BANDIT, ENVIRONMENT):
-                text, reason = (
+            margin = round(0.1 * abs(float(np.mean(finals["ppo"]))), 1)
+            reason = "comparable: a tenth of PPO's return"
+            for name in learned:
+                text, evidence = (
                     f"{place}: {name} ends no lower than PPO",
-                    "comparable: a tenth of PPO's return",
+                    _above(finals, name, "ppo"),
                 )
-                evidence = above(finals[name], finals["ppo"])
-                found.append(Claim(text, evidence, 0.0, round(0.1 * ppo, 1), reason, places=0))
+                found.append(Claim(text, evidence, 0.0, margin, reason, places=0))
             continue
-        for name in (BANDIT, ENVIRONMENT):
-            for what, returns in (
-                ("ends higher", finals),
-                ("learns faster (area under the curve)", areas),
+        for name in learned:
+            for what, kind in (
+                ("ends higher", "finals"),
+                ("learns faster (area under the curve)", "areas"),
             ):
                 text = f"{place}: {name} {what} than PPO"
-                found.append(Claim(text, above(returns[name], returns["ppo"]), places=1))
+                found.append(Claim(text, _above(table[kind], name, "ppo"), places=1))
         text = f"{place}: {BANDIT} ends no lower than {ENVIRONMENT}, after searches of one size"
-        alike = above(finals[BANDIT], finals[ENVIRONMENT]) if same else None
-        if alike is not None and len(finals[ENVIRONMENT]) < 2:
-            alike = replace(pooled_estimate(finals[BANDIT], finals[ENVIRONMENT]), low=None)
+        alike = _above(finals, *learned) if same else None
         found.append(Claim(text, alike, 0.0, tenth, OF_THE_WAY, places=1))
     return found
+
+
+def _above(returns: Mapping[str, Any], name: str, other: str) -> partial[Estimate] | Estimate:
+    """How far an objective earns more than another; without an interval where either was searched for once."""
+    evidence = partial(pooled_estimate, returns[name], returns[other])
+    once = any(len(returns[x]) == 1 for x in (name, other) if x in (BANDIT, ENVIRONMENT))
+    return replace(evidence(), low=None, high=None) if once else evidence
 
 
 def cheaper(report: Report) -> float:

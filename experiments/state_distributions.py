@@ -20,16 +20,16 @@ from experiments.harness import (
     Experiment,
     Report,
     Save,
+    fill,
     packed,
     unpacked,
 )
-from experiments.interpretability import ACTIONS
+from experiments.interpretability import action_bar, draw_actions
 from scb import plotting
 from scb.agents.agent import flat_bounds
-from scb.analysis import figures
 from scb.analysis.components import ReplacedBandit, q_reward
 from scb.analysis.optimal_actions import first_action, optimal_actions
-from scb.analysis.planes import Plane, plane_for
+from scb.analysis.planes import plane_for
 from scb.analysis.states import bandit_states, follow
 from scb.environments.registry import environment_spec
 from scb.environments.synthetic import SyntheticBandit
@@ -51,10 +51,7 @@ BANDIT_ROUGHNESS, EXPERT_ROUGHNESS = "bandit's roughness", "expert's roughness"
 def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None:
     """An environment at a time."""
     found = report.setdefault("environments", {})
-    for environment in plan["environments"]:
-        if environment not in found:
-            found[environment] = _examine(environment, plan)
-            save()
+    fill(found, plan["environments"], lambda name: _examine(name, plan), save)
 
 
 def _examine(environment: str, plan: Mapping[str, Any]) -> dict[str, Any]:
@@ -181,23 +178,16 @@ def draw(report: Mapping[str, Any]) -> Figure:
     figure = Figure(figsize=(3.0 * len(report["environments"]), 6.2))
     panels: Any = figure.subplots(2, len(report["environments"]), squeeze=False)
     for column, (name, entry) in enumerate(report["environments"].items()):
-        limits: Any = tuple(map(tuple, entry["limits"]))
-        plane = Plane(tuple(entry["labels"]), limits, lambda x: x, lambda x: x)
         for axes, states, actions, whose in (
             (panels[0, column], "visited", "expert_actions", "expert"),
             (panels[1, column], "contexts", "bandit_actions", "bandit"),
         ):
-            drawn = figures.action_grid(
-                axes, plane, unpacked(entry[actions]), entry["num_actions"], entry["bounds"]
-            )
+            _, drawn = draw_actions(axes, entry, actions)
             points = points_of(entry[states], entry["limits"])
             # A white edge, for black is hard to see on the dark ends of the background.
             axes.scatter(*points.T, s=6, color=plotting.BLACK, edgecolors="white", linewidths=0.3)
             axes.set_title(f"{name}\n{whose}", fontsize=9)
-        bar = figure.colorbar(drawn, ax=panels[1, column], location="bottom", aspect=30)
-        bar.set_label(f"best action: {ACTIONS[name]}", fontsize=8)
-        if entry["num_actions"]:
-            bar.set_ticks(range(entry["num_actions"]))
+        action_bar(figure, panels[1, column], drawn, name, entry["num_actions"])
     plotting.figure_title(
         figure,
         f"{STATES} states of an expert in the environment and of the bandit, over the best actions",

@@ -23,7 +23,6 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from experiments.harness import Experiment, Save
-from experiments.rendering import listed
 from lpo import drift_figures
 from lpo.drifts import ClosedFormDrift
 from lpo.objectives import load_objective, zoo_names
@@ -64,31 +63,21 @@ def read_formula(path: Path) -> dict[str, Any]:
     }
 
 
-def read_comparison(path: Path, formulas: Sequence[Mapping[str, Any]] = ()) -> dict[str, Any]:
-    """What the page says of a comparison of `lpo evaluate`; formulas are compared with what they were fitted to."""
+def read_comparison(path: Path) -> dict[str, Any]:
+    """A comparison of `lpo evaluate`: how it was made, estimates by objective, and "final" {objective: [S] returns}."""
     try:
         whole = json.loads(path.read_text())
-        curves = whole["curves"]
-        first = curves[0]
-        final = {c["objective"]: np.array(c["returns"])[:, -1] for c in curves}
-        to_original = {
-            f["name"]: {"of": f["of"]}
-            | paired_difference(final[f["name"]], final[f["of"]]).as_dict()
-            for f in formulas
-            if f["name"] in final and f["of"] in final
-        }
+        curves, first = whole["curves"], whole["curves"][0]
+        names = ("environment", "backend", "seeds", "episodes", "mode_actions")
         return {
-            "environment": first["environment"],
-            "backend": first["backend"],
+            **{name: first[name] for name in names},
             "steps": first["steps"][-1],
-            "seeds": first["seeds"],
-            "episodes": first["episodes"],
-            "mode_actions": first["mode_actions"],
             "policy_output_scale": first.get("policy_output_scale", 1.0),
             "reference": whole["reference"],
             "final_iqm": {c["objective"]: c["final_iqm"] for c in curves},
+            "area_iqm": {c["objective"]: c["area_iqm"] for c in curves},
             "paired_differences": whole["paired_differences"],
-            "to_original": to_original,
+            "final": {c["objective"]: np.array(c["returns"])[:, -1] for c in curves},
         }
     except (OSError, KeyError, IndexError, TypeError, ValueError) as error:
         raise UserError(
@@ -96,83 +85,24 @@ def read_comparison(path: Path, formulas: Sequence[Mapping[str, Any]] = ()) -> d
         ) from error
 
 
+def compared(path: Path, formulas: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """What the page says of a comparison; formulas are compared with what they were fitted to."""
+    found = read_comparison(path)
+    final = found.pop("final")
+    del found["area_iqm"]
+    to_original = {
+        f["name"]: {"of": f["of"]} | paired_difference(final[f["name"]], final[f["of"]]).as_dict()
+        for f in formulas
+        if f["name"] in final and f["of"] in final
+    }
+    return {**found, "to_original": to_original}
+
+
 def facts(report: Mapping[str, Any]) -> dict[str, Any]:
-    """The table's rows, and what each says in words."""
-    rows = [
-        {
-            "label": _label(row),
-            "cells": [
-                *(_percent(row["fractions"][name]) for name in REGIONS),
-                *(_stop(row["stops"][sign]) for sign in ("+1", "-1")),
-            ],
-            "words": words(row),
-        }
-        for row in report["analyses"]
-    ]
+    """The objectives, and what their regions mean."""
     names = list(dict.fromkeys(row["objective"] for row in report["analyses"]))
     regions = {name: meaning.replace("-0.05", "−0.05") for name, meaning in REGIONS.items()}
-    return {"rows": rows, "names": names, "regions": regions}
-
-
-def words(row: Mapping[str, Any]) -> str:
-    """Two or three sentences about an analysis, out of its numbers alone."""
-    fractions, beyond = row["fractions"], row["beyond"]
-    positive, negative = (_fate(beyond[sign]) for sign in ("positive", "negative"))
-    fate = (
-        f"{positive}, whatever the advantage's sign"
-        if positive == negative
-        else f"{positive} for positive advantages; for negative ones it {negative}"
-    )
-    sentences = [f"Where PPO's clip stops an update, this one {fate}."]
-    changed = {
-        name: fractions[name]
-        for name in ("cautious", "amplified", "hindered")
-        if fractions[name] >= 0.005
-    }
-    inside = listed([f"{name} in {_percent(share)}" for name, share in changed.items()])
-    sentences.append(
-        f"Elsewhere it is {inside} of the grid, and leaves the gradient as it is in "
-        f"{_percent(fractions['free'])}."
-        if changed
-        else f"Elsewhere, {_percent(fractions['free'])} of the grid, it leaves the gradient as it is."
-    )
-    stops = [
-        f"at ratio {_stop(row['stops'][sign])} with an advantage of {shown}"
-        if row["stops"][sign] is not None
-        else f"nowhere {where} with an advantage of {shown}"
-        for sign, shown, where in (("+1", "+1", "up to ratio 2"), ("-1", "−1", "down to ratio 0.5"))
-    ]
-    sentences.append(f"It stops {stops[0]}, and {stops[1]}.")
-    if fractions["rolls back"] >= 0.005:
-        sentences.append(
-            f"In all, it turns round in {_percent(fractions['rolls back'])} of the grid."
-        )
-    return " ".join(sentences)
-
-
-def _fate(shares: Mapping[str, float]) -> str:
-    fates = [
-        (shares["optimistic"], "goes on"),
-        (shares["flat"], "stops"),
-        (shares["rolls back"], "turns round"),
-    ]
-    shown = [(what, share) for share, what in fates if share >= 0.005]
-    if len(shown) == 1:
-        return f"{shown[0][0]} everywhere"
-    return listed([f"{what} in {_percent(share)}" for what, share in shown])
-
-
-def _label(row: Mapping[str, Any]) -> str:
-    name = f"`{row['objective']}`"
-    return f"{name} at {100 * row['progress']:g} % of training" if row["temporal"] else name
-
-
-def _percent(share: float) -> str:
-    return f"{100 * share:.1f} %" if 0.0 < share < 0.1 else f"{100 * share:.0f} %"
-
-
-def _stop(ratio: float | None) -> str:
-    return "never" if ratio is None else f"{ratio:.2f}"
+    return {"names": names, "regions": regions}
 
 
 @dataclass(frozen=True)
@@ -194,7 +124,7 @@ def measure(options: Options, report: dict[str, Any], save: Save) -> None:
         report["formulas"] = [read_formula(path) for path in options.formulas]
     formulas = report.setdefault("formulas", [])
     if options.comparisons is not None:
-        report["comparisons"] = [read_comparison(path, formulas) for path in options.comparisons]
+        report["comparisons"] = [compared(path, formulas) for path in options.comparisons]
     report.setdefault("comparisons", [])
     save()
 

@@ -36,7 +36,7 @@ from scb.keys import root_key, split_key
 from scb.statistics import Estimate, estimate
 
 HOPPER = "hopper (spring)"
-STANDING = environment_spec("hopper").standing_still("spring") or 0.0
+STANDING = environment_spec("hopper").standing["spring"]
 FRAMES = 6  # of the film strip
 PICTURES = 125  # of a GIF at most: five seconds
 VIEWER = Path("runs/visualize/hopper.html")

@@ -5,7 +5,6 @@
 The comparisons are what `lpo evaluate --out` wrote for that objective; nothing is edited by hand.
 """
 
-import json
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -14,6 +13,7 @@ from typing import Any
 import tyro
 
 from experiments.harness import Experiment, Save, run_name
+from experiments.understanding import read_comparison
 from lpo.objectives import load_objective, save_objective
 from scb.errors import UserError
 
@@ -49,25 +49,16 @@ def measure(options: Options, report: dict[str, Any], save: Save) -> None:
     short = partial(_short, file=options.objective, zoo_name=options.name)
     reporting_seeds = {}
     for path in options.comparisons:
-        comparison = json.loads(path.read_text())
-        curves = comparison["curves"]
-        environment = curves[0]["environment"]
-        scale = curves[0].get("policy_output_scale", 1.0)
+        found = read_comparison(path)
+        environment, scale = found["environment"], found["policy_output_scale"]
         if scale != 1.0:
             environment += f", policy_output_scale {scale:g}"
-        reporting_seeds[environment] = curves[0]["seeds"]
+        reporting_seeds[environment] = found["seeds"]
+        by_objective = ("final_iqm", "area_iqm", "paired_differences")
         results[environment] = {
-            "backend": curves[0]["backend"],
-            "steps": curves[0]["steps"][-1],
-            "episodes": curves[0]["episodes"],
-            "mode_actions": curves[0]["mode_actions"],
-            "final_iqm": {short(c["objective"]): c["final_iqm"] for c in curves},
-            "area_iqm": {short(c["objective"]): c["area_iqm"] for c in curves},
-            "reference": comparison["reference"],
-            "paired_differences": {
-                short(name): x for name, x in comparison["paired_differences"].items()
-            },
-        }
+            name: found[name]
+            for name in ("backend", "steps", "episodes", "mode_actions", "reference")
+        } | {name: {short(k): x for k, x in found[name].items()} for name in by_objective}
     metadata["results"] = results
     metadata["seeds"] = {**metadata["seeds"], "reporting": reporting_seeds}
     for own in ("schema_version", "name", "versions", "sha256", "kind", "certificate"):

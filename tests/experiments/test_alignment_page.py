@@ -2,7 +2,11 @@ import shutil
 from pathlib import Path
 
 import lpo
-from experiments import alignment
+from experiments import alignment, rendering
+
+
+def recommended(report):
+    return rendering.block("alignment", "recommendation", alignment.recommendation(report))
 
 
 def stage(environment, correlations, bandit="Synthetic-Pendulum-v1"):
@@ -27,16 +31,16 @@ def test_the_recommendation_is_the_best_over_both_initialisations():
             "pendulum_small_last_layer": stage("Pendulum-v1", small),
         }
     }
-    said = alignment.recommendation(report)
+    said = recommended(report)
     assert "the best of 3 regimes is *default* with 0.85; the default has 0.85, the best." in said
     own = stage("CartPole-v1", {"default": -0.3, "reward noise 0.0": 0.1}, "Synthetic-CartPole-v1")
     own["regimes"] += stage("CartPole-v1", {"default": 0.6})["regimes"]
     report["stages"]["CartPole-v1"] = own
-    said = alignment.recommendation(report)
+    said = recommended(report)
     assert "own bandit has: CartPole-v1 \u22120.30 (without noise 0.10)." in said
     assert said.endswith("On Pendulum's bandit: CartPole-v1 0.60.")
     report["stages"]["pendulum_small_last_layer"] = stage("Pendulum-v1", small | {"epochs 1": 0.9})
-    said = alignment.recommendation(report)
+    said = recommended(report)
     assert "*epochs 1* with 0.93" in said and "1 regime is above it" in said
 
 
