@@ -23,9 +23,8 @@ from matplotlib.ticker import MaxNLocator
 from experiments.claims import FAILS, HOLDS, UNDECIDED, Claim, judge
 from experiments.harness import Experiment, Report, Save
 from experiments.searches import meta_training, objective_of_run
-from lpo.comparison import compare
+from lpo.comparison import compare, ppo_spec
 from lpo.objectives import load_objective
-from scb.agents.spec import environment_agent
 from scb.errors import UserError, unknown_name
 from scb.plotting import BLUE, GREY, VERMILLION, estimate_row
 from scb.seeds import REPORTING
@@ -224,9 +223,7 @@ def measure(options: Options, report: dict[str, Any], save: Save) -> None:
             evaluation.environment,
             list(objectives.values()),
             evaluation.seed_list(),
-            spec=environment_agent("ppo", evaluation.environment)
-            .with_steps(evaluation.steps)
-            .with_values(policy_output_scale=evaluation.policy_output_scale),
+            spec=ppo_spec(evaluation.environment, evaluation.steps, evaluation.policy_output_scale),
             backend=evaluation.backend,
             points=1,
         )

@@ -15,13 +15,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lpo.comparison import check_names, compare
+from lpo.comparison import check_names, compare, ppo_spec
 from lpo.drifts import ClipDrift, DPODrift, Drift, NoDrift
 from lpo.fitness import FITNESSES, LABELS
 from lpo.meta_training import MetaTrainingConfig, TaskTraining, task_agent
 from lpo.objectives import Objective, closed_form
 from scb.agents.ppo import PPOHyperparameters
-from scb.agents.spec import AgentSpec, environment_agent
+from scb.agents.spec import AgentSpec
 from scb.artefacts import machine_description, package_versions
 from scb.environments.registry import environment_spec, make
 from scb.errors import UserError, at_least
@@ -135,11 +135,7 @@ def outcomes(
     rows: Rows | None = None,
 ) -> dict[str, np.ndarray]:
     """{objective: [S] return of PPO trained with it}, mode actions; arguments as `compare`."""
-    spec = (
-        environment_agent("ppo", environment)
-        .with_steps(steps)
-        .with_values(policy_output_scale=policy_output_scale)
-    )
+    spec = ppo_spec(environment, steps, policy_output_scale)
     comparison = compare(environment, objectives, seeds, spec, backend, points=1, rows=rows)
     return {curves.objective: curves.final for curves in comparison.curves}
 

@@ -8,14 +8,14 @@ from scb.cli import run_program
 
 
 def _commands() -> dict[str, Any]:
-    from lpo import commands, pipeline
+    from lpo import commands, pipeline, training_commands
 
     return {
         "run": pipeline.RunAll,
         "meta-train": commands.MetaTrain,
-        "train": commands.Train,
-        "evaluate": commands.Evaluate,
-        "align": commands.Align,
+        "train": training_commands.Train,
+        "evaluate": training_commands.Evaluate,
+        "align": training_commands.Align,
         "certify": commands.certify_command,
         "distill": commands.distill_command,
     }

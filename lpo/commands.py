@@ -1,27 +1,20 @@
-"""What the subcommands of `lpo` do. Their docstrings are the command line's help."""
+"""What `lpo meta-train`, `distill` and `certify` do. Their docstrings are the command line's help."""
 
-import itertools
-import json
 import shlex
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 from typing import Annotated
 
-import numpy as np
 import tyro
-from rich.table import Table
 
 from lpo import figures
-from lpo.alignment import Regime, correlation_text, known_drifts, measure_alignment
 from lpo.certificate import certify
-from lpo.comparison import Comparison, check_names, compare
 from lpo.distill import DistillConfig, distill
 from lpo.drifts import LearnedDrift, learned_drift
-from lpo.fitness import LABELS
 from lpo.meta_training import (
     TEMPORAL_HORIZONS,
     VALIDATION_AGENTS,
@@ -30,20 +23,12 @@ from lpo.meta_training import (
     learn_objective,
 )
 from lpo.objectives import Objective, load_objective, save_objective
-from lpo.suite import run_suite
-from lpo.suite import suite as suite_environments
 from scb import plotting
-from scb.agents.spec import environment_agent
-from scb.artefacts import machine_description, package_versions
+from scb.artefacts import machine_description
 from scb.command_line import LongRun, Output, flags, listed
 from scb.console import console
-from scb.environments.registry import environment_spec
-from scb.errors import UserError, at_least
-from scb.files import make_folder, write_json
-from scb.measurement import Place, check_seeds
-from scb.rows import Rows
-from scb.runs import config_dict
-from scb.statistics import estimate
+from scb.errors import UserError
+from scb.files import make_folder
 
 _DISTILL = DistillConfig()
 
@@ -76,15 +61,6 @@ def _meta_training(
     if default.validation:
         evolution = replace(evolution, mean_evaluations=VALIDATION_AGENTS)
     return replace(default, evolution=evolution)
-
-
-def seed_list(count: int, first: int, counted: str = "seeds") -> list[int]:
-    """`count` consecutive seeds; a UserError, which says what is `counted`, for none or a negative one."""
-    at_least(1, **{counted: count})
-    at_least(0, seed=first)
-    seeds = list(range(first, first + count))
-    check_seeds(seeds)
-    return seeds
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -132,339 +108,6 @@ class MetaTrain(LongRun):
         return objective
 
 
-def _tell(line: str) -> None:
-    print(line, file=sys.stderr, flush=True)
-
-
-@dataclass(frozen=True)
-class Agents:
-    """Which agents are trained and judged, and how.
-
-    Attributes:
-      environment: Pendulum-v1, CartPole-v1, hopper, Synthetic-Pendulum-v1, ...; Pendulum-v1 where
-        nothing says another.
-      steps: environment steps; the environment's own setting where left out.
-      policy_output_scale: factor on the policy's last layer at initialisation; many public PPOs take
-        0.01.
-      seeds: agents of each objective.
-      seed: the first of their seeds.
-      backend: Brax physics: generalized, positional or spring.
-      sampled_actions: evaluate sampled actions rather than the most likely ones.
-    """
-
-    environment: str | None = None
-    steps: int | None = None
-    policy_output_scale: float | None = None
-    seeds: int = 1
-    seed: int = 0
-    backend: str | None = None
-    sampled_actions: bool = False
-
-    def seed_list(self) -> list[int]:
-        return seed_list(self.seeds, self.seed)
-
-
-@dataclass(frozen=True)
-class TrainConfig(Agents):
-    """What `lpo train` does.
-
-    Attributes:
-      objective: ppo, ppo-0.3 (clip 0.3), dpo, none, a zoo name, or path.npz.
-    """
-
-    objective: str = "ppo"
-
-
-@dataclass(frozen=True)
-class EvaluateConfig(Agents):
-    """What `lpo evaluate` does.
-
-    Attributes:
-      suite: train in every environment of classic, minatar, brax or all, and aggregate normalised
-        scores; a folder given as --out that holds a part of them already is completed.
-      objectives: any of ppo, ppo-0.3, dpo, none, zoo names, files; the first is the reference of
-        the differences.
-    """
-
-    seeds: int = 10
-    seed: int = 1000
-    suite: str | None = None
-    objectives: tuple[str, ...] = ("ppo", "dpo")
-
-    def __post_init__(self) -> None:
-        if not self.objectives:
-            raise UserError("no objectives: give at least one, such as --objectives ppo dpo.")
-        if self.suite is not None and self.environment is not None:
-            raise UserError(
-                f"the environment {self.environment} and the suite {self.suite} are both given: leave one out."
-            )
-
-
-@dataclass(frozen=True)
-class Kept:
-    """Where agents' returns are kept as they come.
-
-    Attributes:
-      out: folder for rows.jsonl and for the table and figure made of them; must be new or empty.
-      resume: a folder that an interrupted command wrote; its settings apply, and a flag that
-        contradicts them is an error.
-    """
-
-    out: Path | None = None
-    resume: Path | None = None
-
-
-@dataclass(frozen=True, kw_only=True)
-class Measuring(LongRun):
-    """A command that trains agents and keeps their rows, in a folder where one is named."""
-
-    output: Kept = field(default_factory=Kept)
-    preset: tyro.conf.Suppress[str] = "quick"
-
-    def opened(self) -> tuple[Path | None, Rows]:
-        """The folder of the results, and the rows in it; without a folder in memory."""
-        if self.output == Kept():
-            return None, Rows()
-        folder = self.open().folder
-        return folder, Rows(folder / "rows.jsonl")
-
-    def compare(self, objectives: Sequence[Objective]) -> Comparison:
-        """Trains with the objectives, and leaves rows, comparison.json and curves.png where a folder is named."""
-        config: Agents = self.config
-        environment, seeds = config.environment or "Pendulum-v1", config.seed_list()
-        spec = (
-            environment_agent("ppo", environment)
-            .with_steps(config.steps)
-            .with_values(policy_output_scale=config.policy_output_scale)
-        )
-        Place.named(environment, config.backend)  # a mistake must not leave a folder behind
-        folder, rows = self.opened()
-        comparison = compare(
-            environment,
-            objectives,
-            seeds,
-            spec=spec,
-            backend=config.backend,
-            mode_actions=not config.sampled_actions,
-            rows=rows,
-            tell=_tell,
-        )
-        if folder is not None:
-            write_json(
-                folder / "comparison.json", {**comparison.as_dict(), "versions": package_versions()}
-            )
-            plotting.save(figures.learning_curves(comparison.curves), folder / "curves.png")
-        return comparison
-
-
-@dataclass(frozen=True, kw_only=True)
-class Train(Measuring):
-    """Train PPO with an objective in an environment, and print how well it ends."""
-
-    program = "lpo train"
-    presets = MappingProxyType({"quick": lambda given: TrainConfig()})
-
-    config: Annotated[TrainConfig, tyro.conf.arg(name="")] = field(default_factory=TrainConfig)
-
-    def run(self) -> None:
-        (curves,) = self.compare([load_objective(self.config.objective)]).curves
-        for point, returns in zip(curves.steps, curves.returns.T, strict=True):
-            print(f"{point:>9} steps: return {np.mean(returns):.1f}")
-        print(f"final return, IQM: {estimate(curves.final)}")
-
-
-@dataclass(frozen=True, kw_only=True)
-class Evaluate(Measuring):
-    """Compare objectives: train PPO with each on the same seeds, and print final scores with intervals.
-
-    With --out every agent's returns are kept in rows.jsonl as they come, for --resume and for
-    other statistics: pandas.read_json("rows.jsonl", lines=True).
-    """
-
-    program = "lpo evaluate"
-    presets = MappingProxyType({"quick": lambda given: EvaluateConfig()})
-
-    config: Annotated[EvaluateConfig, tyro.conf.arg(name="")] = field(
-        default_factory=EvaluateConfig
-    )
-
-    @classmethod
-    def parse(cls, arguments: Sequence[str]) -> "Evaluate":
-        command = super().parse(arguments)
-        kept = command.output
-        if command.config.suite is None or kept.out is None or kept.resume is not None:
-            return command
-        # Other flags than the folder's are refused, not replaced by its own.
-        resume = kept.out if (kept.out / "config.json").exists() else None
-        return replace(command, output=replace(kept, resume=resume))
-
-    def run(self) -> None:
-        objectives = _named_apart(self.config.objectives)
-        if self.config.suite is not None:
-            self.run_suite(self.config.suite, objectives)
-            return
-        table = Table(
-            "objective",
-            "final IQM [95 %]",
-            "area under the curve",
-            f"difference to {self.config.objectives[0]}",
-        )
-        for row in self.compare(objectives).table():
-            difference = "" if row["difference"] is None else str(row["difference"])
-            table.add_row(row["objective"], str(row["final"]), str(row["area"]), difference)
-        console().print(table)
-
-    def run_suite(self, name: str, objectives: Sequence[Objective]) -> None:
-        config, seeds = self.config, self.config.seed_list()
-        suite_environments(name)
-        folder, rows = self.opened()
-        printer = console()
-        scores, comparisons = run_suite(
-            name,
-            objectives,
-            seeds,
-            config.backend,
-            tell=printer.print,
-            rows=rows,
-            steps=config.steps,
-            policy_output_scale=config.policy_output_scale,
-            mode_actions=not config.sampled_actions,
-        )
-        reference = objectives[0].name
-        table = Table(
-            "environment",
-            *scores.objectives,
-            title="final return, IQM [95 %]",
-            caption="suite: " + name,
-        )
-        for environment, comparison in comparisons.items():
-            table.add_row(environment, *(str(estimate(c.final)) for c in comparison.curves))
-        printer.print(table)
-        aggregate = Table("objective", "normalised score, IQM [95 %]", f"difference to {reference}")
-        differences = scores.differences()
-        for i, (objective, score) in enumerate(
-            zip(scores.objectives, scores.aggregate(), strict=True)
-        ):
-            aggregate.add_row(objective, str(score), str(differences[i]) if i else "")
-        printer.print(aggregate)
-        if scores.left_out:
-            printer.print(f"left out, nobody beat random actions: {', '.join(scores.left_out)}")
-        if folder is not None:
-            for environment, comparison in comparisons.items():
-                path = folder / "comparisons" / f"{environment}.json"
-                path.parent.mkdir(exist_ok=True)
-                write_json(path, comparison.as_dict())
-            content = {
-                **config_dict(config),
-                "seeds": seeds,
-                **scores.as_dict(),
-                "versions": package_versions(),
-            }
-            write_json(folder / "suite.json", content)
-            plotting.save(figures.suite_scores(scores), folder / "suite.png")
-
-
-@dataclass(frozen=True)
-class AlignConfig:
-    """What `lpo align` does.
-
-    Attributes:
-      bandits: zoo names or files.
-      environment: whose outcome counts; the first bandit's own where left out.
-      objectives: that join the family of PPO's clips, DPO's and none: zoo names, files.
-      reward_noise: in the bandit's standard deviations of reward.
-      contexts: of a batch.
-      iterations: of the inner loop; the environment's own setting where left out, as the following.
-      learning_rates: of the inner agents.
-      epochs: passes over a batch.
-      minibatches: of a batch.
-      steps: environment steps of the outcome's agents; the environment's own where left out.
-      policy_output_scale: factor on the policy's last layer at initialisation, in the environment and
-        in every regime.
-      agents: of each objective, in the environment and in each regime.
-      seed: the first of their seeds.
-      backend: Brax physics: generalized, positional or spring.
-    """
-
-    bandits: tuple[str, ...] = (Regime.bandit,)
-    environment: str | None = None
-    objectives: tuple[str, ...] = ()
-    reward_noise: tuple[float, ...] = (0.0, 2.0, 5.0)
-    contexts: tuple[int, ...] = (Regime.contexts,)
-    iterations: tuple[int, ...] = ()
-    learning_rates: tuple[float, ...] = ()
-    epochs: tuple[int, ...] = ()
-    minibatches: tuple[int, ...] = ()
-    steps: int | None = None
-    policy_output_scale: float | None = None
-    agents: int = 16
-    seed: int = 500
-    backend: str | None = None
-
-    def regimes(self) -> list[Regime]:
-        """Every combination of the values given."""
-        found = [
-            Regime(*values, policy_output_scale=self.policy_output_scale)
-            for values in itertools.product(
-                self.bandits,
-                self.reward_noise,
-                self.contexts,
-                self.iterations or (None,),
-                self.epochs or (None,),
-                self.minibatches or (None,),
-                self.learning_rates or (None,),
-            )
-        ]
-        if not found:
-            raise UserError("no regimes: give at least one value of each.")
-        return found
-
-
-@dataclass(frozen=True, kw_only=True)
-class Align(Measuring):
-    """Measure which inner loop on a bandit ranks objectives as an environment does.
-
-    Trains agents with a family of known objectives on the environment and in every combination of
-    the values given, and prints Spearman's correlation of each fitness with the environment's final
-    return. Choose a regime with it before meta-training.
-    """
-
-    program = "lpo align"
-    presets = MappingProxyType({"quick": lambda given: AlignConfig()})
-
-    config: Annotated[AlignConfig, tyro.conf.arg(name="")] = field(default_factory=AlignConfig)
-
-    def run(self) -> None:
-        config: AlignConfig = self.config
-        family = [*known_drifts(), *_named_apart(config.objectives)]
-        regimes, seeds = config.regimes(), seed_list(config.agents, config.seed, "agents")
-        target = config.environment or environment_spec(regimes[0].bandit).evaluation_environment
-        Place.named(target, config.backend)  # a mistake must not leave a folder behind
-        folder, rows = self.opened()
-        stored = None if folder is None else folder / "alignment.json"
-        printer = console()
-        report = measure_alignment(
-            regimes,
-            family,
-            target,
-            seeds,
-            config.steps,
-            config.backend,
-            config.policy_output_scale,
-            printer.print,
-            rows,
-            json.loads(stored.read_text()) if stored and stored.exists() else None,
-            partial(write_json, stored) if stored else lambda report: None,
-        )
-        table = Table("regime", *LABELS, title=f"Spearman's correlation with {target} [95 %]")
-        for row in report["regimes"]:
-            cells = (row["alignment"][fitness] for fitness in LABELS)
-            table.add_row(row["name"], *(correlation_text(cell) for cell in cells))
-        printer.print(table)
-        if folder is not None:
-            plotting.save(figures.alignment_heatmap(report), folder / "alignment.png")
-
-
 def distill_command(
     objective: tyro.conf.Positional[str],
     config: Annotated[DistillConfig, tyro.conf.arg(name="")] = _DISTILL,
@@ -481,7 +124,10 @@ def distill_command(
       out: folder for closed_form.npz and closed_form.json; must be new or empty.
     """
     loaded = load_objective(objective)
-    _make_folder(out)
+    # Before the search and not after it, which may take hours.
+    make_folder(out)
+    if any(out.iterdir()):
+        raise UserError(f"{out} already exists and is not empty: choose another --out.")
     found = distill(loaded, config)
     words = [Path(objective).name, *flags(config, _DISTILL)]
     path, certificate = save_objective(
@@ -525,22 +171,3 @@ def certify_command(objective: str) -> None:
     print(f"{loaded.name} {certificate}")
     if not certificate.holds or certificate.stalls:
         sys.exit(1)
-
-
-def _named_apart(names: Sequence[str]) -> list[Objective]:
-    # Every `lpo meta-train` writes an objective.npz: files of one name go by what was typed.
-    loaded = [load_objective(name) for name in names]
-    known = [objective.name for objective in loaded]
-    loaded = [
-        replace(objective, name=typed) if known.count(objective.name) > 1 else objective
-        for objective, typed in zip(loaded, names, strict=True)
-    ]
-    check_names(loaded)
-    return loaded
-
-
-def _make_folder(out: Path) -> None:
-    # Before the training and not after it, which may take hours.
-    make_folder(out)
-    if any(out.iterdir()):
-        raise UserError(f"{out} already exists and is not empty: choose another --out.")

@@ -104,6 +104,14 @@ def check_names(objectives: Sequence[Objective]) -> None:
         )
 
 
+def ppo_spec(
+    environment: str, steps: int | None = None, policy_output_scale: float | None = None
+) -> AgentSpec:
+    """PPO as the environment has it, but for steps and for the policy's last layer at initialisation where given."""
+    spec = environment_agent("ppo", environment).with_steps(steps)
+    return spec.with_values(policy_output_scale=policy_output_scale)
+
+
 def compare(
     environment: str,
     objectives: Sequence[Objective],
@@ -133,7 +141,7 @@ def compare(
       UserError: two objectives bear one name, by which their results are told apart.
     """
     check_names(objectives)
-    spec = spec or environment_agent("ppo", environment)
+    spec = spec or ppo_spec(environment)
     place = Place.named(environment, backend)
     found = measure(
         spec,

@@ -15,7 +15,7 @@ from rich.console import Console
 
 from lpo import drift_figures, figures, report
 from lpo.certificate import certify
-from lpo.comparison import Comparison, check_names, compare
+from lpo.comparison import Comparison, check_names, compare, ppo_spec
 from lpo.meta_training import (
     VALIDATION_AGENTS,
     MetaTraining,
@@ -25,7 +25,6 @@ from lpo.meta_training import (
 )
 from lpo.objectives import Objective, load_objective
 from scb import plotting
-from scb.agents.spec import environment_agent
 from scb.artefacts import machine_description, package_versions
 from scb.command_line import LongRun, Output
 from scb.console import console
@@ -147,7 +146,7 @@ def run_pipeline(run: Run, config: PipelineConfig, preset: str, command: str) ->
             name,
             objectives,
             reporting_seeds(config.seed, evaluation.seeds),
-            environment_agent("ppo", name).with_steps(evaluation.steps),
+            ppo_spec(name, evaluation.steps),
             evaluation.backend,
             evaluation.points,
             evaluation.episodes,

@@ -11,9 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from lpo.comparison import Comparison, check_names, compare
+from lpo.comparison import Comparison, check_names, compare, ppo_spec
 from lpo.objectives import Objective
-from scb.agents.spec import environment_agent
 from scb.environments.registry import environment_spec, families
 from scb.errors import UserError, unknown_name
 from scb.rows import Rows
@@ -200,9 +199,7 @@ def run_suite(
             environment_name,
             objectives,
             seeds,
-            spec=environment_agent("ppo", environment_name)
-            .with_steps(steps)
-            .with_values(policy_output_scale=policy_output_scale),
+            spec=ppo_spec(environment_name, steps, policy_output_scale),
             backend=physics,
             points=points,
             rows=rows,

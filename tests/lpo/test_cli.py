@@ -16,7 +16,7 @@ from gymnax.environments import spaces
 
 import lpo
 import scb.cli
-from lpo import cli, commands
+from lpo import cli, commands, training_commands
 from lpo.commands import MetaTrain
 from lpo.comparison import Comparison, LearningCurves
 from lpo.drifts import DRIFTS, ClosedFormDrift, NoDrift
@@ -489,7 +489,7 @@ def compared(environment, objectives, seeds, mode_actions=True, **_) -> Comparis
 
 @pytest.fixture
 def trained(monkeypatch) -> None:
-    monkeypatch.setattr(commands, "compare", compared)
+    monkeypatch.setattr(training_commands, "compare", compared)
 
 
 @pytest.fixture
@@ -498,7 +498,7 @@ def interrupted_evaluation(working_folder, tiny_agent, monkeypatch):
     monkeypatch.undo()  # it trains
     monkeypatch.chdir(working_folder)
     spec = AgentSpec("ppo", tiny_agent, PPOHyperparameters())
-    monkeypatch.setattr(commands, "environment_agent", lambda *_: spec)
+    monkeypatch.setattr("lpo.comparison.environment_agent", lambda *_: spec)
     arguments = ["--environment=Synthetic-Pendulum-v1", "--objectives", "none", "dpo"]
     assert cli.main(["evaluate", *arguments, "--seeds=2", "--seed=7", "--out=o"]) == 0
     rows, comparison = working_folder / "o" / "rows.jsonl", working_folder / "o" / "comparison.json"
@@ -727,7 +727,7 @@ def test_align_measures_every_combination_and_stores_it(monkeypatch, working_fol
         told.append((len(known), rows.path.name))
         return report
 
-    monkeypatch.setattr(commands, "measure_alignment", measure)
+    monkeypatch.setattr(training_commands, "measure_alignment", measure)
     flags = ["--objectives", "lpo-pendulum", "--agents=2", "--out=aligned"]
     flags += ["--policy-output-scale=0.01"]
     assert cli.main(["align", "--reward-noise", "0", "5", "--contexts", "50", "200", *flags]) == 0

@@ -45,7 +45,7 @@ def small(tiny_agent, tiny_drift):
     config = replace(tiny, search=search, evaluations=evaluations)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(RunAll, "presets", {"tiny": lambda given: config})
-        patch.setattr(pipeline, "environment_agent", spec)
+        patch.setattr("lpo.comparison.environment_agent", spec)
         yield
 
 

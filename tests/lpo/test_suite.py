@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from lpo import commands, figures, suite
+from lpo import figures, suite, training_commands
 from lpo.comparison import Comparison, LearningCurves, learning_curves
 from lpo.objectives import load_objective
 from lpo.suite import RESAMPLES, SuiteScores, run_suite, suite_scores, suites
@@ -164,7 +164,7 @@ def test_a_new_family_has_its_suite(corridors, trained, monkeypatch):
 
 def test_a_killed_suite_is_completed_to_the_same_scores(tmp_path, tiny_agent, monkeypatch, capsys):
     spec = AgentSpec("ppo", tiny_agent, PPOHyperparameters())
-    monkeypatch.setattr(suite, "environment_agent", lambda *_: spec)
+    monkeypatch.setattr("lpo.comparison.environment_agent", lambda *_: spec)
     monkeypatch.setattr(EnvironmentSpec, "random_return", lambda *arguments: -1000.0)
     bandits = {"classic": ("Synthetic-CartPole-v1", "Synthetic-Pendulum-v1")}
     monkeypatch.setattr(suite, "suites", lambda: bandits)
@@ -172,7 +172,7 @@ def test_a_killed_suite_is_completed_to_the_same_scores(tmp_path, tiny_agent, mo
 
     def evaluate(seeds=2):
         words = ["--suite=classic", "--objectives", "ppo", f"--seeds={seeds}", f"--out={out}"]
-        commands.Evaluate.parse(words).run()
+        training_commands.Evaluate.parse(words).run()
 
     evaluate()
     assert "normalised score" in capsys.readouterr().out
@@ -191,14 +191,16 @@ def test_a_killed_suite_is_completed_to_the_same_scores(tmp_path, tiny_agent, mo
         evaluate(seeds=4)
     # A default is a setting too.
     with pytest.raises(UserError, match=r"its config differs at config.seeds \(2 there, 10 now\)"):
-        commands.Evaluate.parse(["--suite=classic", "--objectives=ppo", f"--out={out}"]).run()
+        training_commands.Evaluate.parse(
+            ["--suite=classic", "--objectives=ppo", f"--out={out}"]
+        ).run()
 
 
 def test_a_suite_and_an_environment_do_not_go_together():
     with pytest.raises(UserError, match="are both given: leave one out"):
-        commands.EvaluateConfig(environment="CartPole-v1", suite="classic")
+        training_commands.EvaluateConfig(environment="CartPole-v1", suite="classic")
     with pytest.raises(UserError, match="unknown suite 'clasic': did you mean classic"):
-        commands.Evaluate.parse(["--suite=clasic"]).run()
+        training_commands.Evaluate.parse(["--suite=clasic"]).run()
 
 
 def test_scores_are_drawn(tmp_path):
