@@ -125,21 +125,6 @@ def _dpo(*parameters: tuple[float, float]) -> list[Objective]:
     ]
 
 
-def outcomes(
-    environment: str,
-    objectives: Sequence[Objective],
-    seeds: Sequence[int],
-    steps: int | None = None,
-    backend: str | None = None,
-    policy_output_scale: float | None = None,
-    rows: Rows | None = None,
-) -> dict[str, np.ndarray]:
-    """{objective: [S] return of PPO trained with it}, mode actions; arguments as `compare`."""
-    spec = ppo_spec(environment, steps, policy_output_scale)
-    comparison = compare(environment, objectives, seeds, spec, backend, points=1, rows=rows)
-    return {curves.objective: curves.final for curves in comparison.curves}
-
-
 def regime_fitness(
     regime: Regime, objectives: Sequence[Objective], seeds: Sequence[int]
 ) -> dict[str, dict[str, np.ndarray]]:
@@ -304,11 +289,12 @@ def measure_alignment(
     }
     report: dict[str, Any] = dict(done or {})
     if not report:
-        found = outcomes(environment, objectives, seeds, steps, backend, policy_output_scale, rows)
+        spec = ppo_spec(environment, steps, policy_output_scale)
+        found = compare(environment, objectives, seeds, spec, backend, points=1, rows=rows).curves
         report = {
             **asked,
-            "outcome_iqm": {name: float(iqm(returns)) for name, returns in found.items()},
-            "outcome": {name: np.round(returns, 2).tolist() for name, returns in found.items()},
+            "outcome_iqm": {c.objective: float(iqm(c.final)) for c in found},
+            "outcome": {c.objective: np.round(c.final, 2).tolist() for c in found},
             "regimes": [],
             "versions": package_versions(),
             "machine": machine_description(),

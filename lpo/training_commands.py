@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 import numpy as np
 import tyro
@@ -34,22 +34,13 @@ from scb.runs import config_dict
 from scb.statistics import estimate
 
 
-def seed_list(count: int, first: int, counted: str = "seeds") -> list[int]:
-    """`count` consecutive seeds; a UserError, which says what is `counted`, for none or a negative one."""
-    at_least(1, **{counted: count})
-    at_least(0, seed=first)
-    seeds = list(range(first, first + count))
-    check_seeds(seeds)
-    return seeds
-
-
 def _tell(line: str) -> None:
     print(line, file=sys.stderr, flush=True)
 
 
 @dataclass(frozen=True)
 class Agents:
-    """Which agents are trained and judged, and how.
+    """Which agents are trained, and how.
 
     Attributes:
       environment: Pendulum-v1, CartPole-v1, hopper, Synthetic-Pendulum-v1, ...; Pendulum-v1 where
@@ -57,26 +48,43 @@ class Agents:
       steps: environment steps; the environment's own setting where left out.
       policy_output_scale: factor on the policy's last layer at initialisation; many public PPOs take
         0.01.
-      seeds: agents of each objective.
-      seed: the first of their seeds.
+      seed: the first of the agents' seeds.
       backend: Brax physics: generalized, positional or spring.
-      sampled_actions: evaluate sampled actions rather than the most likely ones.
     """
 
     environment: str | None = None
     steps: int | None = None
     policy_output_scale: float | None = None
-    seeds: int = 1
     seed: int = 0
     backend: str | None = None
-    sampled_actions: bool = False
+
+    # The field that says how many agents of each objective there are.
+    counted: ClassVar[str] = "seeds"
 
     def seed_list(self) -> list[int]:
-        return seed_list(self.seeds, self.seed)
+        """Consecutive seeds; a UserError for none or a negative one."""
+        at_least(1, self, self.counted)
+        at_least(0, self, "seed")
+        seeds = list(range(self.seed, self.seed + getattr(self, self.counted)))
+        check_seeds(seeds)
+        return seeds
 
 
 @dataclass(frozen=True)
-class TrainConfig(Agents):
+class JudgedConfig(Agents):
+    """Agents that are judged along their training.
+
+    Attributes:
+      seeds: agents of each objective.
+      sampled_actions: evaluate sampled actions rather than the most likely ones.
+    """
+
+    seeds: int = 1
+    sampled_actions: bool = False
+
+
+@dataclass(frozen=True)
+class TrainConfig(JudgedConfig):
     """What `lpo train` does.
 
     Attributes:
@@ -87,7 +95,7 @@ class TrainConfig(Agents):
 
 
 @dataclass(frozen=True)
-class EvaluateConfig(Agents):
+class EvaluateConfig(JudgedConfig):
     """What `lpo evaluate` does.
 
     Attributes:
@@ -141,7 +149,7 @@ class Measuring(LongRun):
 
     def compare(self, objectives: Sequence[Objective]) -> Comparison:
         """Trains with the objectives, and leaves rows, comparison.json and curves.png where a folder is named."""
-        config: Agents = self.config
+        config: JudgedConfig = self.config
         environment, seeds = config.environment or "Pendulum-v1", config.seed_list()
         spec = ppo_spec(environment, config.steps, config.policy_output_scale)
         Place.named(environment, config.backend)  # a mistake must not leave a folder behind
@@ -224,8 +232,7 @@ class Evaluate(Measuring):
     def run_suite(self, name: str, objectives: Sequence[Objective]) -> None:
         config, seeds = self.config, self.config.seed_list()
         suite_environments(name)
-        folder, rows = self.opened()
-        printer = console()
+        (folder, rows), printer = self.opened(), console()
         scores, comparisons = run_suite(
             name,
             objectives,
@@ -237,23 +244,17 @@ class Evaluate(Measuring):
             policy_output_scale=config.policy_output_scale,
             mode_actions=not config.sampled_actions,
         )
-        reference = objectives[0].name
-        table = Table(
-            "environment",
-            *scores.objectives,
-            title="final return, IQM [95 %]",
-            caption="suite: " + name,
-        )
+        title, caption = "final return, IQM [95 %]", f"suite: {name}"
+        table = Table("environment", *scores.objectives, title=title, caption=caption)
         for environment, comparison in comparisons.items():
             table.add_row(environment, *(str(estimate(c.final)) for c in comparison.curves))
         printer.print(table)
-        aggregate = Table("objective", "normalised score, IQM [95 %]", f"difference to {reference}")
-        differences = scores.differences()
-        for i, (objective, score) in enumerate(
-            zip(scores.objectives, scores.aggregate(), strict=True)
-        ):
-            aggregate.add_row(objective, str(score), str(differences[i]) if i else "")
-        printer.print(aggregate)
+        first = scores.objectives[0]
+        table = Table("objective", "normalised score, IQM [95 %]", f"difference to {first}")
+        found = zip(scores.objectives, scores.aggregate(), scores.differences(), strict=True)
+        for objective, score, difference in found:
+            table.add_row(objective, str(score), "" if objective == first else str(difference))
+        printer.print(table)
         if scores.left_out:
             printer.print(f"left out, nobody beat random actions: {', '.join(scores.left_out)}")
         if folder is not None:
@@ -272,7 +273,7 @@ class Evaluate(Measuring):
 
 
 @dataclass(frozen=True)
-class AlignConfig:
+class AlignConfig(Agents):
     """What `lpo align` does.
 
     Attributes:
@@ -285,16 +286,10 @@ class AlignConfig:
       learning_rates: of the inner agents.
       epochs: passes over a batch.
       minibatches: of a batch.
-      steps: environment steps of the outcome's agents; the environment's own where left out.
-      policy_output_scale: factor on the policy's last layer at initialisation, in the environment and
-        in every regime.
       agents: of each objective, in the environment and in each regime.
-      seed: the first of their seeds.
-      backend: Brax physics: generalized, positional or spring.
     """
 
     bandits: tuple[str, ...] = (Regime.bandit,)
-    environment: str | None = None
     objectives: tuple[str, ...] = ()
     reward_noise: tuple[float, ...] = (0.0, 2.0, 5.0)
     contexts: tuple[int, ...] = (Regime.contexts,)
@@ -302,11 +297,10 @@ class AlignConfig:
     learning_rates: tuple[float, ...] = ()
     epochs: tuple[int, ...] = ()
     minibatches: tuple[int, ...] = ()
-    steps: int | None = None
-    policy_output_scale: float | None = None
     agents: int = 16
     seed: int = 500
-    backend: str | None = None
+
+    counted = "agents"
 
     def regimes(self) -> list[Regime]:
         """Every combination of the values given."""
@@ -344,7 +338,7 @@ class Align(Measuring):
     def run(self) -> None:
         config: AlignConfig = self.config
         family = [*known_drifts(), *_named_apart(config.objectives)]
-        regimes, seeds = config.regimes(), seed_list(config.agents, config.seed, "agents")
+        regimes, seeds = config.regimes(), config.seed_list()
         target = config.environment or environment_spec(regimes[0].bandit).evaluation_environment
         Place.named(target, config.backend)  # a mistake must not leave a folder behind
         folder, rows = self.opened()

@@ -139,7 +139,7 @@ class LongRun(ABC):
         if "config" not in stored or not isinstance(command, str):
             raise UserError(
                 f"cannot resume {folder}: an earlier version started it, and this one would not end with the same "
-                "numbers; start a new folder with --out, or remove this one."
+                f"numbers; remove it (rm -r {shlex.quote(str(folder))}), or start another with --out."
             )
         if not command.startswith(cls.program):
             raise UserError(

@@ -1,6 +1,7 @@
 """Which bandit regime ranks objectives as an environment does: the measure, and what it is measured on."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -172,7 +173,9 @@ def test_regimes_that_differ_in_traced_numbers_share_a_program_and_nothing_else(
 def test_the_report_holds_every_regime_and_is_drawn(monkeypatch, tmp_path):
     fixed = returns(**{"ppo-0.2": 1.0, "none": 2.0, "dpo (2, 0.6)": 3.0})
     family = [objective for objective in known_drifts() if objective.name in fixed]
-    monkeypatch.setattr(module, "outcomes", lambda *arguments: fixed)
+    curves = [SimpleNamespace(objective=n, final=x) for n, x in fixed.items()]
+    found = SimpleNamespace(curves=curves)
+    monkeypatch.setattr(module, "compare", lambda *arguments, **named: found)
     monkeypatch.setattr(
         module,
         "regime_fitness",
@@ -189,7 +192,7 @@ def test_the_report_holds_every_regime_and_is_drawn(monkeypatch, tmp_path):
     assert (aligned, flat) == (1.0, None)
     assert len(told) == 3
     # An interrupted measurement goes on where it was.
-    monkeypatch.setattr(module, "outcomes", None)
+    monkeypatch.setattr(module, "compare", None)
     kept: list[int] = []
     longer = measure_alignment(
         [*regimes, Regime(reward_noise=2.0)],

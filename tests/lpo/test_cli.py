@@ -31,6 +31,7 @@ from scb.environments.zoo import save_bandit
 from scb.errors import UserError
 from scb.evolution import evolve
 from scb.runs import config_dict
+from scb.seeds import SEARCHING
 from tests.recording import recorded_seeds
 
 PROGRAMS = {"lpo": cli.main, "scb": scb.cli.main}
@@ -287,6 +288,7 @@ def test_a_run_of_an_earlier_version_is_not_resumed(refused, working_folder):
     for command in ("meta-train", "run"):
         message = refused(command, "--resume", working_folder)
         assert "an earlier version started it, and this one would not end" in message
+        assert f"remove it (rm -r {working_folder}), or start another with --out." in message
 
 
 def test_a_resumed_run_takes_the_stored_settings(interrupted, monkeypatch):
@@ -533,6 +535,12 @@ def test_a_resumed_evaluation_keeps_its_settings(
     interrupted_evaluation, refused, arguments, message
 ):
     assert message in refused(*arguments, "--resume", "o")
+
+
+@pytest.mark.parametrize("command", ["Train", "Evaluate", "Align"])
+def test_seeds_that_train_agents_are_those_that_search_where_no_others_are_named(command):
+    config = getattr(training_commands, command).parse([]).config
+    assert set(config.seed_list()) <= set(SEARCHING)
 
 
 def test_train_prints_the_curve_and_stores_it(trained, working_folder, capsys):
