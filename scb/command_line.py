@@ -123,6 +123,10 @@ class LongRun(ABC):
     def parse(cls, arguments: Sequence[str]) -> Self:
         """The command with these flags: those that a resumed run was started with, over its preset, come first."""
         folder = flags_given(arguments, "resume").get("resume")
+        if folder == "":
+            raise UserError(
+                "--resume names no run: give the folder of one, such as --resume runs/NAME."
+            )
         if folder is not None:
             arguments = [*cls._stored(folder), *arguments]
         given = flags_given(arguments, "preset", *cls.deciding)

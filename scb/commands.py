@@ -158,13 +158,14 @@ def judge_all(
     sampled: bool = True,
     num_agents: int = 20,
     num_episodes: int = 50,
-    seed: int = VALIDATING.start,
 ) -> dict[str, Any]:
     """What agents of every fitting algorithm earn, by name of the algorithm in capitals, printed as it comes."""
     results = {}
     for algorithm in algorithms_for(judge_in.env.action_space(judge_in.params)):
         spec = bandit_agent(algorithm, judge_in.name, sampled)
-        returns = judge(spec, synthetic, weights, judge_in, seed, num_agents, num_episodes)
+        returns = judge(
+            spec, synthetic, weights, judge_in, VALIDATING.start, num_agents, num_episodes
+        )
         results[algorithm.upper()] = {
             "agents": num_agents,
             "episodes": num_episodes,

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import optax
 from jax.typing import ArrayLike
 
-from scb.errors import UserError, unknown_name
+from scb.errors import UserError, at_least, unknown_name
 
 Schedule = Callable[[jax.Array], jax.Array]
 
@@ -52,20 +52,10 @@ class CurriculumConfig:
     def __post_init__(self) -> None:
         if self.shape not in SHAPES:
             raise unknown_name("curriculum shape", self.shape, SHAPES)
-        for name in ("initial", "final"):
-            if getattr(self, name) < 1:
-                raise UserError(
-                    f"the curriculum's {name} length is {getattr(self, name)}: an episode takes at "
-                    "least 1 step."
-                )
-        if self.begin < 0:
-            raise UserError(
-                f"the curriculum begins at generation {self.begin}: give 0 or a later one."
-            )
-        if self.transition < 1:
-            raise UserError(
-                f"the curriculum's transition takes {self.transition} generations: give at least 1."
-            )
+        at_least(0, **{"the generation at which the curriculum begins": self.begin})
+        lengths = {"initial length": self.initial, "final length": self.final}
+        for name, value in {**lengths, "transition": self.transition}.items():
+            at_least(1, **{f"the curriculum's {name}": value})
         if self.shape == "constant" and self.initial != self.final:
             raise UserError(
                 f"a constant curriculum cannot go from {self.initial} to {self.final} steps: give "
@@ -86,12 +76,7 @@ class CurriculumConfig:
         `begin` and `transition` are rounded down, so that the transition does not end later in the
         search than it did; it keeps at least one generation.
         """
-        for generations in (from_generations, to_generations):
-            if generations < 1:
-                raise UserError(
-                    f"a curriculum cannot be rescaled between {from_generations} and "
-                    f"{to_generations} generations: give at least 1 for each."
-                )
+        at_least(1, from_generations=from_generations, to_generations=to_generations)
         return replace(
             self,
             begin=self.begin * to_generations // from_generations,

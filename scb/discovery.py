@@ -353,15 +353,13 @@ class BanditDiscovery:
         )
 
 
-def standardize_reward(
-    bandit: SyntheticBandit, weights: Weights, std: float, num_samples: int = 10_000
-) -> Weights:
+def standardize_reward(bandit: SyntheticBandit, weights: Weights, std: float) -> Weights:
     """The bandit whose reward is an affine function of the given one: of mean zero and standard deviation `std`.
 
     Both are over its contexts and uniform actions. What agents should do in it stays the same.
     """
     rewards = bandit.sample_rewards(
-        bandit.params(weights), named_key(root_key(0), "reward scale"), num_samples
+        bandit.params(weights), named_key(root_key(0), "reward scale"), 10_000
     )
     spread = float(rewards.std())
     # Of a constant, in 32 bits, some rounding is left.

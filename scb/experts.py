@@ -209,7 +209,7 @@ def evolve_expert(
 
 
 def _random_statistics(
-    env: environment.Environment[Any, Any], env_params: Any, num_envs: int = 64
+    env: environment.Environment[Any, Any], env_params: Any
 ) -> RunningStatistics:
     """Moments of the observations of random actions, each held for 20 steps so that they lead somewhere."""
     space = env.action_space(env_params)
@@ -230,6 +230,6 @@ def _random_statistics(
         return jax.lax.scan(step, (env_state, space.sample(key_action)), inputs)[1]
 
     with jax.ensure_compile_time_eval():
-        visited = jax.jit(jax.vmap(roll))(split_key(named_key(root_key(0), "statistics"), num_envs))
+        visited = jax.jit(jax.vmap(roll))(split_key(named_key(root_key(0), "statistics"), 64))
         visited = jnp.reshape(visited, (-1, visited.shape[-1]))
         return update_statistics(RunningStatistics.start(visited.shape[-1]), visited)

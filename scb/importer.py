@@ -11,7 +11,6 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 import tyro
 
 from scb.artefacts import Artefact, expect_shapes, read_arrays, unflatten
@@ -39,18 +38,15 @@ ORIGIN = "published by Liesen et al. (2024), released as synthetic-gymnax, Apach
 # The paper's table says tanh; the released code's default is ReLU, and these weights go with it.
 _CONFIG = BanditConfig(hidden_size=32, activation="relu", latent="normal")
 _PICKLE_SUFFIXES = (".pkl", ".pickle", ".p", ".ckpt")
-# How a pickle of protocol 2 or later starts.
-_PICKLE_START = b"\x80"
 
 
-def published_bandit(path: str | Path, environment: str | None = None) -> SyntheticBandit:
+def published_bandit(path: str | Path) -> SyntheticBandit:
     """One published bandit from its arrays.
 
     Args:
       path: an .npz file with `initial_state/Dense_0/kernel` and the seven other arrays of two
-        networks with 32 hidden units.
-      environment: its evaluation environment; None takes it from the file's name ("pendulum.npz"
-        is Pendulum-v1's).
+        networks with 32 hidden units. Its name says the evaluation environment: "pendulum.npz" is
+        Pendulum-v1's.
 
     Returns:
       The bandit, under the name "Synthetic-<environment>".
@@ -60,10 +56,10 @@ def published_bandit(path: str | Path, environment: str | None = None) -> Synthe
     """
     path = Path(path)
     _check_is_npz(path)
-    home = _environment_of(path) if environment is None else environment
+    home = _environment_of(path)
     env, env_params = make(home)
     bandit = bandit_for(env, env_params, _CONFIG, environment_spec(home).bandit)
-    artefact = Artefact(str(path), unflatten(path, _arrays(path)), {"kind": BANDIT})
+    artefact = Artefact(str(path), unflatten(path, read_arrays(path)), {"kind": BANDIT})
     expect_shapes(artefact, bandit.weight_shapes())
     weights: Any = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), artefact.arrays)
     return SyntheticBandit(
@@ -128,7 +124,10 @@ def _sources(source: Path) -> list[Path]:
 
 def _check_is_npz(path: Path) -> None:
     if path.suffix in _PICKLE_SUFFIXES:
-        raise _pickle(path)
+        raise UserError(
+            f"{path} holds pickled objects, which run code when they are opened: only plain arrays in "
+            "an .npz file are read, so convert it where you trust it."
+        )
     if path.is_dir():
         raise UserError(f"{path} is a folder: give one bandit's .npz file here.")
     if not path.is_file():
@@ -143,26 +142,6 @@ def _environment_of(path: Path) -> str:
     if path.stem not in PUBLISHED_BANDITS:
         raise unknown_name("published bandit", path.stem, PUBLISHED_BANDITS)
     return PUBLISHED_BANDITS[path.stem]
-
-
-def _arrays(path: Path) -> dict[str, np.ndarray]:
-    try:
-        return read_arrays(path)
-    except UserError as error:
-        # NumPy refuses a member with objects by naming that option. Only the wording depends on it:
-        # whatever is wrong, nothing is unpickled.
-        with path.open("rb") as file:
-            starts_as_pickle = file.read(1) == _PICKLE_START
-        if starts_as_pickle or "allow_pickle" in str(error.__cause__):
-            raise _pickle(path) from error
-        raise
-
-
-def _pickle(path: Path) -> UserError:
-    return UserError(
-        f"{path} holds pickled objects, which run code when they are opened: only plain arrays in "
-        "an .npz file are read, so convert it where you trust it."
-    )
 
 
 def _metadata(path: Path) -> dict[str, Any]:

@@ -5,15 +5,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from scb.agents.spec import tables_of
+from scb.agents.spec import check_lists, tables_of
 from scb.agents.tables import Lists
 from scb.command_line import numbers
 from scb.errors import UserError
 
-# Of 32 bits, which is what an agent calculates with.
-_LARGEST = float(np.finfo(np.float32).max)
 _WANTED = 'give {"ppo": {"learning_rate": [0.001, 0.005]}, ...}'
 
 
@@ -36,20 +32,11 @@ def read_lists(words: str) -> dict[str, Lists]:
         return {}
     if not isinstance(lists, dict) or not lists or not all(map(_is_filled, lists.values())):
         raise UserError(f"{source} holds no hyperparameter lists: {_WANTED}.")
-    for algorithm, values_of in lists.items():
-        tables_of(algorithm)
-        for name, values in values_of.items():
-            if not isinstance(values, list) or not values:
-                raise UserError(
-                    f"{source}: {algorithm}'s {name} is {values!r}, no list of numbers: {_WANTED}."
-                )
-            for value in values:
-                number = isinstance(value, int | float) and not isinstance(value, bool)
-                if not number or abs(value) > _LARGEST:
-                    raise UserError(
-                        f"{source}: {algorithm}'s {name} has the value {value!r}, which is no number that an "
-                        "agent can take: give finite numbers only."
-                    )
+    for algorithm, values in lists.items():
+        try:
+            check_lists(values, tables_of(algorithm).algorithm.hyperparameters())
+        except UserError as error:
+            raise UserError(f"{source}, {algorithm}: {error}") from error
     return {a: {n: tuple(v) for n, v in values.items()} for a, values in lists.items()}
 
 

@@ -91,18 +91,7 @@ def paired_difference(a: ArrayLike, b: ArrayLike, confidence: float = 0.95) -> E
     Raises:
       UserError: different numbers of runs, no runs, NaN or infinity.
     """
-    first, second = _runs("a", a), _runs("b", b)
-    if first.size != second.size:
-        raise UserError(
-            f"a has {first.size} runs and b has {second.size}: a paired comparison needs both "
-            "methods on the same seeds."
-        )
-
-    def difference(rows: Rows) -> NDArray[np.floating]:
-        drawn = rows(first.size)
-        return iqm(first[drawn], axis=1) - iqm(second[drawn], axis=1)
-
-    return _bootstrapped(difference, [first.size], confidence)
+    return stratified_estimate([a], [b], confidence, num_resamples=10_000)
 
 
 def stratified_estimate(

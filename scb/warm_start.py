@@ -7,6 +7,7 @@ what it cannot know is which of them *trains* well, and that is what evolution i
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -280,7 +281,7 @@ def fit_bandit(
     num_states = dataset.observation.shape[0]
     scale = dataset.observation.std(axis=0) + 1e-6
 
-    def reward_loss(reward_weights: Any, index: jax.Array) -> jax.Array:
+    def reward_loss(reward_weights: Any, index: jax.Array, _: jax.Array) -> jax.Array:
         params = BanditParams(weights={"initial_state": {}, "reward": reward_weights})
         predict = jax.vmap(
             jax.vmap(bandit.mean_reward, in_axes=(None, 0, None)), in_axes=(0, 0, None)
@@ -295,15 +296,13 @@ def fit_bandit(
         )
         return energy_distance(generated / scale, dataset.observation[index] / scale)
 
-    def fit(
-        loss: Any, start: Any, key: jax.Array, batch: int, keyed: bool
-    ) -> tuple[Any, jax.Array]:
+    @partial(jax.jit, static_argnums=0)
+    def fit(loss: Any, start: Any, key: jax.Array) -> tuple[Any, jax.Array]:
         def step(carry: Any, key: jax.Array) -> Any:
             weights, state = carry
             key_index, key_loss = split_key(key)
-            index = jax.random.randint(key_index, (batch,), 0, num_states)
-            arguments = (index, key_loss) if keyed else (index,)
-            value, gradient = jax.value_and_grad(loss)(weights, *arguments)
+            index = jax.random.randint(key_index, (256,), 0, num_states)
+            value, gradient = jax.value_and_grad(loss)(weights, index, key_loss)
             updates, state = optimizer.update(gradient, state)
             return (optax.apply_updates(weights, updates), state), value
 
@@ -311,10 +310,8 @@ def fit_bandit(
         (weights, _), losses = jax.lax.scan(step, carry, split_key(key, config.fit_steps))
         return weights, losses[-100:].mean()
 
-    fit_reward = jax.jit(lambda w, k: fit(reward_loss, w, k, batch=256, keyed=False))
-    fit_context = jax.jit(lambda w, k: fit(context_loss, w, k, batch=256, keyed=True))
-    reward, error = fit_reward(weights["reward"], key_reward)
-    context, distance = fit_context(weights["initial_state"], key_context)
+    reward, error = fit(reward_loss, weights["reward"], key_reward)
+    context, distance = fit(context_loss, weights["initial_state"], key_context)
     report = {
         "reward_r2": float(1.0 - error / jnp.var(target)),
         "energy_distance": float(distance),

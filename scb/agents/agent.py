@@ -180,19 +180,17 @@ class Agent(ABC):
         env_params: Any = None,
         mode: bool = False,
         horizon: ArrayLike | None = None,
-        training_params: Any = None,
     ) -> Episodes:
         """Episodes of the frozen agent, in its own environment or in another of the same shapes.
 
         Args:
           env, env_params: where the episodes are; None for the agent's environment and for the
-            environment's default parameters.
-          training_params: of the agent's own environment, where `env` is another: they decide the
-            bounds that its actions are scaled to. None for the default ones.
+            environment's default parameters. In another, the agent's actions are scaled to the bounds of
+            its own environment with its default parameters.
         """
         env = self.env if env is None else env
         env_params = env.default_params if env_params is None else env_params
-        own_params = env_params if env is self.env else training_params
+        own_params = env_params if env is self.env else None
 
         def policy(observation: jax.Array, key: jax.Array) -> jax.Array:
             action = self.choose(state, jnp.ravel(observation), key, own_params, mode)

@@ -20,6 +20,8 @@ from scb.environments.registry import environment_spec
 from scb.errors import UserError, at_least, unknown_name
 from scb.keys import split_key
 
+# Of 32 bits, which is what an agent calculates with.
+_LARGEST = float(jnp.finfo(jnp.float32).max)
 # {name: its tables, with the algorithm itself}. In the order that lists and pages name them in.
 ALGORITHMS: dict[str, Tables] = {tables.algorithm.name: tables for tables in TABLES}
 
@@ -224,17 +226,21 @@ def check_algorithms(names: Sequence[str], kind: str) -> None:
 
 
 def check_lists(lists: Lists, hyperparameters: Any) -> None:
-    """Raises a UserError for an unknown hyperparameter, an empty list, or a value that is no number."""
+    """Raises a UserError for an unknown hyperparameter, no list or an empty one, or what is no finite number."""
     known = [f.name for f in fields(hyperparameters)]
     for name, values in lists.items():
         if name not in known:
             raise UserError(f"unknown hyperparameter {name!r}: known are {', '.join(known)}.")
-        if not len(values):
-            raise UserError(f"the list of values for {name} is empty: give at least one number.")
+        if not isinstance(values, Sequence) or not values:
+            raise UserError(
+                f"{name} has {values!r} for a list of values: give one or more numbers."
+            )
         for value in values:
-            if isinstance(value, bool) or not isinstance(value, int | float):
+            number = isinstance(value, int | float) and not isinstance(value, bool)
+            if not number or not abs(value) <= _LARGEST:
                 raise UserError(
-                    f"{name} has the value {value!r}, which is no number: give numbers only."
+                    f"{name} has the value {value!r}, which is no number that an agent can take: give finite "
+                    "numbers only."
                 )
 
 

@@ -18,6 +18,7 @@ from jax.typing import ArrayLike
 
 from scb.agents import networks
 from scb.agents.agent import clip_to_space, scale_to_space
+from scb.agents.ppo import PPOConfig
 from scb.agents.sac import SAC
 from scb.agents.spec import environment_agent
 from scb.environments.synthetic import BanditParams, BanditState, SyntheticBandit
@@ -130,30 +131,23 @@ def clone(
     space: spaces.Box | spaces.Discrete,
     key: jax.Array,
     learning_rate: ArrayLike,
-    hidden_sizes: tuple[int, ...] = (64, 64),
-    activation: str = "tanh",
-    batch_size: int = 500,
-    num_batches: int = 20,
-    num_epochs: int = 10,
-    num_minibatches: int = 10,
+    config: PPOConfig,
 ) -> Policy:
     """Online behavioural cloning: steps towards smaller KL[pi || pi_expert] on batches of states.
-
-    The defaults are PPO's inner loop: 20 batches of 500 states, each learned from in 10 epochs of 10
-    minibatches.
 
     Args:
       contexts: key -> [O] one state.
       learning_rate: of Adam, traced.
+      config: network, batches, epochs and minibatches; by default those of the inner loop.
 
     Returns:
       The trained policy's most likely actions.
     """
-    discrete = isinstance(space, spaces.Discrete)
+    discrete, shape = isinstance(space, spaces.Discrete), (config.hidden_sizes, config.activation)
     network: Any = (
-        networks.CategoricalPolicy(int(space.n), hidden_sizes, activation)
+        networks.CategoricalPolicy(int(space.n), *shape)
         if isinstance(space, spaces.Discrete)
-        else networks.SquashedGaussianPolicy(int(np.prod(space.shape)), hidden_sizes, activation)
+        else networks.SquashedGaussianPolicy(int(np.prod(space.shape)), *shape)
     )
     optimizer = optax.adam(learning_rate)
 
@@ -175,21 +169,21 @@ def clone(
 
     def batch(carry: Any, key: jax.Array) -> Any:
         key_states, key_order = split_key(key)
-        states = jax.vmap(contexts)(split_key(key_states, batch_size))
+        states = jax.vmap(contexts)(split_key(key_states, config.batch_size))
 
         def epoch(carry: Any, key: jax.Array) -> Any:
-            order = jax.random.permutation(key, batch_size)
-            shuffled = jnp.reshape(states[order], (num_minibatches, -1, states.shape[-1]))
+            order = jax.random.permutation(key, config.batch_size)
+            shuffled = jnp.reshape(states[order], (config.num_minibatches, -1, states.shape[-1]))
             return jax.lax.scan(learn, carry, shuffled)
 
         return jax.lax.scan(
-            lambda c, k: (epoch(c, k)[0], None), carry, split_key(key_order, num_epochs)
+            lambda c, k: (epoch(c, k)[0], None), carry, split_key(key_order, config.num_epochs)
         )
 
     key_init, key_batches = split_key(key)
     weights = network.init(key_init, jnp.zeros(jax.eval_shape(contexts, key).shape))
     (weights, _), _ = jax.lax.scan(
-        batch, (weights, optimizer.init(weights)), split_key(key_batches, num_batches)
+        batch, (weights, optimizer.init(weights)), split_key(key_batches, config.num_iterations)
     )
 
     def policy(observation: jax.Array, key: jax.Array) -> jax.Array:
@@ -218,7 +212,8 @@ def judge_cloning(
     @jax.vmap
     def returns(key: jax.Array, learning_rate: jax.Array) -> jax.Array:
         key_clone, key_evaluate = split_key(key)
-        policy = clone(expert, contexts, space, key_clone, learning_rate, activation=activation)
+        config = PPOConfig(activation=activation)
+        policy = clone(expert, contexts, space, key_clone, learning_rate, config)
         return evaluate(env, env_params, policy, key_evaluate, num_episodes).returns.mean()
 
     return np.asarray(returns(split_key(key, len(learning_rates)), learning_rates))

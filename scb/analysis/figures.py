@@ -66,12 +66,11 @@ def importance_bars(
     axes: Axes,
     names: Sequence[str],
     importance: Sequence[float],
-    color: str = plotting.BLUE,
     intervals: Sequence[tuple[float, float]] | None = None,
 ) -> None:
     """The share of the reward's variance that each observation entry causes, with (low, high) where given."""
     positions = np.arange(len(names))
-    axes.barh(positions, importance, color=color)
+    axes.barh(positions, importance, color=plotting.BLUE)
     for position, (low, high) in zip(positions, intervals or (), strict=False):
         axes.hlines(position, low, high, color=plotting.BLACK, linewidth=2.5)
     axes.set_yticks(positions, list(names))

@@ -5,18 +5,14 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 
-from scb.environments.synthetic import BanditParams, SyntheticBandit
+from scb.environments.synthetic import SyntheticBandit
 from scb.keys import split_key
 
+VALUES = 32  # that an entry takes in each observation
 
-@partial(jax.jit, static_argnames=("bandit", "num_values"))
-def reward_variance(
-    bandit: SyntheticBandit,
-    observations: jax.Array,
-    key: jax.Array,
-    params: BanditParams | None = None,
-    num_values: int = 32,
-) -> jax.Array:
+
+@partial(jax.jit, static_argnames="bandit")
+def reward_variance(bandit: SyntheticBandit, observations: jax.Array, key: jax.Array) -> jax.Array:
     """The share of the reward's variance that one observation entry causes, alone or with others.
 
     Observation and action are fixed but for one entry, which takes other observations' values; the
@@ -29,13 +25,11 @@ def reward_variance(
       bandit: whose noiseless reward is examined.
       observations: [N, O], from which the entries' values come.
       key: decides actions and values.
-      params: the bandit's parameters; its own where None.
-      num_values: that an entry takes in each observation.
 
     Returns:
       [O] non-negative.
     """
-    params = bandit.default_params if params is None else params
+    params = bandit.default_params
     number, size = observations.shape
     key_action, key_value, key_entries = split_key(key, 3)
     independent = jnp.stack(
@@ -47,7 +41,7 @@ def reward_variance(
     )
     actions = jax.vmap(bandit.action_space().sample)(split_key(key_action, number))
     reward = jax.vmap(bandit.mean_reward, in_axes=(0, 0, None))
-    picked = jax.random.randint(key_value, (number, num_values), 0, number)
+    picked = jax.random.randint(key_value, (number, VALUES), 0, number)
 
     def entry_variance(entry: jax.Array) -> jax.Array:
         def varied(value: jax.Array) -> jax.Array:

@@ -62,11 +62,9 @@ def optimal_actions(
     return best
 
 
-def optimal_policy(
-    bandit: SyntheticBandit, params: BanditParams | None = None, method: str = "gradient"
-) -> Policy:
+def optimal_policy(bandit: SyntheticBandit, params: BanditParams | None = None) -> Policy:
     """`optimal_actions` as `scb.evaluation.evaluate` takes a policy: of unflattened observations, with a key."""
-    best = optimal_actions(bandit, params, method)
+    best = optimal_actions(bandit, params)
     return lambda observation, key: best(jnp.ravel(observation))
 
 

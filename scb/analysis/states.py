@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from gymnax.environments import environment
 
-from scb.environments.synthetic import BanditParams, SyntheticBandit
+from scb.environments.synthetic import SyntheticBandit
 from scb.keys import split_key
 
 
@@ -36,14 +36,9 @@ class Trajectories(NamedTuple):
         return np.sum(self.rewards * self.active, axis=1)
 
 
-def bandit_states(
-    bandit: SyntheticBandit,
-    key: jax.Array,
-    number: int,
-    params: BanditParams | None = None,
-) -> np.ndarray:
+def bandit_states(bandit: SyntheticBandit, key: jax.Array, number: int) -> np.ndarray:
     """[number, O] contexts."""
-    params = bandit.default_params if params is None else params
+    params = bandit.default_params
     draw = jax.jit(jax.vmap(lambda key: bandit.reset_env(key, params)[0]))
     return np.asarray(draw(split_key(key, number)))
 
@@ -54,15 +49,9 @@ def follow(
     policy: Callable[[jax.Array, jax.Array], jax.Array],
     key: jax.Array,
     num_episodes: int,
-    num_steps: int | None = None,
 ) -> Trajectories:
-    """Episodes of a policy, every step of them recorded.
-
-    Args:
-      policy: (observation, key) -> action, for one environment.
-      num_steps: T, after which an episode is cut; None for the environment's own limit.
-    """
-    steps = int(env_params.max_steps_in_episode) if num_steps is None else num_steps
+    """Episodes of a policy, (observation, key) -> action, every step of them recorded."""
+    steps = int(env_params.max_steps_in_episode)
     records = jax.jit(jax.vmap(lambda key: record_episode(env, env_params, policy, key, steps)[0]))(
         split_key(key, num_episodes)
     )

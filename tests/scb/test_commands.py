@@ -457,8 +457,8 @@ def test_a_reader_that_stops_early_is_no_error(monkeypatch):
             "unknown curriculum shape 'liner': did you mean li",
         ),
         ("discover --curriculum linear:0:2:3:4", "the curriculum's initial length is 0"),
-        ("discover --curriculum linear:1:2:-3:4", "the curriculum begins at generation -3"),
-        ("discover --curriculum linear:1:2:3:0", "the curriculum's transition takes 0 generations"),
+        ("discover --curriculum linear:1:2:-3:4", "at which the curriculum begins is -3"),
+        ("discover --curriculum linear:1:2:3:0", "the curriculum's transition is 0"),
         ("discover --mode al", "unknown mode 'al': did you mean all"),
         ("discover --parameterization IT", "unknown parameterization 'IT': did you mean"),
         ("discover --parameterization T", "(T) cannot be fitted to an expert: use init random"),
@@ -481,6 +481,7 @@ def test_a_reader_that_stops_early_is_no_error(monkeypatch):
         ("discover --out FOLDER", "already exists and is not empty"),
         ("discover --out FILE/run", "cannot write to"),
         ("discover --resume FOLDER", "is not a run"),
+        ("discover --resume", "--resume names no run: give the folder of one"),
     ],
 )
 def test_a_wrong_input_is_one_sentence_and_exit_code_2(
@@ -517,8 +518,8 @@ def refused(arguments, message):
         ('{"ppo": [0.1]}', "lists.json holds no hyperparameter lists"),
         ('{"pop": {"discount": [0.9]}}', "unknown algorithm 'pop': did you mean ppo"),
         ('{"ppo": {"lr": [0.1]}}', "unknown hyperparameter 'lr': known are learning_rate"),
-        ('{"ppo": {"discount": []}}', "ppo's discount is [], no list of numbers"),
-        ('{"ppo": {"discount": 0.9}}', "ppo's discount is 0.9, no list of numbers"),
+        ('{"ppo": {"discount": []}}', "discount has [] for a list of values"),
+        ('{"ppo": {"discount": 0.9}}', "discount has 0.9 for a list of values"),
         ('{"ppo": {"learning_rate": ["fast"]}}', "learning_rate has the value 'fast', which is no"),
         ('{"ppo": {"discount": [0.9, true]}}', "discount has the value True, which is no number"),
         ('{"ppo": {"discount": [null]}}', "discount has the value None, which is no number"),
@@ -554,7 +555,7 @@ def test_an_import_of_pickles_is_refused_and_writes_nothing(tmp_path, monkeypatc
     message = "published holds no .npz file, only pickles, which run code when they are opened"
     refused(["import-published", "published", "--out", "out"], message)
     (tmp_path / "published" / "pendulum.npz").write_bytes(b"\x80\x05N.")
-    message = "pendulum.npz holds pickled objects, which run code when they are opened"
+    message = "pendulum.npz is not a usable .npz"
     refused(["import-published", "published", "--out", "out"], message)
     assert [path.name for path in tmp_path.iterdir()] == ["published"]
 

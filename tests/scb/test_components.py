@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import scb
+from scb.agents.ppo import PPOConfig
 from scb.agents.sac import SAC, SACConfig, SACHyperparameters
 from scb.agents.spec import AgentSpec
 from scb.analysis import components
@@ -126,9 +127,8 @@ def test_cloning_comes_close_to_the_expert(name, request):
 
     @jax.jit
     def agreement(rate):
-        policy = components.clone(
-            expert, contexts, space, jax.random.key(4), rate, batch_size=200, num_batches=5
-        )
+        config = PPOConfig(num_steps=40, total_steps=1000)
+        policy = components.clone(expert, contexts, space, jax.random.key(4), rate, config)
         states = jax.vmap(contexts)(jax.random.split(jax.random.key(5), 300))
         actions = jax.vmap(lambda o: policy(o, jax.random.key(0)))(states)
         wanted = jax.vmap(expert.action)(states)

@@ -138,10 +138,10 @@ def test_a_rescaled_curriculum_reaches_its_end_within_the_search(name):
             ("linaer", 1, 2, 0, 1),
             "unknown curriculum shape 'linaer': did you mean linear or cosine?",
         ),
-        (("linear", 0, 2, 0, 1), "initial length is 0"),
+        (("linear", 0, 2, 0, 1), "the curriculum's initial length is 0: it must be at least 1."),
         (("linear", 1, -2, 0, 1), "final length is -2"),
-        (("linear", 1, 2, -1, 1), "begins at generation -1"),
-        (("linear", 1, 2, 0, 0), "takes 0 generations"),
+        (("linear", 1, 2, -1, 1), "begins is -1: it must be 0 or larger."),
+        (("linear", 1, 2, 0, 0), "transition is 0"),
         (("constant", 1, 2, 0, 1), "cannot go from 1 to 2"),
     ],
 )
@@ -153,12 +153,12 @@ def test_a_curriculum_that_cannot_be_is_refused(arguments, message):
 
 @pytest.mark.parametrize("generations", [(0, 5), (5, 0), (5, -1)])
 def test_a_search_without_generations_is_refused(generations):
-    with pytest.raises(UserError, match="give at least 1"):
+    with pytest.raises(UserError, match="it must be at least 1"):
         MOUNTAIN_CAR.rescaled(*generations)
 
 
 def test_a_search_of_no_generations_has_no_paper_curriculum():
-    with pytest.raises(UserError, match="and 0 generations"):
+    with pytest.raises(UserError, match="to_generations is 0"):
         paper_curriculum("hopper", 0)
 
 

@@ -631,7 +631,7 @@ def test_the_inner_loop_is_the_papers_where_no_agent_is_given():
             {"lists": {"ppo": {"lr": (0.1,)}}},
             "unknown hyperparameter 'lr': known are learning_rate",
         ),
-        ({"lists": {"ppo": {"discount": ()}}}, "the list of values for discount is empty"),
+        ({"lists": {"ppo": {"discount": ()}}}, "for a list of values: give one or more numbers"),
         ({"lists": {"ppo": {"discount": (True,)}}}, "discount has the value True"),
         (
             {"lists": {"sac": {"discount": (0.9,)}}},
