@@ -13,6 +13,7 @@ from scb.agents import networks
 from scb.agents.agent import Algorithm
 from scb.agents.off_policy import (
     Learner,
+    Moment,
     OffPolicyAgent,
     OffPolicyConfig,
     Transition,
@@ -71,20 +72,15 @@ class DQN(OffPolicyAgent):
         return {"q": self._network(env_params).init(key, observation)}
 
     def explore(
-        self,
-        learner: Learner,
-        hyperparameters: DQNHyperparameters,
-        observation: jax.Array,
-        key: jax.Array,
-        progress: jax.Array,
-        env_params: Any,
+        self, learner: Learner, observation: jax.Array, key: jax.Array, moment: Moment
     ) -> jax.Array:
+        hyperparameters: DQNHyperparameters = moment.hyperparameters
         key_coin, key_random = split_key(key)
         number = observation.shape[0]
-        done = jnp.clip(progress / hyperparameters.epsilon_decay, 0.0, 1.0)
+        done = jnp.clip(moment.progress / hyperparameters.epsilon_decay, 0.0, 1.0)
         start = jnp.asarray(hyperparameters.epsilon_start)
         end = jnp.asarray(hyperparameters.epsilon_end)
-        q = self._network(env_params).apply(learner.params["q"], observation)
+        q = self._network(moment.env_params).apply(learner.params["q"], observation)
         random = jax.random.randint(key_random, (number,), 0, q.shape[-1])
         explores = jax.random.uniform(key_coin, (number,)) < start + (end - start) * done
         return jnp.where(explores, random, jnp.argmax(q, axis=-1))
@@ -101,16 +97,9 @@ class DQN(OffPolicyAgent):
             self._network(env_params).apply(learner.params["q"], observation), axis=-1
         )
 
-    def learn(
-        self,
-        learner: Learner,
-        hyperparameters: DQNHyperparameters,
-        batch: Transition,
-        key: jax.Array,
-        step: jax.Array,
-        env_params: Any,
-    ) -> Learner:
-        network = self._network(env_params)
+    def learn(self, learner: Learner, batch: Transition, key: jax.Array, moment: Moment) -> Learner:
+        hyperparameters: DQNHyperparameters = moment.hyperparameters
+        network = self._network(moment.env_params)
         if self.one_step:
             target = batch.reward
         else:

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import optax
 from flax import struct
 from gymnax.environments import spaces
+from jax.typing import ArrayLike
 
 from scb.agents import replay
 from scb.agents.agent import Agent, AgentConfig, clip_to_space, clipped_adam
@@ -111,6 +112,15 @@ class OffPolicyState:
     key: jax.Array
 
 
+class Moment(NamedTuple):
+    """What an agent explores and learns under: everything but what it learned and what it meets."""
+
+    hyperparameters: Any
+    env_params: Any
+    progress: jax.Array | float = 0.0  # share of the environment steps taken
+    step: jax.Array | int = 0  # gradient steps taken
+
+
 @dataclass(frozen=True, eq=False)
 class OffPolicyAgent(Agent):
     """The loop; a subclass says how to act and how to learn."""
@@ -134,27 +144,13 @@ class OffPolicyAgent(Agent):
 
     @abstractmethod
     def explore(
-        self,
-        learner: Learner,
-        hyperparameters: Any,
-        observation: jax.Array,
-        key: jax.Array,
-        progress: jax.Array,
-        env_params: Any,
+        self, learner: Learner, observation: jax.Array, key: jax.Array, moment: Moment
     ) -> jax.Array:
         """[N, O] normalised observations -> [N, ...] actions to gather experience with."""
 
     @abstractmethod
-    def learn(
-        self,
-        learner: Learner,
-        hyperparameters: Any,
-        batch: Transition,
-        key: jax.Array,
-        step: jax.Array,
-        env_params: Any,
-    ) -> Learner:
-        """One gradient step on [B] transitions with normalised observations; `step` counts them."""
+    def learn(self, learner: Learner, batch: Transition, key: jax.Array, moment: Moment) -> Learner:
+        """One gradient step on [B] transitions with normalised observations."""
 
     def update_targets(
         self, learner: Learner, hyperparameters: Any, iteration: jax.Array
@@ -226,10 +222,8 @@ class OffPolicyAgent(Agent):
         progress = (config.prefill + state.iteration * config.num_envs) / config.total_steps
 
         def explore(observation: jax.Array, key: jax.Array) -> jax.Array:
-            observation = self._inputs(state, observation)
-            return self.explore(
-                state.learner, hyperparameters, observation, key, progress, env_params
-            )
+            moment = Moment(hyperparameters, env_params, progress=progress)
+            return self.explore(state.learner, self._inputs(state, observation), key, moment)
 
         standing, transitions = self._step(
             state.environment, config.num_envs, explore, key_step, env_params
@@ -245,7 +239,8 @@ class OffPolicyAgent(Agent):
                 next_observation=self._inputs(state, batch.next_observation),
             )
             step = state.iteration * config.gradient_steps + number
-            return self.learn(learner, hyperparameters, batch, key_learn, step, env_params), None
+            moment = Moment(hyperparameters, env_params, step=step)
+            return self.learn(learner, batch, key_learn, moment), None
 
         learner, _ = jax.lax.scan(
             gradient_step,
@@ -312,14 +307,12 @@ def _flatten(observation: jax.Array) -> jax.Array:
     return jnp.reshape(observation, (observation.shape[0], -1)).astype(jnp.float32)
 
 
-def target_values(
-    batch: Transition, next_value: jax.Array, discount: jax.typing.ArrayLike
-) -> jax.Array:
+def target_values(batch: Transition, next_value: jax.Array, discount: ArrayLike) -> jax.Array:
     """[B] r + discount * V(s'), without V where the episode terminated (a truncation is no termination)."""
     return batch.reward + discount * (1.0 - batch.terminated) * next_value
 
 
-def polyak_average(target: Any, online: Any, polyak: jax.typing.ArrayLike) -> Any:
+def polyak_average(target: Any, online: Any, polyak: ArrayLike) -> Any:
     """Polyak * target + (1 - polyak) * online: the paper's convention, in which 0.99 moves slowly."""
     # optax.incremental_update is the same sum the other way round, and rounds its last bit otherwise.
     return jax.tree.map(lambda t, o: polyak * t + (1.0 - polyak) * o, target, online)

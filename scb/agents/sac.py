@@ -17,6 +17,7 @@ from scb.agents import networks
 from scb.agents.agent import Algorithm, scale_to_space
 from scb.agents.off_policy import (
     Learner,
+    Moment,
     OffPolicyAgent,
     OffPolicyConfig,
     OffPolicyState,
@@ -92,15 +93,9 @@ class SAC(OffPolicyAgent):
         }
 
     def explore(
-        self,
-        learner: Learner,
-        hyperparameters: SACHyperparameters,
-        observation: jax.Array,
-        key: jax.Array,
-        progress: jax.Array,
-        env_params: Any,
+        self, learner: Learner, observation: jax.Array, key: jax.Array, moment: Moment
     ) -> jax.Array:
-        return self.greedy(learner, observation, key, env_params, mode=False)
+        return self.greedy(learner, observation, key, moment.env_params, mode=False)
 
     def greedy(
         self,
@@ -144,15 +139,9 @@ class SAC(OffPolicyAgent):
             q = critics.apply(params, inputs, jnp.reshape(action, (size,)))
         return q.min(axis=0)
 
-    def learn(
-        self,
-        learner: Learner,
-        hyperparameters: SACHyperparameters,
-        batch: Transition,
-        key: jax.Array,
-        step: jax.Array,
-        env_params: Any,
-    ) -> Learner:
+    def learn(self, learner: Learner, batch: Transition, key: jax.Array, moment: Moment) -> Learner:
+        hyperparameters: SACHyperparameters = moment.hyperparameters
+        env_params = moment.env_params
         discrete, size = self._space(env_params)
         policy, critics = self._networks(env_params)
         key_next, key_policy = split_key(key)

@@ -14,6 +14,7 @@ from scb.agents import networks
 from scb.agents.agent import Algorithm, scale_to_space
 from scb.agents.off_policy import (
     Learner,
+    Moment,
     OffPolicyAgent,
     OffPolicyConfig,
     Transition,
@@ -89,20 +90,14 @@ class TD3(OffPolicyAgent):
         }
 
     def explore(
-        self,
-        learner: Learner,
-        hyperparameters: TD3Hyperparameters,
-        observation: jax.Array,
-        key: jax.Array,
-        progress: jax.Array,
-        env_params: Any,
+        self, learner: Learner, observation: jax.Array, key: jax.Array, moment: Moment
     ) -> jax.Array:
-        policy, _ = self._networks(env_params)
+        space = self.env.action_space(moment.env_params)
+        policy, _ = self._networks(moment.env_params)
         squashed = policy.apply(learner.params["policy"], observation)
-        noise = hyperparameters.exploration_noise * jax.random.normal(key, squashed.shape)
-        return scale_to_space(
-            jnp.clip(squashed + noise, -1.0, 1.0), self.env.action_space(env_params)
-        )
+        spread = moment.hyperparameters.exploration_noise
+        noise = spread * jax.random.normal(key, squashed.shape)
+        return scale_to_space(jnp.clip(squashed + noise, -1.0, 1.0), space)
 
     def greedy(
         self,
@@ -116,17 +111,10 @@ class TD3(OffPolicyAgent):
         squashed = policy.apply(learner.params["policy"], observation)
         return scale_to_space(squashed, self.env.action_space(env_params))
 
-    def learn(
-        self,
-        learner: Learner,
-        hyperparameters: TD3Hyperparameters,
-        batch: Transition,
-        key: jax.Array,
-        step: jax.Array,
-        env_params: Any,
-    ) -> Learner:
-        policy, critics = self._networks(env_params)
-        space = self.env.action_space(env_params)
+    def learn(self, learner: Learner, batch: Transition, key: jax.Array, moment: Moment) -> Learner:
+        hyperparameters: TD3Hyperparameters = moment.hyperparameters
+        policy, critics = self._networks(moment.env_params)
+        space = self.env.action_space(moment.env_params)
         optimizer = self.optimizer(hyperparameters)
         action = jnp.reshape(batch.action, (-1, policy.action_size))
         if self.one_step:
@@ -161,7 +149,7 @@ class TD3(OffPolicyAgent):
             carry = update_policy(carry)
         else:
             # `step` is no member of a vmapped population: this stays a branch, and skips the work.
-            due = step % self.config.policy_delay == self.config.policy_delay - 1
+            due = moment.step % self.config.policy_delay == self.config.policy_delay - 1
             carry = jax.lax.cond(due, update_policy, lambda carry: carry, carry)
         return learner.replaced("policy", *carry)
 

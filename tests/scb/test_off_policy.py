@@ -18,7 +18,7 @@ import scb
 from scb.agents import replay, sac
 from scb.agents.dqn import DQN, DQNConfig, DQNHyperparameters
 from scb.agents.normalization import RunningStatistics
-from scb.agents.off_policy import Transition, polyak_average, target_values
+from scb.agents.off_policy import Moment, Transition, polyak_average, target_values
 from scb.agents.sac import SAC, SACConfig, SACHyperparameters
 from scb.agents.spec import environment_agent
 from scb.agents.td3 import TD3, TD3Config, TD3Hyperparameters, ddpg_config
@@ -156,14 +156,9 @@ def linear(name):
 def learn_once(name, learner, batch, key=0, step=0, **hyperparameters):
     agent, _, learn, _ = linear(name)
     h = {"discount": 0.5} | hyperparameters
-    return learn(
-        learner,
-        jax.tree.map(np.float32, CASES[name].hyperparameters.replace(**h)),
-        batch,
-        jax.random.key(key),
-        np.int32(step),
-        agent.env.default_params,
-    )
+    h = jax.tree.map(np.float32, CASES[name].hyperparameters.replace(**h))
+    moment = Moment(h, agent.env.default_params, step=np.int32(step))
+    return learn(learner, batch, jax.random.key(key), moment)
 
 
 @pytest.mark.parametrize(
@@ -422,14 +417,8 @@ def test_epsilon_falls_linearly_over_its_fraction_of_the_training():
     learner = replace(learner, params={"q": constant(learner.params["q"], [1.0, 0.0])})
     h = DQNHyperparameters(epsilon_start=1.0, epsilon_end=0.2, epsilon_decay=0.5)
     for progress, expected in ((0.0, 0.5), (0.25, 0.3), (0.5, 0.1), (1.0, 0.1)):
-        actions = explore(
-            learner,
-            h,
-            np.ones((4000, 3), np.float32),
-            jax.random.key(0),
-            progress,
-            agent.env.default_params,
-        )
+        moment = Moment(h, agent.env.default_params, progress)
+        actions = explore(learner, np.ones((4000, 3), np.float32), jax.random.key(0), moment)
         np.testing.assert_allclose(np.mean(np.asarray(actions)), expected, atol=0.03)
 
 
@@ -438,14 +427,9 @@ def test_exploration_noise_is_in_units_of_half_the_action_spaces_width(name):
     # Around the middle of [-1, 2], deviation 0.2 * 1.5 = 0.3; its error is 0.3 / sqrt(2 * 4000).
     agent, learner, _, explore = linear(name)
     params = learner.params | {"policy": constant(learner.params["policy"], [0.0])}
-    actions = explore(
-        replace(learner, params=params),
-        TD3Hyperparameters(exploration_noise=0.2),
-        np.ones((4000, 3), np.float32),
-        jax.random.key(0),
-        0.0,
-        agent.env.default_params,
-    )
+    moment = Moment(TD3Hyperparameters(exploration_noise=0.2), agent.env.default_params)
+    learner = replace(learner, params=params)
+    actions = explore(learner, np.ones((4000, 3), np.float32), jax.random.key(0), moment)
     np.testing.assert_allclose(np.mean(actions), 0.5, atol=0.02)
     np.testing.assert_allclose(np.std(actions), 0.3, atol=0.015)
 
@@ -772,7 +756,7 @@ def test_learning_in_a_one_step_environment_is_learning_from_terminated_steps(na
         def step(learner, number):
             key_sample, key_step = jax.random.split(jax.random.fold_in(key_learn, number))
             batch = replay.sample(buffer, key_sample, 8)
-            return agent.learn(learner, h, batch, key_step, number, params), None
+            return agent.learn(learner, batch, key_step, Moment(h, params, step=number)), None
 
         start = agent.init_learner(key_init, h, params)
         end, _ = jax.lax.scan(step, start, jnp.arange(20))
