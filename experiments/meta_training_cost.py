@@ -14,7 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments.harness import Experiment, Save
-from lpo.meta_training import MetaTraining, MetaTrainingConfig, environment_problem
+from lpo.inner_loop import MetaTrainingConfig
+from lpo.meta_training import MetaTraining, environment_problem
 from scb.evolution import map_population
 from scb.keys import root_key
 from scb.runs import Stopwatch

@@ -13,7 +13,8 @@ _HOME = {
         "certificate": ("Certificate", "certify"),
         "drifts": ("ClipDrift", "DPODrift", "Drift", "LearnedDrift", "NoDrift"),
         "comparison": ("compare", "learning_curves"),
-        "meta_training": ("MetaTrainingConfig", "meta_train"),
+        "inner_loop": ("MetaTrainingConfig",),
+        "meta_training": ("meta_train",),
         "objectives": ("Objective", "load_objective", "save_objective"),
         "portable": ("drift_function", "numpy_drift", "torch_drift", "torch_loss"),
     }.items()

@@ -18,7 +18,7 @@ import numpy as np
 from lpo.comparison import check_names, compare, ppo_spec
 from lpo.drifts import ClipDrift, DPODrift, Drift, NoDrift
 from lpo.fitness import FITNESSES, LABELS
-from lpo.meta_training import MetaTrainingConfig, TaskTraining, task_agent
+from lpo.inner_loop import MetaTrainingConfig, TaskTraining, task_agent
 from lpo.objectives import Objective, closed_form
 from scb.agents.ppo import PPOHyperparameters
 from scb.agents.spec import AgentSpec
@@ -82,8 +82,9 @@ class Regime:
             agent=self.spec().config,
             reward_noise=self.reward_noise,
             fitness="area",
+            drift=objective.drift,
         )
-        return TaskTraining(config, self.bandit, objective.drift)
+        return TaskTraining(config, self.bandit)
 
     def static(self) -> "Regime":
         """The regime without what is traced: those that are equal here share a program."""

@@ -15,11 +15,11 @@ from lpo import figures
 from lpo.certificate import certify
 from lpo.distill import DistillConfig, distill
 from lpo.drifts import LearnedDrift, learned_drift
+from lpo.inner_loop import MetaTrainingConfig
 from lpo.meta_training import (
     TEMPORAL_HORIZONS,
     VALIDATION_AGENTS,
     MetaTraining,
-    MetaTrainingConfig,
     learn_objective,
 )
 from lpo.objectives import Objective, load_objective, save_objective

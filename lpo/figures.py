@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, MaxNLocator, NullFormatter
 from numpy.typing import NDArray
 
-from lpo.meta_training import MetaTrainingConfig
+from lpo.inner_loop import MetaTrainingConfig
 from scb.environments.registry import environment_spec
 from scb.errors import UserError
 from scb.plotting import (

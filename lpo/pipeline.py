@@ -16,10 +16,10 @@ from rich.console import Console
 from lpo import drift_figures, figures, report
 from lpo.certificate import certify
 from lpo.comparison import Comparison, check_names, compare, ppo_spec
+from lpo.inner_loop import MetaTrainingConfig
 from lpo.meta_training import (
     VALIDATION_AGENTS,
     MetaTraining,
-    MetaTrainingConfig,
     environment_problem,
     learn_objective,
 )

@@ -21,7 +21,8 @@ from lpo.commands import MetaTrain
 from lpo.comparison import Comparison, LearningCurves
 from lpo.drifts import DRIFTS, ClosedFormDrift, NoDrift
 from lpo.fitness import LABELS
-from lpo.meta_training import TEMPORAL_HORIZONS, MetaTrainingConfig
+from lpo.inner_loop import MetaTrainingConfig
+from lpo.meta_training import TEMPORAL_HORIZONS
 from lpo.objectives import Objective, closed_form, load_objective, zoo_names
 from lpo.pipeline import RunAll
 from scb.agents.ppo import PPOHyperparameters

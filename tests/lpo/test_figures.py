@@ -14,7 +14,7 @@ from matplotlib.collections import FillBetweenPolyCollection, QuadMesh
 
 from lpo import drift_figures, figures
 from lpo.comparison import LearningCurves
-from lpo.meta_training import MetaTrainingConfig
+from lpo.inner_loop import MetaTrainingConfig
 from lpo.objectives import Objective, load_objective
 from lpo.update_regions import surface
 from scb import plotting

@@ -9,7 +9,8 @@ import pytest
 
 from lpo.comparison import learning_curves
 from lpo.drifts import LearnedDrift
-from lpo.meta_training import MetaTrainingConfig, meta_train
+from lpo.inner_loop import MetaTrainingConfig
+from lpo.meta_training import meta_train
 from lpo.objectives import load_objective
 from scb.agents.spec import environment_agent
 from scb.discovery import DiscoveryConfig, discover, judge

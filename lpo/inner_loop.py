@@ -1,0 +1,256 @@
+"""What meta-training is asked for, and its inner loop: agents that train with a drift, and what that is worth."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Annotated, Any
+
+import jax
+import jax.numpy as jnp
+import tyro
+from jax.typing import ArrayLike
+
+from lpo.drifts import Drift, LearnedDrift
+from lpo.fitness import FITNESSES, Fitness
+from scb.agents.ppo import PPOConfig, PPOHyperparameters
+from scb.agents.spec import AgentSpec, check_lists, environment_agent
+from scb.command_line import listed, numbers, text
+from scb.environments.registry import environment_spec
+from scb.errors import UserError, at_least, unknown_name
+from scb.evolution import EnvironmentSteps, EvolutionConfig
+from scb.keys import named_key, root_key, split_key
+from scb.lists import read_values, write_values
+from scb.measurement import Judge, spaced, train_and_judge
+
+POINTS = 5  # of the curve that the area is under
+
+
+def _read_horizons(words: str) -> tuple[float, ...]:
+    return () if words == "None" else numbers(words, "horizons")
+
+
+def _write_horizons(horizons: tuple[float, ...]) -> str:
+    return ",".join(map(str, horizons)) or "None"
+
+
+@dataclass(frozen=True)
+class MetaTrainingConfig:
+    """What to learn an objective on, and how.
+
+    Attributes:
+      tasks: where the inner loop trains: bandits (Synthetic-Pendulum-v1) or any environments
+        (Pendulum-v1, hopper, ...), separated by commas; observations and actions may differ.
+      fitness: return (of the trained agent where it was trained, without noise), return-sampled (with
+        sampled actions rather than the most likely ones), area (the mean over the training), or
+        transfer (return of the bandit-trained agent in the bandit's evaluation environment).
+      agent: PPO's static configuration; None takes `task_agent`'s.
+      contexts: that a batch of a bandit holds.
+      horizons: how long inner agents train, as fractions of the setting's number of updates, such as
+        0.25,0.5,1; one is drawn for each generation. None: always in full. A temporally-aware drift
+        learns here that the fraction of training done is what matters.
+      hyperparameters: values that inner agents draw PPO's hyperparameters from, such as
+        "learning_rate=0.0003,0.001 policy_output_scale=1,0.01"; the rest are those of the (evaluation)
+        environment's own setting. With one initialisation of the policy alone, an objective learns to
+        make up for its weakness.
+      reward_noise: noise on a bandit's reward, in standard deviations of that reward over random
+        contexts and actions. Without it the drift overfits the bandit. Environments have noise of
+        their own and take none.
+      agents_per_candidate: inner agents whose mean is a candidate's fitness.
+      evaluation_episodes: of each inner agent; None takes 50 where they are of one step, else 20.
+      validation: judge the mean of the search distribution by agents trained with it in the tasks'
+        evaluation environments, on the settings of those, and keep the mean that was judged best,
+        rather than the final one. The longer a search on a bandit, the more it learns about the bandit
+        alone. Takes environment steps, of which the search itself sees none.
+      backend: Brax physics, where the environment is Brax's (with transfer: the evaluation
+        environment).
+      initial_scale: of the drift's random start, so that the search begins near what it corrects.
+      drift: the settings of what is learned.
+      evolution: of the candidates.
+    """
+
+    tasks: Annotated[
+        tuple[str, ...],
+        tyro.conf.arg(aliases=("--environment",)),
+        text(partial(listed, what="tasks"), ",".join, "NAME,NAME"),
+    ] = ("Synthetic-Pendulum-v1",)
+    fitness: str = "return"
+    agent: tyro.conf.Suppress[PPOConfig | None] = None
+    contexts: int = 200
+    horizons: Annotated[tuple[float, ...], text(_read_horizons, _write_horizons, "A,B,C")] = ()
+    hyperparameters: Annotated[
+        Mapping[str, tuple[float, ...]], text(read_values, write_values, "'NAME=A,B NAME=A'")
+    ] = field(default_factory=lambda: {"policy_output_scale": (1.0, 0.01)})
+    reward_noise: float = 5.0
+    agents_per_candidate: int = 4
+    evaluation_episodes: int | None = None
+    validation: Annotated[bool, tyro.conf.arg(name="validate")] = False
+    backend: str | None = None
+    initial_scale: float = 0.1
+    drift: Annotated[Drift, tyro.conf.arg(prefix_name=False)] = field(default_factory=LearnedDrift)
+    evolution: Annotated[EvolutionConfig, tyro.conf.arg(name="outer loop", prefix_name=False)] = (
+        field(
+            default_factory=lambda: EvolutionConfig(
+                strategy="Open_ES", population_size=32, sigma=0.03, learning_rate=0.01
+            )
+        )
+    )
+
+    def __post_init__(self) -> None:
+        if self.fitness not in FITNESSES:
+            raise unknown_name("fitness", self.fitness, FITNESSES)
+        if not self.tasks:
+            raise UserError("the list of tasks is empty: give at least one bandit or environment.")
+        for name in self.tasks:
+            if self.tasks.count(name) > 1:
+                raise UserError(f"the task {name} is there twice: give each once.")
+            if self.judgement.at_home and not environment_spec(name).synthetic:
+                raise UserError(
+                    f"fitness {self.fitness!r} asks for a bandit, and {name!r} is none: use 'return' or 'area', or "
+                    f"train on {environment_spec(name).bandit!r}."
+                )
+        known = {n: environment_spec(n).reference(self.backend) is not None for n in self.homes}
+        if self.validation and len(known) > 1 and not all(known.values()):
+            raise UserError(
+                "validation on several environments needs a reference return of each, and "
+                f"{', '.join(n for n in known if not known[n])} has none: leave out its task, or validation."
+            )
+        if self.agent is not None and len(self.tasks) > 1:
+            raise UserError(
+                "one agent configuration does not fit several tasks: leave it out, and each takes its own."
+            )
+        if self.horizons and self.judgement.along:
+            raise UserError(
+                f"fitness {self.fitness!r} needs trainings of one length: leave out the horizons, or use 'return'."
+            )
+        for horizon in self.horizons:
+            if not 0 < horizon < math.inf:
+                raise UserError(
+                    f"a horizon is {horizon}: it must be larger than 0, and finite (1 is the setting's own)."
+                )
+        check_lists(self.hyperparameters, PPOHyperparameters())
+        for name in ("drift", "horizon"):
+            if name in self.hyperparameters:
+                raise UserError(
+                    f"{name} is not drawn from a list: the drift is what is learned, and horizons are a setting of "
+                    "their own."
+                )
+        at_least(1, self, "agents_per_candidate", "evaluation_episodes", "contexts")
+        at_least(0, self, "reward_noise", "initial_scale")
+
+    @property
+    def judgement(self) -> Fitness:
+        """What `fitness` names."""
+        return FITNESSES[self.fitness]
+
+    @property
+    def homes(self) -> tuple[str, ...]:
+        """The tasks' evaluation environments, each once."""
+        homes = (environment_spec(name).evaluation_environment for name in self.tasks)
+        return tuple(dict.fromkeys(homes))
+
+    @property
+    def judged_in(self) -> tuple[str, ...]:
+        """Where fitness is earned."""
+        return self.homes if self.judgement.at_home else self.tasks
+
+    def at_home(self) -> "MetaTrainingConfig":
+        """The same on the tasks' evaluation environments themselves."""
+        return replace(self, tasks=self.homes, fitness="return", agent=None)
+
+
+def task_agent(task: str, contexts: int) -> AgentSpec:
+    """PPO as the evaluation environment has it, or on a bandit its image (`AgentSpec.on_bandit`)."""
+    place = environment_spec(task)
+    spec = environment_agent("ppo", place.evaluation_environment)
+    return spec.on_bandit(contexts) if place.synthetic else spec
+
+
+class TaskTraining:
+    """Trains one PPO agent with a drift in one task's environment and says what it is worth.
+
+    Args:
+      config: the meta-training's.
+      environment: the task, one of the configuration's.
+    """
+
+    def __init__(self, config: MetaTrainingConfig, environment: str) -> None:
+        self.config = config
+        spec = environment_spec(environment)
+        self.home = spec.evaluation_environment
+        judged_in = environment_spec(self.home) if config.judgement.at_home else spec
+        # Of several tasks some may have a choice of physics; a single one is told where it has none.
+        backend = judged_in.physics(config.backend) if len(config.tasks) > 1 else config.backend
+        self.evaluation_env, self.evaluation_params = judged_in.make(backend)
+        self.env, self.env_params = self.evaluation_env, self.evaluation_params
+        if config.judgement.at_home:  # a bandit, which has no physics
+            self.env, self.env_params = spec.make()
+        agent = task_agent(environment, config.contexts)
+        self.spec = replace(
+            agent, config=config.agent or agent.config, lists=config.hyperparameters
+        )
+        self.every, iterations = spaced(self.spec.config.num_iterations, POINTS)
+        if config.judgement.along:
+            self.spec = self.spec.with_steps(self.spec.config.steps_after(iterations))
+        self.agent = self.spec.agent(self.env, config.drift)
+        self.evaluation_episodes = config.evaluation_episodes or (50 if judged_in.is_bandit else 20)
+        self.training_params = self.env_params
+        if spec.is_bandit and config.reward_noise:
+            scale = self.env.reward_scale(
+                self.env_params, named_key(root_key(0), f"reward scale of {self.env.name}")
+            )
+            self.training_params = self.env_params.replace(reward_noise=config.reward_noise * scale)
+
+    def fitness(
+        self, drift_parameters: Any, key: jax.Array, number: int, horizon: ArrayLike = 1.0
+    ) -> jax.Array:
+        """[number] fitnesses of as many agents, each trained with these drift parameters.
+
+        Args:
+          horizon: how long they train, as a fraction of the inner loop's iterations; traced.
+        """
+        key_draw, key_agents = split_key(key)
+        hyperparameters = self.spec.sample(key_draw, number)
+        return jax.vmap(lambda h, k: self._train_one(drift_parameters, h, k, horizon))(
+            hyperparameters, split_key(key_agents, number)
+        )
+
+    def _train_one(
+        self,
+        drift_parameters: Any,
+        hyperparameters: PPOHyperparameters,
+        key: jax.Array,
+        horizon: ArrayLike,
+    ) -> jax.Array:
+        fitness = self.config.judgement
+        hyperparameters = replace(hyperparameters, drift=drift_parameters)
+        iterations = None
+        if self.config.horizons:
+            iterations = jnp.round(jnp.asarray(horizon) * self.spec.config.num_iterations)
+            iterations = jnp.maximum(1, iterations.astype(jnp.int32))
+            hyperparameters = replace(hyperparameters, horizon=iterations)
+        env, params = self.evaluation_env, self.evaluation_params
+        _, earned = train_and_judge(
+            self.agent,
+            hyperparameters,
+            split_key(key)[0] if fitness.along else key,
+            self.training_params,
+            {"return": Judge(env, params, self.evaluation_episodes, fitness.mode)},
+            self.every if fitness.along else None,
+            iterations,
+        )
+        returns = earned["return"].returns.mean(-1)
+        return fitness.of(returns if fitness.along else returns[None])
+
+    def steps(self, agents: int, share: float = 1.0) -> EnvironmentSteps:
+        """Of so many agents that train for this share of the agent's steps."""
+        points = 1
+        if self.config.judgement.along:
+            points = self.spec.config.num_iterations // self.every + 1
+        return EnvironmentSteps(
+            training=round(agents * self.spec.steps * share),
+            evaluation=agents
+            * points
+            * self.evaluation_episodes
+            * int(self.evaluation_params.max_steps_in_episode),
+        )
