@@ -18,14 +18,14 @@ import zipfile
 from collections.abc import Mapping, Sequence
 from importlib import metadata as distributions
 from pathlib import Path
-from typing import Any, NoReturn, TypeAlias
+from typing import Any, TypeAlias
 
 import jax
 import numpy as np
 from flax import traverse_util
 
 from scb.errors import UserError, unknown_name
-from scb.files import write_bytes
+from scb.files import strict_json, write_bytes
 
 SCHEMA_VERSION = 1
 KINDS = ("bandit", "drift", "synthetic_mdp")
@@ -308,11 +308,8 @@ def _damaged(path: Path, what: str) -> UserError:
 
 
 def _parse_metadata(path: Path, text: bytes) -> dict[str, Any]:
-    def refuse(constant: str) -> NoReturn:
-        raise ValueError(f"{constant} is not JSON")
-
     try:
-        metadata = json.loads(text, parse_constant=refuse)
+        metadata = strict_json(text)
     except (ValueError, RecursionError) as error:
         raise UserError(f"{path} is not valid JSON ({error}): fetch or save it again.") from error
     if not isinstance(metadata, dict):

@@ -4,7 +4,7 @@ import json
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 
@@ -31,6 +31,15 @@ def cannot_write(folder: Path, flag: str = "--out", reason: str | None = None) -
     return UserError(
         f"cannot write to {folder}{said}: choose another {flag}, a folder that you may write to."
     )
+
+
+def strict_json(text: str | bytes) -> Any:
+    """What JSON says; a ValueError also for NaN and infinities, which Python would read."""
+
+    def refuse(constant: str) -> NoReturn:
+        raise ValueError(f"{constant} is no JSON number")
+
+    return json.loads(text, parse_constant=refuse)
 
 
 def plain(number: Any) -> float | int | None:

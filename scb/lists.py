@@ -9,6 +9,7 @@ from scb.agents.spec import check_lists, tables_of
 from scb.agents.tables import Lists
 from scb.command_line import numbers
 from scb.errors import UserError
+from scb.files import strict_json
 
 _WANTED = 'give {"ppo": {"learning_rate": [0.001, 0.005]}, ...}'
 
@@ -25,7 +26,7 @@ def read_lists(words: str) -> dict[str, Lists]:
         except ValueError as error:
             raise UserError(f"{source} is no JSON ({error}): {_WANTED}.") from error
     try:
-        lists = json.loads(content, parse_constant=_no_json)
+        lists = strict_json(content)
     except ValueError as error:
         raise UserError(f"{source} is no JSON ({error}): {_WANTED}.") from error
     if words == "{}":
@@ -66,8 +67,3 @@ def write_values(values: Mapping[str, Sequence[float]]) -> str:
 
 def _is_filled(lists: Any) -> bool:
     return isinstance(lists, dict) and bool(lists)
-
-
-def _no_json(constant: str) -> Any:
-    """Raises a ValueError for NaN and infinities, which Python would read."""
-    raise ValueError(f"{constant} is no JSON number")

@@ -6,8 +6,6 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from scb.errors import UserError
-
 
 @struct.dataclass
 class ReplayBuffer:
@@ -27,8 +25,6 @@ class ReplayBuffer:
 
 def empty_buffer(example: Any, capacity: int) -> ReplayBuffer:
     """A buffer for transitions like `example` (one transition, or its shapes and dtypes)."""
-    if capacity < 1:
-        raise UserError(f"the replay buffer's size is {capacity}: it must be at least 1.")
     transitions = jax.tree.map(lambda x: jnp.zeros((capacity, *x.shape), x.dtype), example)
     return ReplayBuffer(transitions, jnp.int32(0))
 
@@ -42,8 +38,6 @@ def add(buffer: ReplayBuffer, batch: Any) -> ReplayBuffer:
     """
     number = jax.tree.leaves(batch)[0].shape[0]
     capacity = buffer.capacity
-    if number > capacity:
-        raise UserError(f"{number} transitions at once do not fit a replay buffer of {capacity}.")
     start = buffer.written % capacity
     if capacity % number == 0:
 

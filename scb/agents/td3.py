@@ -92,12 +92,12 @@ class TD3(OffPolicyAgent):
     def explore(
         self, learner: Learner, observation: jax.Array, key: jax.Array, moment: Moment
     ) -> jax.Array:
-        space = self.env.action_space(moment.env_params)
         policy, _ = self._networks(moment.env_params)
         squashed = policy.apply(learner.params["policy"], observation)
         spread = moment.hyperparameters.exploration_noise
         noise = spread * jax.random.normal(key, squashed.shape)
-        return scale_to_space(jnp.clip(squashed + noise, -1.0, 1.0), space)
+        chosen = jnp.clip(squashed + noise, -1.0, 1.0)
+        return scale_to_space(chosen, self.env.action_space(moment.env_params))
 
     def greedy(
         self,

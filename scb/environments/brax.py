@@ -210,16 +210,6 @@ class BraxEnvironment(environment.Environment[BraxState, BraxParams]):
         info = {"discount": self.discount(next_state, params)}
         return observation, next_state, after.reward, terminated, info
 
-    def observe(
-        self,
-        key: jax.Array,
-        state: BraxState,
-        action: int | float | jax.Array | None,
-        params: BraxParams,
-    ) -> jax.Array:
-        """[O] the observation that brax made with this state."""
-        return state.brax_state.obs
-
     def is_terminated(self, state: BraxState, params: BraxParams) -> jax.Array:
         """Whether brax ended the episode; its `done` knows no time limit."""
         return state.brax_state.done > 0.5

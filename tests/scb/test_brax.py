@@ -332,11 +332,8 @@ def test_the_spaces_are_braxs(env):
     space = env.action_space(env.default_params)
     assert (space.low, space.high, space.shape) == (-1.0, 1.0, (1,))
     assert env.observation_space(env.default_params).shape == (4,)
-    observation, state = env.reset(jax.random.key(0), env.default_params)
+    observation, _ = env.reset(jax.random.key(0), env.default_params)
     assert env.observation_space(env.default_params).contains(observation)
-    np.testing.assert_array_equal(
-        env.observe(jax.random.key(0), state, None, env.default_params), observation
-    )
 
 
 def test_environments_made_alike_share_a_compiled_program(env):

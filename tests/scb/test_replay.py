@@ -6,7 +6,6 @@ import pytest
 from scipy import stats
 
 from scb.agents.replay import ReplayBuffer, add, empty_buffer, sample
-from scb.errors import UserError
 
 
 def numbered(*numbers):
@@ -111,14 +110,3 @@ def test_members_of_a_population_have_their_own_contents_and_one_write_position(
     batches = jax.vmap(lambda b, k: sample(b, k, 50), in_axes=(axes, 0))(buffers, keys)
     assert [set(np.asarray(b)) for b in batches] == [{2, 3, 4, 5}, {102, 103, 104, 105}]
     assert not np.array_equal(batches[0], batches[1] - 100)  # each draws by its own key
-
-
-def test_more_transitions_than_places_are_refused():
-    with pytest.raises(UserError, match="3 transitions at once do not fit a replay buffer of 2"):
-        filled(2, (1, 2, 3))
-
-
-@pytest.mark.parametrize("capacity", [0, -1])
-def test_a_buffer_without_places_is_refused(capacity):
-    with pytest.raises(UserError, match=f"size is {capacity}: it must be at least 1"):
-        empty_buffer(jnp.zeros(()), capacity)
