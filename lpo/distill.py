@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from lpo.certificate import certify
 from lpo.drifts import ClosedFormDrift
 from lpo.drifts.contract import CorrectedDrift
-from lpo.drifts.formula import FUNCTIONS, parse
+from lpo.drifts.formula import Node, evaluate, parse
 from scb.agents.ppo import clipped_surrogate_drift
 from scb.errors import UserError, at_least
 from scb.keys import root_key
@@ -398,15 +398,25 @@ def _size(terms: _Sum) -> int:
     return len(_numbers(terms)) + len(re.findall(r"\w+", _structure(terms)))
 
 
-def _numbers(terms: _Sum) -> list[float]:
-    """A formula's coefficients, each followed by those inside its term's functions."""
-    found = []
+def _node(terms: _Sum, numbers: list[float]) -> Node:
+    """A formula as `evaluate` takes it; its coefficients, each before those inside its term, join the numbers."""
+    made = []
     for factors, coefficient in terms:
-        found.append(coefficient)
+        numbers.append(coefficient)
+        parts = [Node("number", position=len(numbers) - 1)]
         for factor in factors:
-            if not isinstance(factor, str):
-                found += _numbers(factor[1])
-    return found
+            if isinstance(factor, str):
+                parts.append(Node("variable", name=factor))
+            else:
+                parts.append(Node(factor[0], (_node(factor[1], numbers),)))
+        made.append(Node("*", tuple(parts)))
+    return Node("+", tuple(made))
+
+
+def _numbers(terms: _Sum) -> list[float]:
+    numbers: list[float] = []
+    _node(terms, numbers)
+    return numbers
 
 
 def _with_numbers(terms: _Sum, numbers: Iterator[float]) -> _Sum:
@@ -422,28 +432,24 @@ def _with_numbers(terms: _Sum, numbers: Iterator[float]) -> _Sum:
 
 
 def _value(terms: _Sum, variables: Mapping[str, NDArray[np.floating]]) -> NDArray[np.floating]:
-    total = np.zeros_like(variables["d"])
-    for factors, coefficient in terms:
-        term = np.full_like(total, coefficient)
-        for factor in factors:
-            if isinstance(factor, str):
-                term = term * variables[factor]
-            else:
-                term = term * FUNCTIONS[factor[0]](_value(factor[1], variables), np)
-        total = total + term
-    return total
+    numbers: list[float] = []
+    root = _node(terms, numbers)
+    return np.asarray(evaluate(root, numbers, variables, np))
 
 
 def _tune(terms: _Sum, data: _Data, evaluations: int = 20) -> tuple[_Sum, float]:
     """A formula with the numbers that fit best, and its score."""
     from scipy.optimize import least_squares
 
+    start: list[float] = []
+    root = _node(terms, start)
+
     def residuals(numbers: NDArray[np.floating]) -> NDArray[np.floating]:
-        value = _value(_with_numbers(terms, iter(numbers)), data.variables)
+        value = evaluate(root, numbers, data.variables, np)
         # The mean of squares must stay finite on the way.
         return np.clip(data.residuals(np.clip(value, -1e6, 1e6)), -1e6, 1e6)
 
-    found = least_squares(residuals, _numbers(terms), max_nfev=evaluations).x
+    found = least_squares(residuals, start, max_nfev=evaluations).x
     # Four digits are what the text keeps, and so what is scored.
     rounded = _with_numbers(terms, (float(f"{x:.4g}") for x in found))
     return rounded, data.score(_value(rounded, data.variables))
@@ -469,24 +475,18 @@ def _grow(
 ) -> list[tuple[_Sum, float]]:
     """The formula with one more term, with two more, ..., as long as each adds the tolerance."""
     values = [_value(term, data.variables) for term in library]
-    steps = [s / max(float(v.std()), 1e-12) for v in values for s in _FIRST_STEPS]
+    steps = [
+        (i, step / max(float(value.std()), 1e-12))
+        for i, value in enumerate(values)
+        for step in _FIRST_STEPS
+    ]
     grown: list[tuple[_Sum, float]] = []
     while True:
         here = _value(terms, data.variables)
         # One step along every term shows which are worth a fit of all numbers.
-        tried = [
-            (data.score(here + step * values[i // len(_FIRST_STEPS)]), i)
-            for i, step in enumerate(steps)
-        ]
-        promising = dict.fromkeys(
-            (i // len(_FIRST_STEPS), steps[i]) for _, i in sorted(tried, reverse=True)[:_PROMISING]
-        )
-        fits = [
-            _tune(longer, data)
-            for i, step in promising
-            for longer in [_collect([*terms, *_scale(library[i], step)])]
-            if len(_numbers(longer)) <= config.numbers
-        ]
+        promising = sorted(steps, key=lambda tried: -data.score(here + tried[1] * values[tried[0]]))
+        longer = [_collect([*terms, *_scale(library[i], s)]) for i, s in promising[:_PROMISING]]
+        fits = [_tune(one, data) for one in longer if len(_numbers(one)) <= config.numbers]
         best = max(fits, key=lambda found: found[1], default=None)
         if best is None or best[1] < score + config.tolerance:
             return grown

@@ -30,13 +30,13 @@ from scb.plotting import (
     VERMILLION,
     WIDTH,
     Look,
-    error_bar,
+    estimate_curve,
     figure_style,
     figure_title,
     legend_below,
     ratio_text,
 )
-from scb.statistics import estimate, iqm
+from scb.statistics import estimate
 
 if TYPE_CHECKING:
     from lpo.comparison import LearningCurves
@@ -238,7 +238,9 @@ def learning_curves(curves: "Sequence[LearningCurves]") -> Figure:
         training, final = figure.subplots(1, 2, width_ratios=(2.4, 1))
         for position, curve in enumerate(curves):
             look = style[curve.objective]
-            _curve(training, curve, look)
+            points = [estimate(column) for column in curve.returns.T]
+            drawn = (look.color, look.linestyle, curve.objective, look.marker)
+            estimate_curve(training, curve.steps, points, *drawn)
             _final(final, position, curve, look)
         training.set_xlabel("environment steps")
         training.xaxis.set_major_formatter(EngFormatter(sep=""))
@@ -356,28 +358,6 @@ def regime_label(row: Mapping[str, Any], environment: str) -> str:
         return str(row["name"])
     rest = "" if row["name"] == "default" else f", {row['name']}"
     return f"bandit {bandit}{rest}"
-
-
-def _curve(axes: Axes, curve: "LearningCurves", look: Look) -> None:
-    axes.plot(
-        curve.steps,
-        iqm(curve.returns, axis=0),
-        color=look.color,
-        linestyle=look.linestyle,
-        marker=look.marker,
-        label=curve.objective,
-    )
-    if len(curve.seeds) > 1:
-        middle = iqm(curve.returns, axis=0)
-        below, above = error_bar(*(estimate(column) for column in curve.returns.T))
-        axes.fill_between(
-            curve.steps,
-            middle - below,
-            middle + above,
-            color=look.color,
-            alpha=0.18,
-            linewidth=0,
-        )
 
 
 def _final(axes: Axes, position: int, curve: "LearningCurves", look: Look) -> None:

@@ -116,11 +116,12 @@ def estimate_curve(
     label: str | None = None,
     marker: str = "",
 ) -> None:
-    """A line through estimates, their intervals a band."""
+    """A line through estimates, their intervals a band where there are any."""
     middle = np.array([e.value for e in found])
     below, above = error_bar(*found)
     axes.plot(x, middle, color=color, linestyle=linestyle, label=label, marker=marker)
-    axes.fill_between(x, middle - below, middle + above, color=color, alpha=0.15, linewidth=0)
+    if any(e.low is not None for e in found):
+        axes.fill_between(x, middle - below, middle + above, color=color, alpha=0.15, linewidth=0)
 
 
 @contextmanager

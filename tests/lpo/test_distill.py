@@ -307,7 +307,7 @@ def test_without_gplearn_the_extra_is_named(monkeypatch, one_sentence):
     [
         ({"samples": 10}, "samples is 10: it must be at least 100."),
         ({"generations": 0}, "generations is 0: it must be at least 1."),
-        ({"parsimony": -1.0}, "parsimony is -1.0: it must be 0 or larger."),
+        ({"parsimony": -1.0}, "parsimony is -1.0: it must be 0 or larger"),
     ],
 )
 def test_settings_that_cannot_work_are_refused(settings, message, one_sentence):
