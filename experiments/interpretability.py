@@ -13,7 +13,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-import scb
 from experiments.claims import Claim
 from experiments.harness import (
     CLASSIC_CONTROL,
@@ -33,6 +32,7 @@ from scb.analysis.states import bandit_states
 from scb.environments.registry import environment_spec
 from scb.environments.zoo import bandit_metadata, open_bandit
 from scb.keys import root_key, split_key
+from scb.measurement import Place
 from scb.statistics import Estimate, estimate
 
 # What the actions of each are.
@@ -56,8 +56,7 @@ def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None
 
 def _examine(name: str, plan: Mapping[str, Any]) -> dict[str, Any]:
     bandit = open_bandit(environment_spec(name).bandit)
-    env, env_params = scb.make(name)
-    numbers, drawn = explain(bandit, env, env_params, name, plan["episodes"], plan["seed"])
+    numbers, drawn = explain(bandit, Place.named(name), plan["episodes"], plan["seed"])
     keys = split_key(root_key(plan["seed"] + 1), plan["repetitions"])
     shares = []
     for key in keys:

@@ -24,7 +24,7 @@ import jax
 import numpy as np
 from flax import traverse_util
 
-from scb.errors import UserError, unknown_name
+from scb.errors import UserError
 from scb.files import strict_json, write_bytes
 
 SCHEMA_VERSION = 1
@@ -122,9 +122,6 @@ def load(path: str | Path, *kinds: str) -> Artefact:
       UserError: one sentence that says which file is missing, damaged, changed since it was saved,
         of another kind or a newer schema, or holds something other than finite numbers.
     """
-    for kind in kinds:
-        if kind not in KINDS:
-            raise unknown_name("kind of artefact", kind, KINDS)
     npz_path, json_path = _paths(path)
     # The bytes that are checked are the bytes that are used: each file is read once.
     data, text = _read(npz_path), _read(json_path)

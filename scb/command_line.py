@@ -15,7 +15,7 @@ from typing import Any, ClassVar, Self, TypeVar, get_type_hints
 import tyro
 from tyro.constructors import PrimitiveConstructorSpec
 
-from scb.errors import UserError, unknown_name
+from scb.errors import UserError, one_of
 from scb.runs import Run, config_dict, read_config
 
 T = TypeVar("T")
@@ -131,8 +131,7 @@ class LongRun(ABC):
             arguments = [*cls._stored(folder), *arguments]
         given = flags_given(arguments, "preset", *cls.deciding)
         preset = given.get("preset", "quick")
-        if preset not in cls.presets:
-            raise unknown_name("preset", preset, cls.presets)
+        one_of("preset", preset, cls.presets)
         default = cls(config=cls.presets[preset](given), preset=preset)  # type: ignore[call-arg]
         return tyro.cli(cls, default=default, prog=cls.program, args=arguments, config=_STYLE)
 

@@ -13,7 +13,7 @@ from rich.table import Column, Table
 from scb.agents.spec import algorithms_for, bandit_agent
 from scb.command_line import LongRun, Output
 from scb.console import console
-from scb.discovery import BanditDiscovery, DiscoveryConfig, check_fits, judge
+from scb.discovery import BanditDiscovery, DiscoveryConfig, evaluation_place, judge
 from scb.environments.registry import environment_spec
 from scb.environments.synthetic import SyntheticBandit, Weights
 from scb.environments.synthetic_mdp import SyntheticMDP
@@ -216,16 +216,14 @@ def train(
     at_least(1, agents=agents, episodes=episodes)
     at_least(0, seed=seed)
     loaded = open_synthetic(bandit)
-    target = evaluation_environment or environment_spec(bandit).evaluation_environment
-    judge_in = Place.named(target, backend)
-    check_fits(loaded, judge_in.env, judge_in.params, target)
-    spec = bandit_agent(algorithm, target, not fixed_hyperparameters)
+    judge_in = evaluation_place(loaded, bandit, evaluation_environment, backend)
+    spec = bandit_agent(algorithm, judge_in.name, not fixed_hyperparameters)
     weights = loaded.default_params.weights
     by_actions = judge(
         spec, loaded, weights, judge_in, seed, agents, episodes, mode=not sampled_actions
     )
     (returns,) = by_actions.values()
-    print(f"returns on {target}: {' '.join(f'{r:.0f}' for r in np.sort(returns))}")
+    print(f"returns on {judge_in.name}: {' '.join(f'{r:.0f}' for r in np.sort(returns))}")
     print(f"IQM: {estimate(returns)}")
 
 

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import optax
 from jax.typing import ArrayLike
 
-from scb.errors import UserError, at_least, unknown_name
+from scb.errors import UserError, at_least, one_of
 
 Schedule = Callable[[jax.Array], jax.Array]
 
@@ -50,8 +50,7 @@ class CurriculumConfig:
     transition: int = 1
 
     def __post_init__(self) -> None:
-        if self.shape not in SHAPES:
-            raise unknown_name("curriculum shape", self.shape, SHAPES)
+        one_of("curriculum shape", self.shape, SHAPES)
         at_least(0, **{"the generation at which the curriculum begins": self.begin})
         lengths = {"initial length": self.initial, "final length": self.final}
         for name, value in {**lengths, "transition": self.transition}.items():

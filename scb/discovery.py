@@ -44,7 +44,7 @@ from scb.environments.synthetic import (
 )
 from scb.environments.synthetic_mdp import PARAMETERIZATIONS, SyntheticMDP, synthetic_for
 from scb.environments.zoo import open_bandit
-from scb.errors import UserError, at_least, positive, unknown_name
+from scb.errors import UserError, at_least, one_of, positive
 from scb.evolution import EnvironmentSteps, EvolutionConfig, Outcome, evolve
 from scb.keys import named_key, root_key, split_key
 from scb.lists import read_lists, write_lists
@@ -142,14 +142,10 @@ class DiscoveryConfig:
     )
 
     def __post_init__(self) -> None:
-        if self.init not in INITS:
-            raise unknown_name("initialisation", self.init, INITS)
-        if self.mode not in MODES:
-            raise unknown_name("mode", self.mode, MODES)
-        if self.select not in SELECTIONS:
-            raise unknown_name("selection", self.select, SELECTIONS)
-        if self.parameterization not in PARAMETERIZATIONS:
-            raise unknown_name("parameterization", self.parameterization, PARAMETERIZATIONS)
+        one_of("initialisation", self.init, INITS)
+        one_of("mode", self.mode, MODES)
+        one_of("selection", self.select, SELECTIONS)
+        one_of("parameterization", self.parameterization, PARAMETERIZATIONS)
         if self.parameterization != "I" and self.init == "expert" and self.start is None:
             raise UserError(
                 f"a synthetic MDP ({self.parameterization}) cannot be fitted to an expert: use init random."
@@ -394,6 +390,20 @@ def check_fits(
         raise UserError(
             f"bandit {bandit.name} has {ours}, {environment_name} has {theirs}: take the bandit of that environment."
         )
+
+
+def evaluation_place(
+    bandit: SyntheticBandit | SyntheticMDP, name: str, environment: str | None, backend: str | None
+) -> Place:
+    """Where agents of a bandit, opened by this name, are judged: in what it stands for where no other is named.
+
+    Raises:
+      UserError: it stands for none, or does not fit the environment.
+    """
+    target = environment or environment_spec(name).evaluation_environment
+    place = Place.named(target, backend)
+    check_fits(bandit, place.env, place.params, target)
+    return place
 
 
 def discover(

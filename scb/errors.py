@@ -39,6 +39,12 @@ def _check(
             raise UserError(f"{name} is {value}: it must be {allowed}{finite}.")
 
 
+def one_of(kind: str, name: str, known: Iterable[str]) -> None:
+    """Raises `unknown_name` where a name is none of those."""
+    if name not in known:
+        raise unknown_name(kind, name, known)
+
+
 def unknown_name(kind: str, name: str, known: Iterable[str]) -> UserError:
     """The error for a name that nobody registered; near matches first, else all known names."""
     names = sorted(known)

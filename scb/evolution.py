@@ -21,7 +21,7 @@ from scipy.stats import rankdata
 
 from scb.artefacts import machine_description
 from scb.console import Progress
-from scb.errors import UserError, at_least, positive, unknown_name
+from scb.errors import UserError, at_least, one_of, positive
 from scb.files import plain
 from scb.keys import key_at, root_key, split_key
 from scb.runs import Checkpoints, Run, Stopwatch
@@ -70,10 +70,8 @@ class EvolutionConfig:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        if self.strategy not in STRATEGIES:
-            raise unknown_name("evolution strategy", self.strategy, STRATEGIES)
-        if self.combine not in COMBINATIONS:
-            raise unknown_name("combination of tasks", self.combine, COMBINATIONS)
+        one_of("evolution strategy", self.strategy, STRATEGIES)
+        one_of("combination of tasks", self.combine, COMBINATIONS)
         if self.population_size < 2:
             raise UserError(
                 f"population_size is {self.population_size}: evolution compares candidates, so it needs at least 2."

@@ -18,7 +18,7 @@ from scb.environments.registry import environment_spec, make
 from scb.environments.spec import BANDIT
 from scb.environments.synthetic import BanditConfig, SyntheticBandit, bandit_for
 from scb.environments.zoo import save_bandit
-from scb.errors import UserError, unknown_name
+from scb.errors import UserError, one_of
 
 # The release's name of a bandit -> its evaluation environment.
 PUBLISHED_BANDITS = {
@@ -139,8 +139,7 @@ def _check_is_npz(path: Path) -> None:
 
 
 def _environment_of(path: Path) -> str:
-    if path.stem not in PUBLISHED_BANDITS:
-        raise unknown_name("published bandit", path.stem, PUBLISHED_BANDITS)
+    one_of("published bandit", path.stem, PUBLISHED_BANDITS)
     return PUBLISHED_BANDITS[path.stem]
 
 

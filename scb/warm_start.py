@@ -27,7 +27,7 @@ from scb.agents.spec import (
 from scb.agents.tables import WARM_START
 from scb.curriculum import paper_curriculum
 from scb.environments.synthetic import BanditParams, SyntheticBandit, Weights
-from scb.errors import UserError, at_least, unknown_name
+from scb.errors import UserError, at_least, one_of
 from scb.experts import Expert, PolicySearchConfig, evolve_expert, train_expert
 from scb.keys import split_key
 
@@ -72,11 +72,9 @@ class WarmStartConfig:
     fit_steps: int = 4000
 
     def __post_init__(self) -> None:
-        if self.construction not in CONSTRUCTIONS:
-            raise unknown_name("warm-start construction", self.construction, CONSTRUCTIONS)
+        one_of("warm-start construction", self.construction, CONSTRUCTIONS)
         experts = ("auto", "evolution", *ALGORITHMS)
-        if self.expert not in experts:
-            raise unknown_name("expert", self.expert, experts)
+        one_of("expert", self.expert, experts)
         at_least(0, self, "min_spread")
         if not 0 <= self.discount <= 1:
             raise UserError(f"discount is {self.discount}: it must be between 0 and 1.")

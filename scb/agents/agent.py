@@ -19,7 +19,7 @@ from jax.typing import ArrayLike
 
 from scb.agents import networks
 from scb.agents.normalization import normalize
-from scb.errors import UserError, at_least, unknown_name
+from scb.errors import UserError, at_least, one_of
 from scb.evaluation import Episodes, evaluate
 from scb.keys import split_key
 
@@ -43,8 +43,7 @@ class AgentConfig(ABC):
 
     def __post_init__(self) -> None:
         at_least(1, self, *(f.name for f in fields(self) if type(getattr(self, f.name)) is int))
-        if self.activation not in networks.ACTIVATIONS:
-            raise unknown_name("activation", self.activation, networks.ACTIVATIONS)
+        one_of("activation", self.activation, networks.ACTIVATIONS)
 
     @property
     @abstractmethod

@@ -17,7 +17,7 @@ from scb.agents.agent import Agent
 from scb.agents.tables import ACTIVATIONS, DISCRETE_ONLY, TABLES, Lists, Row, Tables
 from scb.curriculum import with_limit
 from scb.environments.registry import environment_spec
-from scb.errors import UserError, at_least, unknown_name
+from scb.errors import UserError, at_least, one_of
 from scb.keys import split_key
 
 # Of 32 bits, which is what an agent calculates with.
@@ -190,8 +190,7 @@ def _default(tables: Tables, **arguments: Any) -> AgentSpec:
 
 def tables_of(algorithm: str) -> Tables:
     """What the registry holds of an algorithm; a UserError where it holds none of that name."""
-    if algorithm not in ALGORITHMS:
-        raise unknown_name("algorithm", algorithm, ALGORITHMS)
+    one_of("algorithm", algorithm, ALGORITHMS)
     return ALGORITHMS[algorithm]
 
 

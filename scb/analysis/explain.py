@@ -7,7 +7,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import tyro
-from gymnax.environments import environment
 
 from scb.agents.agent import flat_bounds
 from scb.analysis.importance import reward_variance
@@ -15,32 +14,26 @@ from scb.analysis.optimal_actions import first_action, optimal_actions, optimal_
 from scb.analysis.planes import observation_names, plane_for
 from scb.analysis.states import bandit_states, follow
 from scb.console import console
-from scb.discovery import check_fits
-from scb.environments.registry import environment_spec, make
+from scb.discovery import evaluation_place
 from scb.environments.synthetic import SyntheticBandit
 from scb.environments.zoo import open_bandit
 from scb.errors import at_least
 from scb.files import make_folder, write_json
 from scb.keys import root_key, split_key
+from scb.measurement import Place
 from scb.statistics import estimate
 
 STATES = 2000  # of either distribution, as in the paper
 
 
 def explain(
-    bandit: SyntheticBandit,
-    env: environment.Environment[Any, Any],
-    env_params: Any,
-    environment_name: str,
-    episodes: int = 20,
-    seed: int = 0,
+    bandit: SyntheticBandit, place: Place, episodes: int, seed: int
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """What a bandit knows, in numbers and as `scb.analysis.figures.explained` draws it.
 
     Args:
       bandit: with weights of its own.
-      env, env_params: the evaluation environment, where the bandit's optimal policy acts.
-      environment_name: its name.
+      place: the evaluation environment, where the bandit's optimal policy acts.
       episodes: of the optimal policy.
       seed: decides episodes, contexts and what is varied.
 
@@ -51,8 +44,8 @@ def explain(
     space = bandit.action_space()
     contexts = bandit_states(bandit, key_context, STATES)
     importance = np.asarray(reward_variance(bandit, jnp.asarray(contexts), key_vary))
-    names = observation_names(environment_name, bandit.observation_size)
-    trajectories = follow(env, env_params, optimal_policy(bandit), key_episode, episodes)
+    names = observation_names(place.name, bandit.observation_size)
+    trajectories = follow(place.env, place.params, optimal_policy(bandit), key_episode, episodes)
     returns = trajectories.returns()
     earned = estimate(returns)
     best = jax.jit(jax.vmap(optimal_actions(bandit)))
@@ -67,7 +60,7 @@ def explain(
     usual = int(np.argsort(returns)[len(returns) // 2])  # the episode to draw: of median return
     numbers = {
         "bandit": bandit.name,
-        "environment": environment_name,
+        "environment": place.name,
         "episodes": episodes,
         "seed": seed,
         "return_of_optimal_policy": earned.as_dict(),
@@ -79,12 +72,12 @@ def explain(
         return numbers, {}
     several = num_actions is None and bandit.num_actions > 1
     everything = np.concatenate([contexts, shown])
-    low, high = flat_bounds(env.observation_space(env_params))
+    low, high = flat_bounds(place.env.observation_space(place.params))
     box = (np.asarray(low), np.asarray(high))
     parts = {
         "name": bandit.name,
-        "summary": f"its optimal policy earns {earned} in {environment_name}",
-        "plane": plane_for(environment_name, everything, importance.tolist(), box),
+        "summary": f"its optimal policy earns {earned} in {place.name}",
+        "plane": plane_for(place.name, everything, importance.tolist(), box),
         "best": drawn,
         "num_actions": num_actions,
         "bounds": bounds,
@@ -122,17 +115,15 @@ def explain_command(
     at_least(1, episodes=episodes)
     at_least(0, seed=seed)
     loaded = open_bandit(bandit)
-    target = evaluation_environment or environment_spec(bandit).evaluation_environment
-    env, env_params = make(target, backend)
-    check_fits(loaded, env, env_params, target)
+    place = evaluation_place(loaded, bandit, evaluation_environment, backend)
     folder = Path("runs") / "explain" / loaded.name if out is None else out
     make_folder(folder)
-    numbers, parts = explain(loaded, env, env_params, target, episodes, seed)
+    numbers, parts = explain(loaded, place, episodes, seed)
     write_json(folder / "explain.json", numbers)
     printer = console()
     earned = numbers["return_of_optimal_policy"]
     printer.print(
-        f"The bandit's optimal policy earns {earned['value']:.1f} in {target} ({episodes} episodes)."
+        f"The bandit's optimal policy earns {earned['value']:.1f} in {place.name} ({episodes} episodes)."
     )
     for name, share in sorted(numbers["importance"].items(), key=lambda item: -item[1]):
         printer.print(f"  {share:6.1%} of the reward's variance: {name}")

@@ -53,12 +53,15 @@ def action_grid(
     if num_actions and num_actions > len(_DISCRETE):
         colors = "tab20"
     axes.grid(False)
-    axes.set_xlabel(plane.labels[0])
-    axes.set_ylabel(plane.labels[1])
-    axes.set_xlim(*plane.limits[0])
-    axes.set_ylim(*plane.limits[1])
+    _label_axes(axes, plane)
     return axes.pcolormesh(
         x, y, actions, cmap=colors, vmin=low, vmax=high, shading="nearest", rasterized=True
+    )
+
+
+def _label_axes(axes: Axes, plane: Plane) -> None:
+    axes.set(
+        xlabel=plane.labels[0], ylabel=plane.labels[1], xlim=plane.limits[0], ylim=plane.limits[1]
     )
 
 
@@ -107,20 +110,13 @@ def explained(parts: Mapping[str, Any]) -> Figure:
         draw_trajectory(actions, plane, parts["episode"])
         actions.legend(loc="upper right", fontsize=7, frameon=True)
         actions.set_title("the bandit's best action", fontsize=10)
-        for name, color, marker in (
-            ("contexts", plotting.SKY_BLUE, "."),
-            ("visited", plotting.VERMILLION, "."),
+        for name, color, label in (
+            ("contexts", plotting.SKY_BLUE, "contexts of the bandit"),
+            ("visited", plotting.VERMILLION, "visited by its optimal policy"),
         ):
-            label = {
-                "contexts": "contexts of the bandit",
-                "visited": "visited by its optimal policy",
-            }[name]
             points = plane.project(parts[name])
-            states.plot(*points.T, marker, markersize=2, alpha=0.4, color=color, label=label)
-        states.set_xlim(*plane.limits[0])
-        states.set_ylim(*plane.limits[1])
-        states.set_xlabel(plane.labels[0])
-        states.set_ylabel(plane.labels[1])
+            states.plot(*points.T, ".", markersize=2, alpha=0.4, color=color, label=label)
+        _label_axes(states, plane)
         states.set_title("states", fontsize=10)
         legend = states.legend(loc="upper right", fontsize=7, frameon=True)
         for handle in legend.legend_handles:

@@ -16,7 +16,7 @@ from gymnax.environments import spaces
 
 from scb.agents.agent import clip_to_space, flat_bounds
 from scb.environments.synthetic import BanditParams, SyntheticBandit
-from scb.errors import UserError, unknown_name
+from scb.errors import UserError, one_of
 from scb.evaluation import Policy
 from scb.keys import root_key
 
@@ -44,8 +44,7 @@ def optimal_actions(
     Raises:
       UserError: an unknown method; a grid over more actions than 20 000.
     """
-    if method not in METHODS:
-        raise unknown_name("method", method, METHODS)
+    one_of("method", method, METHODS)
     params = bandit.default_params if params is None else params
     space = bandit.action_space()
     if isinstance(space, spaces.Discrete):

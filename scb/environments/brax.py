@@ -24,7 +24,7 @@ from flax import struct
 from gymnax.environments import environment, spaces
 
 from scb.environments.spec import Family, Made, Reference
-from scb.errors import UserError, unknown_name
+from scb.errors import UserError, one_of
 from scb.keys import root_key, split_key
 
 if TYPE_CHECKING:
@@ -102,10 +102,8 @@ class BraxEnvironment(environment.Environment[BraxState, BraxParams]):
         self, name: str, backend: str = DEFAULT_BACKEND, num_start_states: int | None = 1024
     ) -> None:
         super().__init__()
-        if name not in BRAX_NAMES:
-            raise unknown_name("Brax environment", name, BRAX_NAMES)
-        if backend not in BACKENDS:
-            raise unknown_name("Brax backend", backend, BACKENDS)
+        one_of("Brax environment", name, BRAX_NAMES)
+        one_of("Brax backend", backend, BACKENDS)
         if num_start_states is not None and num_start_states < 1:
             raise UserError(
                 f"num_start_states is {num_start_states}: give 1 or more, or None to reset the "

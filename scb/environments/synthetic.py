@@ -19,7 +19,7 @@ from gymnax.environments import environment, spaces
 from jax.typing import ArrayLike
 
 from scb.agents.networks import ACTIVATIONS, MLP
-from scb.errors import UserError, at_least, unknown_name
+from scb.errors import UserError, at_least, one_of
 from scb.keys import root_key, split_key
 
 Weights: TypeAlias = dict[str, dict[str, dict[str, jax.Array]]]
@@ -77,10 +77,8 @@ class BanditConfig:
     latent_size: int | None = None
 
     def __post_init__(self) -> None:
-        if self.activation not in ACTIVATIONS:
-            raise unknown_name("bandit activation", self.activation, ACTIVATIONS)
-        if self.latent not in LATENTS:
-            raise unknown_name("latent distribution", self.latent, LATENTS)
+        one_of("bandit activation", self.activation, ACTIVATIONS)
+        one_of("latent distribution", self.latent, LATENTS)
         at_least(1, self, "hidden_size", "latent_size")
 
 

@@ -29,7 +29,7 @@ from scb.environments.synthetic import (
     Weights,
     bandit_for,
 )
-from scb.errors import UserError, at_least, unknown_name
+from scb.errors import UserError, at_least, one_of
 
 MDP_PARAMETERIZATIONS = ("T", "TI")
 PARAMETERIZATIONS = (*MDP_PARAMETERIZATIONS, "I")
@@ -70,10 +70,7 @@ class MDPConfig(BanditConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.parameterization not in MDP_PARAMETERIZATIONS:
-            raise unknown_name(
-                "parameterization of a synthetic MDP", self.parameterization, MDP_PARAMETERIZATIONS
-            )
+        one_of("parameterization of a synthetic MDP", self.parameterization, MDP_PARAMETERIZATIONS)
         at_least(1, self, "max_steps")
 
 
@@ -201,8 +198,7 @@ def synthetic_for(
     Raises:
       UserError: an unknown parameterisation, or a maximum length that is not possible with it.
     """
-    if parameterization not in PARAMETERIZATIONS:
-        raise unknown_name("parameterization", parameterization, PARAMETERIZATIONS)
+    one_of("parameterization", parameterization, PARAMETERIZATIONS)
     layers = (config.hidden_size, config.activation, config.latent, config.latent_size)
     if parameterization == "I":
         if max_steps not in (None, 1):

@@ -206,8 +206,6 @@ def test_changed_weights_are_noticed(saved):
 
 def test_another_kind_is_refused(saved):
     assert "is a bandit: give a drift here" in load_error(saved, "drift")
-    with pytest.raises(UserError, match="unknown kind of artefact 'drfit': did you mean drift"):
-        artefacts.load(saved, "drfit")
 
 
 @pytest.mark.parametrize("version", [2, "1", None, True])
