@@ -261,43 +261,43 @@ def measure(
         "versions": package_versions(),
     }
 
-    found: dict[str | None, list[Row]] = {}
-    groups: Sequence[Sequence[Objective | None]] = families(objectives) or [[None]]
+    named: Mapping[str | None, Objective | None] = {o.name: o for o in objectives} or {None: None}
+    cells = {
+        name: rows.cell(
+            columns | {"objective": name},
+            configuration | {"objective": objective and (objective.drift, objective.parameters)},
+            len(steps) * len(actions),
+        )
+        for name, objective in named.items()
+    }
+    groups: Sequence[Sequence[Objective]] = families(objectives) or [()]
     for family in groups:
-        cells = [
-            rows.cell(
-                columns | {"objective": objective and objective.name},
-                configuration
-                | {"objective": objective and (objective.drift, objective.parameters)},
-                len(steps) * len(actions),
-            )
-            for objective in family
-        ]
-        first = family[0]
-        agent = spec.agent(train_in.env, first and first.drift)
-        wanted = [(cell, i) for cell in range(len(cells)) for i in range(len(agents.names))]
+        agent = spec.agent(train_in.env, family[0].drift if family else None)
+        parameters = {objective.name: objective.parameters for objective in family}
+        names: list[str | None] = list(parameters) or [None]
+        wanted = [(name, i) for name in names for i in range(len(agents.names))]
         size = min(side_by_side or len(wanted), len(wanted))
         for start in range(0, len(wanted), size):
             batch = wanted[start : start + size]
-            lacking = [x for x in batch if agents.names[x[1]] not in cells[x[0]].done]
+            lacking = [(name, i) for name, i in batch if agents.names[i] not in cells[name].done]
             if not lacking:
                 continue
             # With the neighbours that it always has: an agent's last digits depend on its place.
             padded = [batch[i % len(batch)] for i in range(size)]
             which = np.array([i for _, i in padded])
             hyperparameters = jax.tree.map(itemgetter(which), agents.hyperparameters)
-            if first is not None:
-                drifts = [family[cell].parameters for cell, _ in padded]  # type: ignore[union-attr]
+            if family:
+                drifts = [parameters[name] for name, _ in padded if name is not None]
                 stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *drifts)
                 hyperparameters = replace(hyperparameters, drift=stacked)
             program, arrays = _program_of(
                 agent, params, judge_in.env, episodes, tuple(actions), every, size
             )
             earned = program(hyperparameters, agents.keys[which], *arrays)
-            for cell, i in lacking:
-                position = batch.index((cell, i))
+            for name, i in lacking:
+                position = batch.index((name, i))
                 drawn = {n: float(getattr(agents.hyperparameters, n)[i]) for n in agents.drawn}
-                cells[cell].add(
+                cells[name].add(
                     agents.names[i],
                     [
                         {
@@ -311,13 +311,9 @@ def measure(
                         for kind in actions
                     ],
                 )
-            said = ", ".join([judge_in.name, *(o.name for o in family if o is not None)])
-            tell(f"{said}: {sum(len(cell.done) for cell in cells)} of {len(wanted)} agents")
-        for objective, kept in zip(family, cells, strict=True):
-            name = None if objective is None else objective.name
-            found[name] = [row for one in agents.names for row in kept.done[one]]
-    order = [objective.name for objective in objectives] if objectives else [None]
-    return [row for name in order for row in found[name]]
+            done = sum(len(cells[name].done) for name in names)
+            tell(f"{', '.join([judge_in.name, *parameters])}: {done} of {len(wanted)} agents")
+    return [row for cell in cells.values() for one in agents.names for row in cell.done[one]]
 
 
 def families(objectives: Sequence[AnyObjective]) -> list[list[AnyObjective]]:
