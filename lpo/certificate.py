@@ -99,15 +99,15 @@ def certify(
             parameters, log_ratio[None], advantage[None], jnp.full((1,), progress, jnp.float32)
         )[0]
 
-    def over_advantages(function: Any) -> Any:
-        return jax.vmap(function, in_axes=(None, 0, None))
+    def on_grid(function: Any) -> Any:
+        over_advantages = jax.vmap(function, in_axes=(None, 0, None))
+        return jax.jit(jax.vmap(over_advantages, in_axes=(0, None, None)))
 
     def slope(log_ratio: jax.Array, advantage: jax.Array, progress: float) -> jax.Array:
         # d f / d r = (d f / d log r) / r
         return jax.grad(penalty)(log_ratio, advantage, progress) / jnp.exp(log_ratio)
 
-    values = jax.jit(jax.vmap(over_advantages(penalty), in_axes=(0, None, None)))
-    slopes = jax.jit(jax.vmap(over_advantages(slope), in_axes=(0, None, None)))
+    values, slopes = on_grid(penalty), on_grid(slope)
 
     def largest_slope(ratios: list[float]) -> float:
         points = jnp.log(jnp.asarray(ratios))

@@ -73,19 +73,6 @@ class Comparison:
         reference = self.curves[0]
         return {c.objective: paired_difference(c.final, reference.final) for c in self.curves[1:]}
 
-    def table(self) -> list[dict[str, Any]]:
-        """One row an objective: final and area IQM with intervals, difference to the reference."""
-        differences = self.differences()
-        return [
-            {
-                "objective": c.objective,
-                "final": estimate(c.final),
-                "area": estimate(c.area),
-                "difference": differences.get(c.objective),
-            }
-            for c in self.curves
-        ]
-
     def as_dict(self) -> dict[str, Any]:
         return {
             "curves": [c.as_dict() for c in self.curves],

@@ -15,10 +15,10 @@ from rich.console import Console
 
 from lpo import drift_figures, figures, report
 from lpo.certificate import certify
+from lpo.commands import MetaTrain
 from lpo.comparison import Comparison, check_names, compare, ppo_spec
 from lpo.inner_loop import MetaTrainingConfig
 from lpo.meta_training import (
-    VALIDATION_AGENTS,
     MetaTraining,
     environment_problem,
     learn_objective,
@@ -73,23 +73,18 @@ class PipelineConfig:
         return replace(self.search, evolution=replace(self.search.evolution, seed=self.seed))
 
 
-def _search(
-    population: int, generations: int, agents: int = 4, **others: Any
-) -> MetaTrainingConfig:
-    default = MetaTrainingConfig(
-        agents_per_candidate=agents, validation="mean_evaluations" in others
-    )
-    evolution = replace(default.evolution, population_size=population, num_generations=generations)
-    return replace(default, evolution=replace(evolution, **others))
-
-
+_QUICK, _PAPER = (MetaTrain.presets[name] for name in ("quick", "paper"))
 PRESETS = {
     "tiny": PipelineConfig(
-        search=_search(4, 2, agents=1),
+        search=replace(
+            _QUICK({}),
+            agents_per_candidate=1,
+            evolution=replace(_QUICK({}).evolution, population_size=4, num_generations=2),
+        ),
         evaluations=(Evaluation("Pendulum-v1", None, seeds=2, steps=10_000),),
     ),
     "quick": PipelineConfig(
-        search=_search(32, 30),
+        search=_QUICK({}),
         evaluations=(
             Evaluation("Pendulum-v1", None, seeds=10, steps=150_000),
             # Ten episodes of up to 1000 steps at ten points: more would take as long as the training.
@@ -98,7 +93,7 @@ PRESETS = {
     ),
     "paper": PipelineConfig(
         # So long a search overfits the bandit: the mean that was judged best on Pendulum is kept.
-        search=_search(64, 512, mean_evaluations=VALIDATION_AGENTS),
+        search=_PAPER({"validate": ""}),
         evaluations=(
             Evaluation("Pendulum-v1", None, seeds=20, steps=150_000),
             Evaluation("hopper", "generalized", seeds=10, steps=5 * 2**20),
@@ -155,7 +150,7 @@ def run_pipeline(run: Run, config: PipelineConfig, preset: str, command: str) ->
         )
 
     console.print("[3/3] figures and report")
-    paths = _figures(folder, search, objectives, comparisons, meta)
+    paths = _figures(run, search, objectives, comparisons, meta)
     results = {
         "schema_version": 1,
         "preset": preset,
@@ -163,7 +158,7 @@ def run_pipeline(run: Run, config: PipelineConfig, preset: str, command: str) ->
         "versions": package_versions(),
         "machine": machine_description(),
         "objective": {"name": objective.name, "certificate": certificate.as_dict()},
-        "meta_training": {k: v for k, v in meta.items() if k != "metrics"},
+        "meta_training": meta,
         "comparisons": {name: c.as_dict() for name, c in comparisons.items()},
     }
     if not run.resumed:  # else it would be the time of the last stages alone
@@ -202,12 +197,11 @@ def _told(problem: MetaTraining, run: Run) -> dict[str, Any]:
         "generations": config.evolution.num_generations,
         "steps": of_search(problem.steps()),
         "environment_steps": of_search(environment_problem(config).steps()),
-        "metrics": run.metrics(),
     }
 
 
 def _figures(
-    folder: Path,
+    run: Run,
     config: MetaTrainingConfig,
     objectives: list[Objective],
     comparisons: Mapping[str, Comparison],
@@ -215,7 +209,7 @@ def _figures(
 ) -> dict[str, Path]:
     drawn = {}
     if meta:
-        drawn["meta_training"] = figures.meta_training_curve(meta["metrics"], config)
+        drawn["meta_training"] = figures.meta_training_curve(run.metrics(), config)
         drawn["environment_steps"] = figures.environment_steps(
             meta["steps"], meta["environment_steps"]
         )
@@ -224,9 +218,8 @@ def _figures(
     drawn["drift_heatmaps"] = drift_figures.drift_heatmaps(objectives)
     paths = {}
     for name, figure in drawn.items():
-        paths[name] = folder / "figures" / f"{name.replace('/', '-')}.png"
-        paths[name].parent.mkdir(exist_ok=True)
-        plotting.save(figure, paths[name])
+        path = run.folder / "figures" / f"{name.replace('/', '-')}.png"
+        paths[name] = plotting.save(figure, path)
     return paths
 
 

@@ -224,9 +224,11 @@ class Evaluate(Measuring):
             "area under the curve",
             f"difference to {self.config.objectives[0]}",
         )
-        for row in self.compare(objectives).table():
-            difference = "" if row["difference"] is None else str(row["difference"])
-            table.add_row(row["objective"], str(row["final"]), str(row["area"]), difference)
+        comparison = self.compare(objectives)
+        differences = comparison.differences()
+        for c in comparison.curves:
+            final, area = str(estimate(c.final)), str(estimate(c.area))
+            table.add_row(c.objective, final, area, str(differences.get(c.objective, "")))
         console().print(table)
 
     def run_suite(self, name: str, objectives: Sequence[Objective]) -> None:

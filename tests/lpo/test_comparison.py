@@ -50,17 +50,6 @@ def test_a_difference_is_positive_where_the_objective_is_better_than_the_referen
     assert differences["none"].value == -4
 
 
-def test_a_table_has_a_row_for_each_objective_and_no_difference_for_the_reference():
-    comparison = Comparison([curves("ppo"), curves("dpo", [[0, 4, 6], [1, 3, 9]])])
-    first, second = comparison.table()
-    assert (first["objective"], first["difference"]) == ("ppo", None)
-    # Of two seeds the interquartile mean drops none: (4 + 7) / 2 and (3 + 4) / 2.
-    assert (first["final"].value, first["area"].value) == (5.5, 3.5)
-    # (6 + 9) / 2 - 5.5 = 2; (4 + 6) / 2 = 5 and (3 + 9) / 2 = 6 are 5.5 in the mean.
-    assert second["objective"] == "dpo"
-    assert (second["difference"].value, second["area"].value) == (2.0, 5.5)
-
-
 def test_dictionaries_are_json_and_hold_what_was_measured():
     comparison = Comparison([curves("ppo"), curves("dpo")])
     content = comparison.as_dict()
