@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from experiments import searches
 from experiments.claims import OF_THE_WAY, TENTH, Claim
 from experiments.harness import Experiment, Report, Save
-from experiments.searches import ENOUGH, NONE, Final
+from experiments.searches import ENOUGH, NONE
 from scb import plotting
 from scb.discovery import DiscoveryConfig
 from scb.environments.registry import environment_spec
@@ -88,17 +88,6 @@ def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None
                 save()
 
 
-def finals(report: Mapping[str, Any], environment: str, search: str) -> Final:
-    """The last judgement, the mean over searches."""
-    return searches.final(report["environments"][environment][search], np.mean)
-
-
-def _worst_failing(report: Mapping[str, Any], environment: str, search: str) -> float:
-    most = max(max(c["failed"]) for c in report["environments"][environment][search].values())
-    size = report["plan"]["environments"][environment]["population_size"]
-    return float(most / size)
-
-
 def _never_reached(report: Mapping[str, Any], environment: str, search: str) -> bool:
     """Whether no agent of any judgement earned more than one that never reaches the goal."""
     curves = report["environments"][environment][search].values()
@@ -149,14 +138,15 @@ def facts(report: Report) -> dict[str, Any]:
     """{environment: {row of the figure: {label: what its searches were worth}}}, and where they led nowhere."""
     found: dict[str, dict[str, dict[str, Any]]] = {}
     for environment in ENVIRONMENTS:
+        candidates = report["plan"]["environments"][environment]["population_size"]
         for row, labels in rows(environment).items():
             of_it = found.setdefault(environment, {}).setdefault(row, {})
             for label, search in labels.items():
-                curves = report["environments"][environment][search].values()
+                curves = report["environments"][environment][search]
                 of_it[label] = {
-                    "final": finals(report, environment, search),
-                    "failing": _worst_failing(report, environment, search),
-                    "seconds": float(np.mean([c["seconds"] for c in curves])),
+                    "final": searches.final(curves, np.mean),
+                    "failing": max(max(c["failed"]) for c in curves.values()) / candidates,
+                    "seconds": float(np.mean([c["seconds"] for c in curves.values()])),
                 }
     unseen = [x for x in ENVIRONMENTS if _goal_unseen(report, x)]
     return {"rows": found, "unseen": unseen, "enough": ENOUGH}
@@ -189,9 +179,7 @@ def draw(report: Mapping[str, Any]) -> Figure:
             ):
                 curves = list(report["environments"][environment][search].values())
                 plotting.search_curve(axes, curves, label, color, style)
-            axes.set_title(f"{environment}: {row}")
-            axes.set_xlabel("generation")
-            axes.set_ylabel("return of agents")
+            axes.set(title=f"{environment}: {row}", xlabel="generation", ylabel="return of agents")
             axes.legend(fontsize=8, ncols=2)
     plotting.figure_title(
         figure, "Meta-training curves: mean over searches, 95 % interval over searches"
@@ -199,9 +187,7 @@ def draw(report: Mapping[str, Any]) -> Figure:
     return figure
 
 
-EXPERIMENT = Experiment.of_the_paper(
-    "ablations", measure=measure, claims=claims, facts=facts, draw=draw
-)
+EXPERIMENT = Experiment.of_the_paper("ablations", measure, draw, claims, facts=facts)
 
 
 if __name__ == "__main__":

@@ -227,19 +227,18 @@ def summary(task: Task, measured: dict[str, dict[str, list[float]]]) -> dict[str
 
 
 def row(name: str, result: dict[str, Any]) -> str:
-
-    seconds, returns = [], []
+    """A line of what is printed."""
+    times = [result["seconds_per_agent"].get(who) for who in (THIS, PEER)]
+    seconds = ["-" if x is None else f"{np.median(x):.4f}" for x in times]
+    returns = []
     for who in (THIS, PEER):
-        times = result["seconds_per_agent"].get(who)
-        seconds.append("-" if times is None else f"{np.median(times):.4f}")
-        outcome = result["return"].get(who)
-        if outcome is None:
+        found = result["return"].get(who)
+        if found is None:
             returns.append("-")
             continue
-        text = "none" if outcome["iqm"] is None else str(Estimate(**outcome["iqm"]))
-        returns.append(text + (f", {outcome['diverged']} diverged" if outcome["diverged"] else ""))
-    ratio = f"{result['ratio']:.2f}" if "ratio" in result else "-"
-    return line(name, *seconds, ratio, *returns)
+        iqm = "none" if found["iqm"] is None else str(Estimate(**found["iqm"]))
+        returns.append(iqm + (f", {found['diverged']} diverged" if found["diverged"] else ""))
+    return line(name, *seconds, f"{result['ratio']:.2f}" if "ratio" in result else "-", *returns)
 
 
 def line(*cells: str) -> str:

@@ -108,19 +108,13 @@ def draw(report: Mapping[str, Any]) -> Figure:
         number = len(curves)
         label = f"{shape} ({number} {'search' if number == 1 else 'searches'})"
         plotting.search_curve(right, list(curves.values()), label, color, style, iqm)
-    left.set_title("Evaluation episodes' length")
-    left.set_ylabel("steps")
-    right.set_title("Meta-training on Hopper")
-    right.set_ylabel("return of agents")
-    for axes in (left, right):
-        axes.set_xlabel("generation")
+    left.set(title="Evaluation episodes' length", xlabel="generation", ylabel="steps")
+    right.set(title="Meta-training on Hopper", xlabel="generation", ylabel="return of agents")
     right.legend(fontsize=8)
     return figure
 
 
-EXPERIMENT = Experiment.of_the_paper(
-    "brax_curriculum", measure=measure, claims=claims, facts=facts, draw=draw
-)
+EXPERIMENT = Experiment.of_the_paper("brax_curriculum", measure, draw, claims, facts=facts)
 
 
 if __name__ == "__main__":

@@ -32,6 +32,11 @@ from scb.statistics import estimate
 
 OURS, PUBLISHED = "ours", "published"
 BRAX = ("hopper", "walker2d", "swimmer", "halfcheetah", "humanoidstandup")
+LOOKS: dict[str, dict[str, Any]] = {
+    "trained in the bandit": {"color": plotting.BLUE, "linestyle": "-"},
+    "trained in the environment": {"color": plotting.VERMILLION, "linestyle": "--"},
+}
+PAPER = "the paper, environment"
 ROUGHLY = 50  # times as many steps are roughly two orders of magnitude
 
 
@@ -212,30 +217,16 @@ def claims(report: Report) -> list[Claim]:
 
 def facts(report: Report) -> dict[str, Any]:
     """Final returns, ours and the paper's, and steps to match."""
-    finals_of = []
+    rows, lost = [], 0
     for name, algorithms in report["bandits"].items():
         own, environment = report["environments"][_environment_of(name)], name.split(" ")[0]
         for algorithm, curves in algorithms.items():
-            there = own.get(algorithm)
-            finals_of.append(
-                {
-                    "bandit": name,
-                    "algorithm": algorithm,
-                    "here": finals(curves),
-                    "there": None if there is None else finals(there),
-                    "paper": zoo_table_page.PAPER.get(environment, {}).get(algorithm),
-                    "paper_there": _paper(environment, algorithm),
-                    "seconds": _seconds(curves),
-                    "seconds_there": None if there is None else _seconds(there),
-                }
-            )
-    of_all = [report["bandits"], report["environments"]]
-    failed = sum(x.get("failed", 0) for by in of_all for y in by.values() for x in y.values())
-    return {"finals": finals_of, "matches": matches(report), "lost": failed}
-
-
-def _seconds(curves: Mapping[str, Any]) -> float:
-    return float(curves["seconds"] / len(curves["returns"]))
+            both = [x and {**x, "final": finals(x)} for x in (curves, own.get(algorithm))]
+            stated = zoo_table_page.PAPER.get(environment, {}).get(algorithm)
+            rows.append((name, algorithm, *both, stated, _paper(environment, algorithm)))
+    for of_all in (report["bandits"], report["environments"]):
+        lost += sum(x.get("failed", 0) for by in of_all.values() for x in by.values())
+    return {"finals": rows, "matches": matches(report), "lost": lost}
 
 
 def _paper(environment: str, algorithm: str) -> float | None:
@@ -254,17 +245,14 @@ def draw(report: Mapping[str, Any]) -> Figure:
     for row, (name, curves) in zip(panels, report["bandits"].items(), strict=True):
         own = report["environments"][_environment_of(name)]
         for axes, algorithm in zip(row, algorithms, strict=True):
-            for found, color, style in (
-                (curves[algorithm], plotting.BLUE, "-"),
-                (own.get(algorithm), plotting.VERMILLION, "--"),
-            ):
-                if found is None:
+            for found, look in zip((curves, own), LOOKS.values(), strict=True):
+                if (found := found.get(algorithm)) is None:
                     continue
                 # A logarithmic axis has no zero: the untrained agent is left out.
                 shown = np.asarray(found["steps"]) > 0
                 steps = np.asarray(found["steps"])[shown]
                 estimates = [estimate(x) for x in np.transpose(found["returns"])[shown]]
-                plotting.estimate_curve(axes, steps, estimates, color, style)
+                plotting.estimate_curve(axes, steps, estimates, **look)
             paper = _paper(name.split(" ")[0], algorithm)
             # The paper's physics.
             if algorithm not in own and paper is not None and "(generalized)" in name:
@@ -273,22 +261,13 @@ def draw(report: Mapping[str, Any]) -> Figure:
             axes.set_title(f"{name}\n{algorithm.upper()}", fontsize=9)
             axes.set_xlabel("training steps")
         row[0].set_ylabel("return in the environment")
-    handles: list[Any] = [
-        panels[0, 0].plot([], [], color=color, linestyle=style)[0]
-        for color, style in (
-            (plotting.BLUE, "-"),
-            (plotting.VERMILLION, "--"),
-            (plotting.GREY, ":"),
-        )
-    ]
-    labels = ["trained in the bandit", "trained in the environment", "the paper, environment"]
-    plotting.legend_below(figure, (handles, labels), columns=3)
+    plotting.legend_of(figure, {**LOOKS, PAPER: {"color": plotting.GREY, "linestyle": ":"}}, 3)
     plotting.figure_title(figure, "Interquartile mean over agents with its 95 % interval")
     return figure
 
 
 EXPERIMENT = Experiment.of_the_paper(
-    "brax_training", measure=measure, claims=claims, facts=facts, draw=draw, options=Options
+    "brax_training", measure, draw, claims, facts=facts, options=Options
 )
 
 

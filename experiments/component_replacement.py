@@ -208,17 +208,17 @@ def facts(report: Report) -> dict[str, Any]:
 def draw(report: Mapping[str, Any]) -> Figure:
     """A line a combination: the score with its interval, each expert a dot."""
     number = len(report["experts"])
+    looks = {
+        SYNTHETIC: {"color": plotting.VERMILLION, "marker": "o", "linestyle": ""},
+        EXPERT: {"color": plotting.BLUE, "marker": "o", "linestyle": ""},
+    }
     figure = Figure(figsize=(plotting.WIDTH, 3.6))
     axes = figure.subplots()
     for i, reward in enumerate(REWARDS):
-        for states, offset, color in (
-            (SYNTHETIC, -0.15, plotting.VERMILLION),
-            (EXPERT, 0.15, plotting.BLUE),
-        ):
+        for (states, look), offset in zip(looks.items(), (-0.15, 0.15), strict=True):
             scores = scores_of(report, reward, states)
-            plotting.estimate_row(
-                axes, i + offset, iqm(scores, axis=1), pooled_estimate(scores), color
-            )
+            each, pooled = iqm(scores, axis=1), pooled_estimate(scores)
+            plotting.estimate_row(axes, i + offset, each, pooled, look["color"])
     axes.axvline(1.0, color=plotting.BLACK, linestyle=":", linewidth=1.2)
     axes.set_yticks(range(len(REWARDS)), list(REWARDS))
     axes.invert_yaxis()
@@ -228,16 +228,11 @@ def draw(report: Mapping[str, Any]) -> Figure:
         f"Learning in a bandit with replaced parts: {number} experts (dots), "
         f"{report['plan']['agents']} agents each",
     )
-    handles: list[Any] = [
-        axes.plot([], [], "o", color=color)[0] for color in (plotting.VERMILLION, plotting.BLUE)
-    ]
-    plotting.legend_below(figure, (handles, list(STATES)), columns=2)
+    plotting.legend_of(figure, looks, columns=2)
     return figure
 
 
-EXPERIMENT = Experiment.of_the_paper(
-    "component_replacement", measure=measure, claims=claims, facts=facts, draw=draw
-)
+EXPERIMENT = Experiment.of_the_paper("component_replacement", measure, draw, claims, facts=facts)
 
 
 if __name__ == "__main__":

@@ -225,8 +225,7 @@ def figure(report: Mapping[str, Any]) -> Figure:
             axes.xaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 2.5, 5, 10]))
         row[1].xaxis.set_major_formatter(EngFormatter(sep=""))
         statistics = " or ".join(dict.fromkeys(run["statistic"] for run in of_it))
-        row[0].set_ylabel(f"return ({statistics})")
-        row[0].set_title(environment)
+        row[0].set(title=environment, ylabel=f"return ({statistics})")
     grid[-1][0].set_xlabel("minutes")
     grid[-1][1].set_xlabel("environment steps (training + evaluation)")
     number = {start: sum(run["start"] == start for run in runs) for start in STARTS}

@@ -105,11 +105,9 @@ def returns_and_lengths(
 
 def binned(lengths: np.ndarray) -> dict[str, int]:
     """{bin: number of episodes}."""
-    lowest, counts = 0.0, {}
-    for name, highest in BINS.items():
-        counts[name] = int(np.sum((lengths > lowest) & (lengths <= highest)))
-        lowest = highest
-    return counts
+    bins = np.searchsorted(list(BINS.values()), lengths.ravel())
+    counts = np.bincount(bins, minlength=len(BINS))
+    return dict(zip(BINS, counts.tolist(), strict=True))
 
 
 def shares(entry: Mapping[str, Any]) -> dict[str, float]:
@@ -185,12 +183,12 @@ def facts(report: Report) -> dict[str, Any]:
 def draw(report: Mapping[str, Any]) -> Figure:
     """Left: lengths, a stacked bar an environment. Right: score against the limit."""
     colors = colormaps["viridis"](np.linspace(0.0, 0.95, len(BINS)))
-    looks = (
-        (plotting.BLUE, "o", "-"),
-        (plotting.VERMILLION, "s", "--"),
-        (plotting.GREEN, "^", "-."),
-        (plotting.PURPLE, "D", ":"),
-        (plotting.BLACK, "v", (0, (5, 1))),
+    looks: tuple[dict[str, Any], ...] = (
+        {"color": plotting.BLUE, "marker": "o", "linestyle": "-"},
+        {"color": plotting.VERMILLION, "marker": "s", "linestyle": "--"},
+        {"color": plotting.GREEN, "marker": "^", "linestyle": "-."},
+        {"color": plotting.PURPLE, "marker": "D", "linestyle": ":"},
+        {"color": plotting.BLACK, "marker": "v", "linestyle": (0, (5, 1))},
     )
     limits = report["plan"]["limits"]
     figure = Figure(figsize=(12.0, 4.2))
@@ -203,35 +201,27 @@ def draw(report: Mapping[str, Any]) -> Figure:
             start += share
     left.set_yticks(range(len(report["environments"])), list(report["environments"]))
     left.invert_yaxis()
-    left.set_xlabel("share of the episodes in the synthetic MDP")
-    left.set_title("Steps of an episode, where many are allowed")
+    left.set(
+        title="Steps of an episode, where many are allowed",
+        xlabel="share of the episodes in the synthetic MDP",
+    )
     below = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.16), "fontsize": 8}
     left.legend(ncols=len(BINS), **below)
-    for i, (name, (color, marker, style)) in enumerate(
-        zip(report["environments"], looks, strict=False)
-    ):
+    for i, (name, look) in enumerate(zip(report["environments"], looks, strict=False)):
         found = [scores(report, name, limit) for limit in limits]
-        right.errorbar(
-            np.arange(len(limits)) + 0.06 * (i - 2),
-            [e.value for e in found],
-            plotting.error_bar(*found),
-            color=color,
-            marker=marker,
-            linestyle=style,
-            capsize=2,
-            label=name,
-        )
+        x, y = np.arange(len(limits)) + 0.06 * (i - 2), [e.value for e in found]
+        right.errorbar(x, y, plotting.error_bar(*found), **look, capsize=2, label=name)
     right.set_xticks(range(len(limits)), limits)
-    right.set_xlabel("longest episode (steps; max: the environment's own)")
-    right.set_ylabel("normalised score in the environment")
-    right.set_title("What the limit is worth")
+    right.set(
+        title="What the limit is worth",
+        xlabel="longest episode (steps; max: the environment's own)",
+        ylabel="normalised score in the environment",
+    )
     right.legend(ncols=3, columnspacing=1.0, **below)
     return figure
 
 
-EXPERIMENT = Experiment.of_the_paper(
-    "episode_lengths", measure=measure, claims=claims, facts=facts, draw=draw
-)
+EXPERIMENT = Experiment.of_the_paper("episode_lengths", measure, draw, claims, facts=facts)
 
 
 if __name__ == "__main__":

@@ -282,8 +282,7 @@ def draw(report: Mapping[str, Any]) -> Figure:
             [TICKS.get(x, x.upper()) for x in shown],
             fontsize=8,
         )
-        axes.set_ylabel("return")
-        axes.set_title(name)
+        axes.set(title=name, ylabel="return")
     dots = {source: {**look, "linestyle": ""} for source, look in looks.items()}
     plotting.legend_of(figure, dots, columns=4)
     plotting.figure_title(
@@ -293,9 +292,7 @@ def draw(report: Mapping[str, Any]) -> Figure:
     return figure
 
 
-EXPERIMENT = Experiment.of_the_paper(
-    "generality", measure=measure, claims=claims, facts=facts, draw=draw
-)
+EXPERIMENT = Experiment.of_the_paper("generality", measure, draw, claims, facts=facts)
 
 
 if __name__ == "__main__":

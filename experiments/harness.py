@@ -35,6 +35,9 @@ DOCS = Path("docs")
 PLANS = Path(__file__).with_name("plans")
 Save = Callable[[], None]
 Report = Mapping[str, Any]
+Measure = Callable[[Any, dict[str, Any], Save], None]
+Draw = Callable[[Report], Figure | dict[str, Figure]]
+Claims = Callable[[Report], Sequence[Claim]]
 
 
 @dataclass(frozen=True)
@@ -84,11 +87,11 @@ class Experiment:
 
     name: str
     title: str
-    measure: Callable[[Any, dict[str, Any], Save], None]
-    draw: Callable[[Report], Figure | dict[str, Figure]] | None = None
+    measure: Measure
+    draw: Draw | None = None
     paper: str = ""
     claim: str = ""
-    claims: Callable[[Report], Sequence[Claim]] = lambda report: ()
+    claims: Claims = lambda report: ()
     presets: Mapping[str, Mapping[str, Any]] | None = None
     minutes: Mapping[str, str] | None = None
     needs: str = ""
@@ -101,12 +104,14 @@ class Experiment:
     dpi: int = plotting.DPI
 
     @classmethod
-    def of_the_paper(cls, name: str, **parts: Any) -> "Experiment":
+    def of_the_paper(
+        cls, name: str, measure: Measure, draw: Draw, claims: Claims, **parts: Any
+    ) -> "Experiment":
         """One whose title, claim, needs and presets are those of plans/NAME.toml; presets.both is part of either."""
-        said = tomllib.loads((PLANS / f"{name}.toml").read_text())
+        said = plan_of(name)
         both = said["presets"].pop("both", {})
         said["presets"] = {preset: both | own for preset, own in said["presets"].items()}
-        return cls(name, **said, **parts)
+        return cls(name, measure=measure, draw=draw, claims=claims, **said, **parts)
 
     def judged(self, report: Report) -> list[Judged]:
         """What becomes of each part of the claim."""
@@ -240,6 +245,11 @@ class Experiment:
             plotting.save(figure, docs / "figures" / f"{name}.png", self.dpi)
         if self.extras is not None:
             self.extras(report, docs)
+
+
+def plan_of(name: str) -> dict[str, Any]:
+    """What plans/NAME.toml says."""
+    return tomllib.loads((PLANS / f"{name}.toml").read_text())
 
 
 def exit_status(name: str, command: Callable[[], int]) -> int:

@@ -189,9 +189,7 @@ def draw(report: Mapping[str, Any]) -> Figure:
     return figure
 
 
-EXPERIMENT = Experiment.of_the_paper(
-    "interpretability", measure=measure, claims=claims, facts=facts, draw=draw
-)
+EXPERIMENT = Experiment.of_the_paper("interpretability", measure, draw, claims, facts=facts)
 
 
 if __name__ == "__main__":

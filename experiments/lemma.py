@@ -188,7 +188,7 @@ def draw(report: Mapping[str, Any]) -> Figure:
     return figure
 
 
-EXPERIMENT = Experiment.of_the_paper("lemma", measure=measure, claims=claims, draw=draw)
+EXPERIMENT = Experiment.of_the_paper("lemma", measure, draw, claims)
 
 
 if __name__ == "__main__":

@@ -182,8 +182,7 @@ def draw(report: Mapping[str, Any]) -> Figure:
     titles = ("(i) over generations", "(ii) over environment steps", "(ii) over wall-clock")
     labels = ("generation", "environment steps of the search", "minutes of the search")
     for panel, title, label in zip(panels, titles, labels, strict=True):
-        panel.set_title(title)
-        panel.set_xlabel(label)
+        panel.set(title=title, xlabel=label)
         panel.legend(fontsize=8)
     for panel in panels[1:]:
         panel.set_xscale("log")
@@ -349,10 +348,10 @@ class Options(Preset):
 
 EXPERIMENT = Experiment.of_the_paper(
     "lpo_on_bandits",
-    measure=measure,
-    claims=claims,
+    measure,
+    draw,
+    claims,
     facts=facts,
-    draw=draw,
     options=Options,
     keys=("preset", "searches", "evaluations"),
 )

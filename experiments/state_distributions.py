@@ -195,9 +195,7 @@ def draw(report: Mapping[str, Any]) -> Figure:
     return figure
 
 
-EXPERIMENT = Experiment.of_the_paper(
-    "state_distributions", measure=measure, claims=claims, facts=facts, draw=draw
-)
+EXPERIMENT = Experiment.of_the_paper("state_distributions", measure, draw, claims, facts=facts)
 
 
 if __name__ == "__main__":

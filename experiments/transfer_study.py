@@ -21,7 +21,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from experiments.claims import FAILS, HOLDS, UNDECIDED, Claim, judge
-from experiments.harness import Experiment, Report, Save
+from experiments.harness import Experiment, Report, Save, plan_of
 from experiments.searches import meta_training, objective_of_run
 from lpo.comparison import compare, ppo_spec
 from lpo.objectives import load_objective
@@ -30,32 +30,9 @@ from scb.plotting import BLUE, GREY, VERMILLION, estimate_row
 from scb.seeds import REPORTING
 from scb.statistics import Estimate, estimate, pooled_estimate
 
-# Flags of `lpo meta-train`. The first is what the others differ from in one thing each.
-VARIATIONS: dict[str, dict[str, Any]] = {
-    "default": {},
-    "no reward noise": {"reward_noise": 0.0},
-    "reward noise 10": {"reward_noise": 10.0},
-    "one initialisation": {"hyperparameters": "policy_output_scale=1"},
-    "learning rates drawn": {
-        "hyperparameters": "policy_output_scale=1,0.01 learning_rate=0.0003,0.001,0.003"
-    },
-    "area under the curve": {"fitness": "area"},
-    "return on Pendulum": {"fitness": "transfer"},
-    "four bandits": {
-        "tasks": "Synthetic-Pendulum-v1,Synthetic-CartPole-v1,Synthetic-Acrobot-v1,"
-        "Synthetic-MountainCarContinuous-v0"
-    },
-    "no PPO base": {"base": "none"},
-    "temporal": {"temporal": True},
-    "no gate": {"gate": 0.0},
-    "no gate, xi 1e-4": {"gate": 0.0, "xi": 1e-4},
-    "small steps": {"sigma": 0.01, "learning_rate": 0.003},
-    "large steps": {"sigma": 0.1, "learning_rate": 0.03},
-    # A training of 1350 steps, less than a hundredth of Pendulum's.
-    "90 contexts": {"contexts": 90},
-    "stopped by validation": {"validate": True},
-}
-REFERENCES = ("ppo", "ppo-1", "dpo")
+_PLAN = plan_of("transfer_study")
+VARIATIONS: dict[str, dict[str, Any]] = _PLAN["variations"]
+REFERENCES: list[str] = _PLAN["references"]
 NO_SEARCH = "no search"  # stands for the meta-seed of a reference
 
 
@@ -176,14 +153,12 @@ def draw(report: Mapping[str, Any]) -> Figure:
         for position, row in enumerate(rows):
             if evaluation not in row["in"]:
                 continue
-            color = {"default": VERMILLION}.get(
-                row["name"], BLUE if row["name"] in REFERENCES else GREY
-            )
-            returns = report["objectives"][row["name"]]["returns"][evaluation]
+            name = row["name"]
+            color = BLUE if name in REFERENCES else VERMILLION if name == "default" else GREY
+            returns = report["objectives"][name]["returns"][evaluation]
             agents = np.concatenate(list(returns.values()))
             estimate_row(axes, position, agents, row["in"][evaluation], color)
-        axes.set_title(evaluation)
-        axes.set_xlabel("final return")
+        axes.set(title=evaluation, xlabel="final return")
         axes.xaxis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10]))
     panels[0].set_yticks(range(len(rows)), [row["name"] for row in rows])
     panels[0].invert_yaxis()

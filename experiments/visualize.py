@@ -150,7 +150,7 @@ def draw(report: Mapping[str, Any]) -> Figure:
 
 
 EXPERIMENT = Experiment.of_the_paper(
-    "visualize", measure=measure, claims=claims, facts=facts, draw=draw, extras=animate
+    "visualize", measure, draw, claims, facts=facts, extras=animate
 )
 
 

@@ -7,6 +7,7 @@ from typing import Any
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
+from experiments.harness import plan_of
 from scb import plotting
 from scb.agents.spec import ALGORITHMS
 from scb.environments.registry import environment_spec
@@ -14,43 +15,10 @@ from scb.errors import UserError
 
 ACTIONS = {"mode_actions": "most likely actions", "sampled_actions": "sampled actions"}
 BANDITS = ("ours", "published")
-# Classic control, then Brax by cost. An environment that isn't here comes after these.
-ENVIRONMENTS = (
-    "CartPole-v1",
-    "Acrobot-v1",
-    "MountainCar-v0",
-    "MountainCarContinuous-v0",
-    "Pendulum-v1",
-    "hopper",
-    "walker2d",
-    "swimmer",
-    "halfcheetah",
-    "humanoidstandup",
-)
-
-# The return that a bandit of this project is meant to train agents to.
-TARGETS = {
-    "CartPole-v1": 500.0,
-    "Acrobot-v1": -82.0,
-    "MountainCar-v0": -130.0,
-    "MountainCarContinuous-v0": 92.0,
-    "Pendulum-v1": -170.0,
-}
-
-# Liesen et al. (2024): returns of agents trained in the published bandits, as the paper states them
-# (IQM of 20 agents, 50 episodes; classic control's table, and the columns SCB of Brax's).
-PAPER: dict[str, dict[str, float]] = {
-    "CartPole-v1": {"ppo": 500.0, "sac": 500.0, "dqn": 500.0},
-    "Acrobot-v1": {"ppo": -84.1, "sac": -85.3, "dqn": -82.6},
-    "MountainCar-v0": {"ppo": -181.8, "sac": -170.1, "dqn": -118.4},
-    "MountainCarContinuous-v0": {"ppo": 66.9, "sac": 91.1, "ddpg": 97.6, "td3": 97.5},
-    "Pendulum-v1": {"ppo": -205.4, "sac": -188.3, "ddpg": -164.3, "td3": -168.5},
-    "hopper": {"ppo": 853.5, "sac": 2738.8, "ddpg": 3012.4, "td3": 2985.3},
-    "walker2d": {"ppo": 858.3, "sac": 1323.1, "ddpg": 1304.3, "td3": 1321.8},
-    "swimmer": {"ppo": 348.5, "sac": 361.6, "ddpg": 365.1, "td3": 365.4},
-    "halfcheetah": {"ppo": 1657.4, "sac": 5810.4, "ddpg": 6162.4, "td3": 6555.8},
-    "humanoidstandup": {"ppo": 13356.1, "sac": 21105.2, "ddpg": 21039.0, "td3": 20372.0},
-}
+_PLAN = plan_of("zoo_table")
+ENVIRONMENTS: list[str] = _PLAN["environments"]
+TARGETS: dict[str, float] = _PLAN["targets"]
+PAPER: dict[str, dict[str, float]] = _PLAN["paper"]
 
 
 def pairs(

@@ -113,8 +113,8 @@ def test_the_page_and_the_figure_show_bandits_environments_and_the_paper(report)
     figure = experiment.draw(report)
     assert len(figure.axes) == 4
     ppo, sac = figure.axes[:2]
-    # Bandit, environment and the legend's three; with SAC the bandit, and the paper's level in its physics.
-    assert len(ppo.lines) == 5 and len(sac.lines) == 1
+    # Bandit and environment; with SAC the bandit, and the paper's level in its physics.
+    assert len(ppo.lines) == 2 and len(sac.lines) == 1
     assert len(figure.axes[3].lines) == 2
     np.testing.assert_array_equal(ppo.lines[0].get_xdata(), [5000, 10_000])
 
