@@ -14,6 +14,7 @@ import pkgutil
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -145,12 +146,7 @@ def _all(arguments: All) -> int:
         print(f"{experiment.name} ...{note}", flush=True)
         files = Files(out, arguments.docs, arguments.only_render or kept)
         options = experiment.options(arguments.preset)
-
-        def run(
-            experiment: Experiment = experiment, options: Any = options, files: Files = files
-        ) -> int:
-            return experiment.run(options, files)
-
+        run = partial(experiment.run, options, files)
         failed |= bool(harness.exit_status(experiment.name, run))
     (arguments.docs / "experiments.md").write_text(overview(experiments, arguments.data))
     print(f"written: {arguments.docs / 'experiments.md'}")

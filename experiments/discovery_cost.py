@@ -140,10 +140,7 @@ def _judged(found: Mapping[str, Any]) -> float:
 def _warm_start(folder: Path, environment: str) -> dict[str, Any]:
     """What the warm start took, as the run's bandit says it; None where that is unknown."""
     path = folder / f"{environment_spec(environment).bandit}.json"
-    unknown: dict[str, Any] = {"steps": None, "minutes": None, "machine": None}
-    if not path.is_file():
-        return unknown
-    cost = json.loads(path.read_text()).get("cost", {})
+    cost = json.loads(path.read_text()).get("cost", {}) if path.is_file() else {}
     warm = cost.get("warm_start") or {}
     steps, seconds = warm.get("environment_steps"), warm.get("seconds")
     return {

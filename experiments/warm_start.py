@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from experiments.harness import Experiment, Save
+from experiments.rendering import number, text
 from scb import make
 from scb.agents.spec import algorithms_for, bandit_agent
 from scb.discovery import judge
@@ -50,12 +51,9 @@ def markdown(report: Mapping[str, Any]) -> str:
                 continue
             iqms = {arm: arms[arm][algorithm]["mode_actions"]["iqm"] for arm in ARMS}
             best = max(iqms, key=lambda arm: iqms[arm]["value"])
-            cells = []
-            for arm, x in iqms.items():
-                text = f"{x['value']:.0f} [{x['low']:.0f}, {x['high']:.0f}]".replace("-", "\u2212")
-                cells.append(f"**{text}**" if arm == best else text)
-            expert = f"{result['expert_return']:.0f}".replace("-", "\u2212")
-            lines.append(f"| {name} ({expert}) | {algorithm.upper()} | {' | '.join(cells)} |")
+            cells = [f"**{text(x)}**" if arm == best else text(x) for arm, x in iqms.items()]
+            environment = f"{name} ({number(result['expert_return'])})"
+            lines.append(f"| {environment} | {algorithm.upper()} | {' | '.join(cells)} |")
     return "\n".join(lines)
 
 

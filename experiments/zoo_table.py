@@ -114,25 +114,20 @@ def candidates(
     """
     paths = {}
     if published is not None:
-        stored = {
-            environment: published / f"{n}.npz" for n, environment in PUBLISHED_BANDITS.items()
-        }
+        stored = {home: published / f"{name}.npz" for name, home in PUBLISHED_BANDITS.items()}
         paths = {environment: path for environment, path in stored.items() if path.is_file()}
         if not paths:
             raise UserError(f"{published} holds no published bandit such as pendulum.npz.")
-    found = []
-    wanted = set()
-    published_alone = {environment_spec(environment).bandit: environment for environment in paths}
-    for name in zoo_names():
-        published_alone.pop(name, None)
+    homes = {environment_spec(environment).bandit: environment for environment in paths}
+    found, wanted = [], set()
     for name in zoo_names() if names is None else names:
-        if name in published_alone:
-            wanted.add(published_alone[name])
+        if name in homes and name not in zoo_names():  # published alone
+            wanted.add(homes[name])
             continue
-        bandit = open_bandit(name)
         environment = environment_spec(name).evaluation_environment
         wanted.add(environment)
-        found.append(Candidate(environment, "ours", bandit, bandit_metadata(name)["sha256"]))
+        digest = bandit_metadata(name)["sha256"]
+        found.append(Candidate(environment, "ours", open_bandit(name), digest))
     found += [
         Candidate(environment, "published", published_bandit(path), arrays_digest(path))
         for environment, path in paths.items()
@@ -173,8 +168,7 @@ def measure_bandits(
             environment, bandits = candidate.environment, {}
             env, env_params = home.make(backend)
         check_fits(candidate.bandit, env, env_params, environment)
-        space = env.action_space(env_params)
-        for algorithm in algorithms_for(space):
+        for algorithm in algorithms_for(env.action_space(env_params)):
             spec = bandit_agent(algorithm, environment)
             row: dict[str, Any] = {
                 "environment": environment,
@@ -237,7 +231,7 @@ def _counted(agents: Sequence[float | None]) -> list[float]:
 
 
 def differences(entries: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Ours - published, by environment and algorithm, where both were measured under one protocol."""
+    """Ours - published, by environment and algorithm, where both were measured alike."""
     protocol = ("agents", "episodes", "seed", "backend", "inner_loop")
     rows = []
     for (name, algorithm), pair in pairs(entries).items():
