@@ -149,11 +149,7 @@ def measure(options: Options, report: dict[str, Any], save: Save) -> None:
     def named(path: Path) -> Objective:
         return replace(load_objective(path), name=run_name(path))
 
-    family = [
-        *known_drifts(),
-        *map(load_objective, OF_THE_ZOO),
-        *map(named, options.adversaries),
-    ]
+    family = [*known_drifts(), *map(load_objective, OF_THE_ZOO), *map(named, options.adversaries)]
     held_out = [*other_drifts(), *map(named, options.held_out)]
     for objective in held_out:
         twins = [member.name for member in family if same_drift(objective, member)]

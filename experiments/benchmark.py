@@ -35,11 +35,10 @@ import jax
 import numpy as np
 
 import scb
-from experiments.harness import Experiment, Save
+from experiments.harness import Experiment, Save, bandit_of
 from scb.agents.spec import bandit_agent
 from scb.artefacts import flatten
-from scb.environments.registry import environment_spec
-from scb.environments.zoo import open_bandit, space_description
+from scb.environments.zoo import space_description
 from scb.errors import unknown_name
 from scb.evolution import map_population
 from scb.keys import named_key, root_key, split_key
@@ -69,11 +68,6 @@ TASKS = {
 }
 
 
-def bandit_of(task: Task) -> Any:
-    """The bandit that ships for the task's environment."""
-    return open_bandit(environment_spec(task.environment).bandit)
-
-
 def spec_of(task: Task, steps: int) -> Any:
 
     return bandit_agent(task.algorithm, task.environment, sampled=False).with_steps(steps)
@@ -85,7 +79,7 @@ def measure_this_project(task: Task, steps: int) -> dict[str, list[float]]:
     Runs in a process of its own.
     """
 
-    bandit = bandit_of(task)
+    bandit, _ = bandit_of(task.environment)
     params = bandit.default_params
     spec = spec_of(task, steps)
     agent = spec.agent(bandit)
@@ -118,7 +112,7 @@ def measure_this_project(task: Task, steps: int) -> dict[str, list[float]]:
 
 def write_rejax_job(folder: Path, task: Task, steps: int) -> Path:
     """Writes the bandit and rejax's settings where the peer, which can't import this project, finds them."""
-    bandit = bandit_of(task)
+    bandit, _ = bandit_of(task.environment)
     spec = spec_of(task, steps)
     algorithm, settings = rejax_settings(task.algorithm, spec, bandit.action_space())
     weights = folder / "bandit.npz"

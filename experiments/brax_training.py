@@ -20,11 +20,10 @@ from matplotlib.figure import Figure
 
 from experiments import zoo_table, zoo_table_page
 from experiments.claims import Claim
-from experiments.harness import Experiment, Preset, Report, Save, fill
+from experiments.harness import Experiment, Preset, Report, Save, bandit_of, fill
 from scb import measurement, plotting
 from scb.agents.spec import AgentSpec, bandit_agent, environment_agent
 from scb.environments.registry import environment_spec
-from scb.environments.zoo import bandit_metadata, open_bandit
 from scb.importer import PUBLISHED_BANDITS, published_bandit
 from scb.rows import Rows, pivot
 from scb.seeds import REPORTING
@@ -88,8 +87,7 @@ def _in_bandit(
     kind: str, environment: str, backend: str | None, plan: Mapping[str, Any], algorithm: str
 ) -> dict[str, Any]:
     if kind == OURS:
-        bandit = open_bandit(environment_spec(environment).bandit)
-        digest = bandit_metadata(bandit.name)["sha256"]
+        bandit, digest = bandit_of(environment)
     else:
         (name,) = (n for n, home in PUBLISHED_BANDITS.items() if home == environment)
         folder = Path(plan["published"])
@@ -223,16 +221,18 @@ def facts(report: Report) -> dict[str, Any]:
         for algorithm, curves in algorithms.items():
             both = [x and {**x, "final": finals(x)} for x in (curves, own.get(algorithm))]
             stated = zoo_table_page.PAPER.get(environment, {}).get(algorithm)
-            rows.append((name, algorithm, *both, stated, _paper(environment, algorithm)))
+            rows.append(
+                (
+                    name,
+                    algorithm,
+                    *both,
+                    stated,
+                    zoo_table_page.paper_return(environment, algorithm),
+                )
+            )
     for of_all in (report["bandits"], report["environments"]):
         lost += sum(x.get("failed", 0) for by in of_all.values() for x in by.values())
     return {"finals": rows, "matches": matches(report), "lost": lost}
-
-
-def _paper(environment: str, algorithm: str) -> float | None:
-    """What the paper's agents earn that were trained in the environment."""
-    found = environment_spec(environment).reference(algorithm=algorithm)
-    return None if found is None else found.value
 
 
 def draw(report: Mapping[str, Any]) -> Figure:
@@ -253,7 +253,7 @@ def draw(report: Mapping[str, Any]) -> Figure:
                 steps = np.asarray(found["steps"])[shown]
                 estimates = [estimate(x) for x in np.transpose(found["returns"])[shown]]
                 plotting.estimate_curve(axes, steps, estimates, **look)
-            paper = _paper(name.split(" ")[0], algorithm)
+            paper = zoo_table_page.paper_return(name.split(" ")[0], algorithm)
             # The paper's physics.
             if algorithm not in own and paper is not None and "(generalized)" in name:
                 axes.axhline(paper, color=plotting.GREY, linestyle=":")

@@ -10,6 +10,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+from scb.environments.registry import environment_spec
 from scb.statistics import Estimate
 
 HOLDS, IN_PART, FAILS, UNDECIDED, UNTESTED = OUTCOMES = (
@@ -103,4 +104,12 @@ def outcome(judged: Sequence[Judged]) -> str:
 
 # A margin of normalised scores.
 TENTH = 0.1
+
+
+def of_the_way(environment: str, share: float = TENTH) -> float:
+    """The same as a return: this share of the way from random actions to the expert."""
+    spec = environment_spec(environment)
+    return round(share * (spec.reference_return() - spec.random_return()), 1)
+
+
 OF_THE_WAY = "a tenth of the way from random actions to the expert: half of what algorithms differ by in the paper"

@@ -17,14 +17,12 @@ from matplotlib.figure import Figure
 
 import scb
 from experiments.claims import OF_THE_WAY, TENTH, Claim
-from experiments.harness import Experiment, Report, Save, finite
+from experiments.harness import Experiment, Report, Save, bandit_of, finite
 from scb import plotting
 from scb.agents.spec import bandit_agent
 from scb.analysis import components
 from scb.analysis.states import follow
 from scb.discovery import judge
-from scb.environments.registry import environment_spec
-from scb.environments.zoo import bandit_metadata, open_bandit
 from scb.keys import key_at, root_key, split_key
 from scb.measurement import Place
 from scb.seeds import ILLUSTRATING, REPORTING
@@ -65,7 +63,7 @@ def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None
 
     env, env_params = scb.make(ENVIRONMENT)
     space = env.action_space(env_params)
-    bandit = open_bandit(environment_spec(ENVIRONMENT).bandit)
+    bandit, digest = bandit_of(ENVIRONMENT)
     spec = bandit_agent("ppo", ENVIRONMENT)
     key_random, key_experts = split_key(root_key(ILLUSTRATING.start))
 
@@ -110,7 +108,7 @@ def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None
         random = follow(
             env, env_params, lambda _, key: space.sample(key), key_random, plan["expert_episodes"]
         )
-        report["sha256"] = bandit_metadata(bandit.name)["sha256"]
+        report["sha256"] = digest
         report["random"] = float(np.round(random.returns().mean(), 2))
         report["bandit"] = learn(None, None)
         save()

@@ -14,7 +14,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import scb
-from experiments.claims import Claim
+from experiments.claims import Claim, of_the_way
 from experiments.harness import Experiment, Report, Save, fill
 from scb import plotting
 from scb.agents.spec import environment_agent
@@ -74,7 +74,7 @@ def claims(report: Report) -> list[Claim]:
     found = []
     for name, entry in report["environments"].items():
         expert = paper(name).value
-        margin = round(MARGIN * (expert - environment_spec(name).random_return()), 1)
+        margin = of_the_way(name, MARGIN)
         evidence = partial(estimate, entry["returns"])
         text = f"{name}: no worse than the paper's expert"
         found.append(Claim(text, evidence, expert, margin, REASON, places=1))

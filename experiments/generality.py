@@ -20,14 +20,13 @@ from matplotlib.figure import Figure
 import scb
 from experiments import searches
 from experiments.claims import OF_THE_WAY, TENTH, Claim
-from experiments.harness import Experiment, Report, Save, finite
+from experiments.harness import Experiment, Report, Save, bandit_of, finite
 from scb import measurement, plotting
 from scb.agents.spec import algorithms_for, bandit_agent
 from scb.analysis.optimal_actions import optimal_policy
 from scb.curriculum import paper_curriculum
 from scb.discovery import DiscoveryConfig
 from scb.environments.registry import environment_spec
-from scb.environments.zoo import bandit_metadata, open_bandit
 from scb.evaluation import evaluate
 from scb.evolution import map_population
 from scb.keys import root_key, split_key
@@ -96,7 +95,7 @@ def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None
     for environment in plan["environments"]:
         if environment not in random:
             random[environment] = round(environment_spec(environment).random_return(), 2)
-            digests[environment] = bandit_metadata(environment_spec(environment).bandit)["sha256"]
+            _, digests[environment] = bandit_of(environment)
         entry = found.setdefault(environment, {source: {} for source in SOURCES})
         chosen = generations.setdefault(environment, {})
         judge_in = Place.named(environment)
@@ -131,7 +130,7 @@ def _source(judge_in: Place, source: str, plan: Mapping[str, Any]) -> tuple[Plac
     if source == ENVIRONMENT:
         return judge_in, None
     if source == ZOO:
-        bandit = open_bandit(environment_spec(judge_in.name).bandit)
+        bandit, _ = bandit_of(judge_in.name)
         return Place(source, bandit, bandit.default_params), None
     kind = "drawn" if source == DRAWN else "fixed"
     problem, outcome = searches.search(
@@ -277,11 +276,7 @@ def draw(report: Mapping[str, Any]) -> Figure:
                 markersize=4,
             )
         axes.axvline(shown.index(TOGETHER) + 0.5, color=plotting.BLACK, linestyle="--", linewidth=1)
-        axes.set_xticks(
-            range(len(shown)),
-            [TICKS.get(x, x.upper()) for x in shown],
-            fontsize=8,
-        )
+        axes.set_xticks(range(len(shown)), [TICKS.get(x, x.upper()) for x in shown], fontsize=8)
         axes.set(title=name, ylabel="return")
     dots = {source: {**look, "linestyle": ""} for source, look in looks.items()}
     plotting.legend_of(figure, dots, columns=4)

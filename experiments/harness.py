@@ -25,7 +25,9 @@ from experiments import claims, rendering
 from experiments.claims import Claim, Judged
 from scb import plotting
 from scb.artefacts import machine_description, package_versions
-from scb.environments.registry import families
+from scb.environments.registry import environment_spec, families
+from scb.environments.synthetic import SyntheticBandit
+from scb.environments.zoo import bandit_metadata, open_bandit
 from scb.errors import UserError
 from scb.files import make_folder, write_json
 
@@ -289,6 +291,12 @@ def fill(
         if name not in part:
             part[name] = measured(name)
             save()
+
+
+def bandit_of(environment: str) -> tuple[SyntheticBandit, str]:
+    """The zoo's bandit of an environment, and the checksum of its weights."""
+    name = environment_spec(environment).bandit
+    return open_bandit(name), bandit_metadata(name)["sha256"]
 
 
 def packed(rows: Any) -> list[str]:

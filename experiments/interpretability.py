@@ -19,6 +19,7 @@ from experiments.harness import (
     Experiment,
     Report,
     Save,
+    bandit_of,
     fill,
     packed,
     unpacked,
@@ -29,8 +30,6 @@ from scb.analysis.explain import explain
 from scb.analysis.importance import reward_variance
 from scb.analysis.planes import Plane
 from scb.analysis.states import bandit_states
-from scb.environments.registry import environment_spec
-from scb.environments.zoo import bandit_metadata, open_bandit
 from scb.keys import root_key, split_key
 from scb.measurement import Place
 from scb.statistics import Estimate, estimate
@@ -55,7 +54,7 @@ def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None
 
 
 def _examine(name: str, plan: Mapping[str, Any]) -> dict[str, Any]:
-    bandit = open_bandit(environment_spec(name).bandit)
+    bandit, digest = bandit_of(name)
     numbers, drawn = explain(bandit, Place.named(name), plan["episodes"], plan["seed"])
     keys = split_key(root_key(plan["seed"] + 1), plan["repetitions"])
     shares = []
@@ -67,7 +66,7 @@ def _examine(name: str, plan: Mapping[str, Any]) -> dict[str, Any]:
     _, _, nodes = plane.grid(POINTS)
     actions = drawn["best"](nodes)
     return {
-        "sha256": bandit_metadata(bandit.name)["sha256"],
+        "sha256": digest,
         "return": numbers["return_of_optimal_policy"],
         "importance": {
             entry: estimate(column).as_dict()

@@ -34,13 +34,9 @@ def measure(options: Options, report: dict[str, Any], save: Save) -> None:
     """The bandit, then the environment."""
     default = MetaTrainingConfig()
     config = replace(
-        default,
-        evolution=replace(default.evolution, population_size=options.population_size),
+        default, evolution=replace(default.evolution, population_size=options.population_size)
     )
-    problems = {
-        "bandit": MetaTraining(config),
-        "environment": environment_problem(config),
-    }
+    problems = {"bandit": MetaTraining(config), "environment": environment_problem(config)}
     result: dict[str, dict[str, float]] = {}
     for name, problem in problems.items():
         weights = problem.initial_solution(root_key(0))

@@ -16,14 +16,7 @@ from matplotlib.figure import Figure
 
 from experiments import experts
 from experiments.claims import Claim
-from experiments.harness import (
-    Experiment,
-    Report,
-    Save,
-    fill,
-    packed,
-    unpacked,
-)
+from experiments.harness import Experiment, Report, Save, bandit_of, fill, packed, unpacked
 from experiments.interpretability import action_bar, draw_actions
 from scb import plotting
 from scb.agents.agent import flat_bounds
@@ -31,9 +24,7 @@ from scb.analysis.components import ReplacedBandit, q_reward
 from scb.analysis.optimal_actions import first_action, optimal_actions
 from scb.analysis.planes import plane_for
 from scb.analysis.states import bandit_states, follow
-from scb.environments.registry import environment_spec
 from scb.environments.synthetic import SyntheticBandit
-from scb.environments.zoo import bandit_metadata, open_bandit
 from scb.keys import root_key, split_key
 from scb.seeds import ILLUSTRATING
 from scb.statistics import Estimate, estimate
@@ -57,7 +48,7 @@ def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None
 def _examine(environment: str, plan: Mapping[str, Any]) -> dict[str, Any]:
     key_states, key_episodes, key_pick = split_key(root_key(SEED), 3)
     expert, env, env_params = experts.train(environment, plan["agents"], plan["selection_episodes"])
-    bandit = open_bandit(environment_spec(environment).bandit)
+    bandit, digest = bandit_of(environment)
     space = env.action_space(env_params)
     contexts = bandit_states(bandit, key_states, STATES)
     episodes = follow(env, env_params, expert.policy(), key_episodes, plan["episodes"])
@@ -81,7 +72,7 @@ def _examine(environment: str, plan: Mapping[str, Any]) -> dict[str, Any]:
 
     num_actions, bounds = first_action(space)
     return {
-        "sha256": bandit_metadata(bandit.name)["sha256"],
+        "sha256": digest,
         "expert": round(float(episodes.returns().mean()), 2),
         "labels": list(plane.labels),
         "limits": [list(x) for x in plane.limits],

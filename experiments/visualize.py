@@ -21,6 +21,7 @@ from experiments.harness import (
     Experiment,
     Report,
     Save,
+    bandit_of,
     packed,
     unpacked,
 )
@@ -30,7 +31,6 @@ from scb.analysis import animation
 from scb.analysis.animation import picture, save_gif
 from scb.analysis.states import follow
 from scb.environments.registry import environment_spec
-from scb.environments.zoo import open_bandit
 from scb.errors import UserError
 from scb.keys import root_key, split_key
 from scb.statistics import Estimate, estimate
@@ -57,7 +57,7 @@ def _show(name: str, plan: Mapping[str, Any]) -> dict[str, Any]:
     environment, backend = ("hopper", "spring") if name == HOPPER else (name, None)
     place = environment_spec(environment)
     env, env_params = place.make(backend)
-    bandit = open_bandit(place.bandit)
+    bandit, _ = bandit_of(environment)
     spec = bandit_agent("ppo", environment, sampled=False)
     agent = spec.agent(bandit)
     key_train, key_choose, key_show = split_key(root_key(plan["seed"]), 3)

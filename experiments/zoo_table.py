@@ -25,16 +25,7 @@ import numpy as np
 
 from experiments.harness import Experiment, Save
 from experiments.rendering import digits
-from experiments.zoo_table_page import (
-    ACTIONS,
-    BANDITS,
-    TARGETS,
-    facts,
-    figure,
-    pairs,
-    place,
-    rank,
-)
+from experiments.zoo_table_page import ACTIONS, BANDITS, TARGETS, facts, figure, pairs, place, rank
 from scb.agents.spec import AgentSpec, algorithms_for, bandit_agent
 from scb.discovery import check_fits, judge
 from scb.environments.registry import environment_spec
@@ -124,10 +115,10 @@ def candidates(
         if name in homes and name not in zoo_names():  # published alone
             wanted.add(homes[name])
             continue
+        bandit, digest = open_bandit(name), bandit_metadata(name)["sha256"]
         environment = environment_spec(name).evaluation_environment
         wanted.add(environment)
-        digest = bandit_metadata(name)["sha256"]
-        found.append(Candidate(environment, "ours", open_bandit(name), digest))
+        found.append(Candidate(environment, "ours", bandit, digest))
     found += [
         Candidate(environment, "published", published_bandit(path), arrays_digest(path))
         for environment, path in paths.items()

@@ -108,6 +108,7 @@ def figure(report: Mapping[str, Any]) -> Figure:
         )
         for actions in ACTIONS
     }
+    experts = {x: value for x in environments if (value := _paper_expert(x)) is not None}
     columns = min(2, len(environments))
     rows = math.ceil(len(environments) / columns)
     drawn = Figure(figsize=(plotting.WIDTH, 2.1 * rows + 1.1))
@@ -127,9 +128,8 @@ def figure(report: Mapping[str, Any]) -> Figure:
                 if iqm["low"] is not None and iqm["high"] is not None:
                     axes.hlines(y, iqm["low"], iqm["high"], color=look["color"], linewidth=1.6)
                 axes.plot(iqm["value"], y, **look, markersize=6, linestyle="")
-        expert = _paper_expert(environment)
-        if expert is not None:
-            axes.axvline(expert, **_EXPERT)
+        if environment in experts:
+            axes.axvline(experts[environment], **_EXPERT)
         axes.set_yticks(range(len(algorithms)), [a.upper() for a in algorithms])
         axes.set_ylim(len(algorithms) - 0.5, -0.5)
         axes.tick_params(axis="y", length=0)
@@ -147,7 +147,7 @@ def figure(report: Mapping[str, Any]) -> Figure:
         for (kind, actions), look in looks.items()
         if kind in measured
     }
-    if any(_paper_expert(environment) is not None for environment in environments):
+    if experts:
         shown["SAC trained on the environment (paper)"] = _EXPERT
     agents = " or ".join(str(n) for n in sorted({entry["agents"] for entry in entries}))
     plotting.figure_title(
@@ -164,8 +164,13 @@ _EXPERT: dict[str, Any] = {"color": plotting.BLACK, "linewidth": 1.4, "linestyle
 def _paper_expert(name: str) -> float | None:
     """What the paper's SAC agents earn in the environment itself, by label."""
     environment, _, physics = name.removesuffix(")").partition(" (")
-    expert = environment_spec(environment).reference(physics or None, "sac")
-    return None if expert is None else expert.value
+    return paper_return(environment, "sac", physics or None)
+
+
+def paper_return(environment: str, algorithm: str, backend: str | None = None) -> float | None:
+    """What the paper's agents earn that were trained in the environment itself."""
+    found = environment_spec(environment).reference(backend, algorithm)
+    return None if found is None else found.value
 
 
 def _panel_title(environment: str, entries: Sequence[Mapping[str, Any]]) -> str:

@@ -3,6 +3,7 @@ import pytest
 
 from experiments import brax_training as experiment
 from experiments.brax_training import OURS, PUBLISHED, task
+from scb import measurement
 
 NAMES = (task(OURS, "hopper", "spring"), task(PUBLISHED, "hopper", "generalized"))
 
@@ -30,7 +31,7 @@ def test_steps_to_match_are_of_the_first_evaluation_that_reaches_the_level():
     assert experiment.steps_to_match(found, 8.0) == [20, 10, None]
 
 
-def test_agents_are_followed_in_a_bandit_and_in_an_environment(small_agents):
+def test_agents_are_followed_in_a_bandit_and_in_an_environment(tmp_path, monkeypatch, small_agents):
     # Pendulum stands in for Brax, whose physics compile for long.
     plan = {
         "published": None,
@@ -42,6 +43,7 @@ def test_agents_are_followed_in_a_bandit_and_in_an_environment(small_agents):
         "environment_steps": 32,
         "episodes": 2,
         "points": 2,
+        "rows": tmp_path / "kept.jsonl",
     }
     found, saved = {}, []
     experiment.measure(plan, found, lambda: saved.append(1))
@@ -51,6 +53,15 @@ def test_agents_are_followed_in_a_bandit_and_in_an_environment(small_agents):
     assert np.shape(in_bandit["returns"]) == (2, 2) and np.shape(own["returns"]) == (2, 3)
     experiment.measure(plan, found, lambda: saved.append(1))
     assert len(saved) == 2
+
+    # As if killed before the report had them: their agents are kept, and not trained again.
+    def forbidden(*arguments):
+        raise AssertionError("trained")
+
+    monkeypatch.setattr(measurement, "_program_of", forbidden)
+    lost = found["environments"]["Pendulum-v1"].pop("ppo")
+    experiment.measure(plan, found, lambda: None)
+    assert found["environments"]["Pendulum-v1"]["ppo"]["returns"] == lost["returns"]
 
 
 def test_published_bandits_that_are_in_the_report_need_no_folder(monkeypatch):
