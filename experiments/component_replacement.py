@@ -58,9 +58,6 @@ def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None
         for number in range(plan["experts"])
         if len(found.get(str(number), {}).get("returns", ())) < len(REPLACED)
     ]
-    if not unfinished:
-        return
-
     env, env_params = scb.make(ENVIRONMENT)
     space = env.action_space(env_params)
     bandit, digest = bandit_of(ENVIRONMENT)

@@ -21,7 +21,7 @@ from matplotlib.ticker import EngFormatter, MaxNLocator
 
 from experiments.harness import Experiment, Save
 from experiments.rendering import plain
-from experiments.searches import judgements
+from experiments.searches import judgements, read_log
 from experiments.zoo_table_page import TARGETS, label, rank
 from scb import plotting
 from scb.discovery import DiscoveryConfig
@@ -86,12 +86,10 @@ def _run(folder: Path) -> dict[str, Any] | str:
         return "it searches for no bandit but for a synthetic MDP"
     start = {"expert": "warm", "random": "random"}[config.get("init") or DiscoveryConfig.init]
     environment = config.get("environment") or DiscoveryConfig.environment
-    rows, seconds = _lines(folder / "metrics.jsonl"), _lines(folder / "timing.jsonl")
-    number = min(len(rows), len(seconds))  # a run that goes on writes one before the other
-    rows, warm = rows[:number], _warm_start(folder, environment)
+    rows, seconds = read_log(folder)
+    warm = _warm_start(folder, environment)
     # Before every generation, and after the last.
-    spent = [x["seconds"] / 60 for x in seconds[:number]]
-    minutes = list(accumulate(spent, initial=warm["minutes"] or 0.0))
+    minutes = list(accumulate([x / 60 for x in seconds], initial=warm["minutes"] or 0.0))
     steps = [x + (warm["steps"] or 0) for x in (0, *(row["steps/total"] for row in rows))]
     judged = [(g, x) for g, x in judgements(rows) if x["fitness"] is not None]
     points = [[g, round(minutes[g], 3), steps[g], _judged(x)] for g, x in judged]
@@ -107,7 +105,7 @@ def _run(folder: Path) -> dict[str, Any] | str:
         "start": start,
         "seed": evolution.get("seed") or 0,
         "settings": {name: config.get(name, evolution.get(name)) for name in SETTINGS},
-        "generations": number,
+        "generations": len(rows),
         "planned_generations": evolution.get("generations", evolution.get("num_generations")),
         "minutes": round(minutes[-1], 3),
         "steps": {
@@ -148,20 +146,6 @@ def _warm_start(folder: Path, environment: str) -> dict[str, Any]:
         "minutes": None if seconds is None else seconds / 60,
         "machine": cost.get("machine"),
     }
-
-
-def _lines(path: Path) -> list[dict[str, Any]]:
-    """The JSON lines up to the first that is cut, which a run in progress may just be writing."""
-    rows: list[dict[str, Any]] = []
-    for line in path.read_text().splitlines() if path.exists() else []:
-        try:
-            row = json.loads(line)
-        except json.JSONDecodeError:
-            break
-        if row.get("generation") != len(rows):
-            break
-        rows.append(row)
-    return rows
 
 
 def _place(run: Mapping[str, Any]) -> tuple[Any, ...]:

@@ -5,7 +5,7 @@
 `scb explain NAME` shows the same of any bandit.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax.numpy as jnp
@@ -96,16 +96,13 @@ def claims(report: Report) -> list[Claim]:
     def shares(environment: str, kind: str) -> list[dict[str, Any]]:
         return [x for name, x in environments[environment]["importance"].items() if kind in name]
 
-    def most(end: str) -> float:
-        return float(max(x[end] for x in shares("Acrobot-v1", "angle")))
-
-    def least(end: str) -> float:
-        return float(min(x[end] for x in shares("Acrobot-v1", "velocity")))
+    def extreme(kind: str, pick: Callable[..., float]) -> list[float]:
+        found = shares("Acrobot-v1", kind)
+        return [float(pick(x[end] for x in found)) for end in ("value", "low", "high")]
 
     # The widest interval that those of the entries allow.
-    more = Estimate(
-        least("value") - most("value"), least("low") - most("high"), least("high") - most("low"), 0
-    )
+    speed, angle = extreme("velocity", min), extreme("angle", max)
+    more = Estimate(speed[0] - angle[0], speed[1] - angle[2], speed[2] - angle[1], 0)
     found = [
         Claim(
             "Acrobot's angular velocities cause more of the reward's variance than its angles", more

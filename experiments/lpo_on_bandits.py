@@ -10,21 +10,19 @@ resumed; what --out holds already is not measured again, so the same command con
 one. `--only-render` makes page and figure from --out.
 """
 
-import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, LogLocator, NullFormatter, StrMethodFormatter
 
 from experiments.claims import OF_THE_WAY, Claim, of_the_way
 from experiments.harness import Experiment, Preset, Report, Save
-from experiments.searches import judgements, objective_of_run
+from experiments.searches import judgements, objective_of_run, read_log
 from lpo.comparison import compare
 from lpo.objectives import Objective, load_objective
 from scb import plotting
@@ -191,20 +189,16 @@ def draw(report: Mapping[str, Any]) -> Figure:
     panels[0].set_ylabel("return on Pendulum of agents\ntrained with the search's mean")
     below = bottom.subplots(1, len(report["evaluations"]), squeeze=False)[0]
     for panel, (name, table) in zip(below, report["evaluations"].items(), strict=True):
-        _dots(panel, table)
+        for position, (objective, finals) in enumerate(table["finals"].items()):
+            color = plotting.VERMILLION if objective.startswith("LPO") else plotting.BLUE
+            pooled = pooled_estimate(finals)
+            plotting.estimate_row(panel, position, np.ravel(finals), pooled, color)
+        panel.set_yticks(range(len(table["finals"])), list(table["finals"]))
+        panel.invert_yaxis()
+        panel.set_xlabel("final return")
         number = "(iv)" if name.startswith("Hopper") else "(iii)"
         panel.set_title(f"{number} {name}".replace(", ", ",\n", 1), fontsize=9)
     return figure
-
-
-def _dots(axes: Axes, table: Mapping[str, Any]) -> None:
-    for position, (objective, finals) in enumerate(table["finals"].items()):
-        learned = objective.startswith("LPO")
-        color = plotting.VERMILLION if learned else plotting.BLUE
-        plotting.estimate_row(axes, position, np.ravel(finals), pooled_estimate(finals), color)
-    axes.set_yticks(range(len(table["finals"])), list(table["finals"]))
-    axes.invert_yaxis()
-    axes.set_xlabel("final return")
 
 
 def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None:
@@ -212,20 +206,27 @@ def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None
     runs = Path(plan["runs"]) / report["preset"]
     found = report.setdefault("searches", {})
     evaluations = report.setdefault("evaluations", {})
-    groups: dict[str, list[_Learned]] = {}
+
+    @cache
+    def learned(source: str, seed: int) -> Objective:
+        """A search's objective, loaded or searched for when it is asked for."""
+        settings = {"seed": seed, **plan["searches"][source]["settings"]}
+        objective = objective_of_run(settings, runs / f"{source}-{seed}")
+        return replace(objective, name=f"LPO ({source}) {seed}")
+
+    groups: dict[str, list[Callable[[], Objective]]] = {}
     for source, search in plan["searches"].items():
-        groups[f"LPO ({source})"] = group = [
-            _Learned(source, seed, search["settings"], runs) for seed in range(search["seeds"])
-        ]
+        seeds = range(search["seeds"])
+        groups[f"LPO ({source})"] = [partial(learned, source, seed) for seed in seeds]
         entry = found.setdefault(source, {"settings": search["settings"], "curves": []})
         if entry["settings"] != search["settings"]:
             raise UserError("the report is of other searches: choose another --out.")
-        for learned in group[len(entry["curves"]) :]:
-            cost = learned.objective.metadata["cost"]
+        for seed in seeds[len(entry["curves"]) :]:
+            cost = learned(source, seed).metadata["cost"]
             # A run folder of before November 2026 has the second name.
             names = ("environment_steps_judgements", "environment_steps_validation")
             entry["steps_to_judge"] = next(cost[name] for name in names if name in cost)
-            entry["curves"].append(_curve_of(learned.folder))
+            entry["curves"].append(search_curve(*read_log(runs / f"{source}-{seed}")))
             save()
     for label, scale in SCALES.items():
         table = evaluations.setdefault(f"Pendulum, {label}", {})
@@ -251,33 +252,6 @@ def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None
     save()
 
 
-@dataclass(frozen=True)
-class _Learned:
-    """A search's objective, loaded or searched for when it is asked for."""
-
-    source: str
-    seed: int
-    settings: Mapping[str, Any]
-    runs: Path
-
-    @property
-    def folder(self) -> Path:
-        return self.runs / f"{self.source}-{self.seed}"
-
-    @cached_property
-    def objective(self) -> Objective:
-        found = objective_of_run({"seed": self.seed, **self.settings}, self.folder)
-        return replace(found, name=f"LPO ({self.source}) {self.seed}")
-
-
-def _curve_of(folder: Path) -> dict[str, Any]:
-    lines = [
-        [json.loads(line) for line in (folder / name).read_text().splitlines()]
-        for name in ("metrics.jsonl", "timing.jsonl")
-    ]
-    return search_curve(lines[0], [line["seconds"] for line in lines[1]])
-
-
 def _tuned_clip(spec: AgentSpec, agents: int) -> dict[str, Any]:
     """{"tuned": the best of CLIPS on agents that report nothing, "sweep": what each earned}."""
     curves = compare(
@@ -295,7 +269,7 @@ def _judge(
     table: dict[str, Any],
     environment: str,
     tuned: str,
-    groups: Mapping[str, Sequence[_Learned]],
+    groups: Mapping[str, Sequence[Callable[[], Objective]]],
     agents: int,
     spec: AgentSpec,
     backend: str | None = None,
@@ -305,7 +279,7 @@ def _judge(
     closed_forms = ("ppo", tuned, "dpo")
     lacking = {name: [] if name in finals else [load_objective(name)] for name in closed_forms}
     lacking |= {
-        name: [learned.objective for learned in group[len(finals.get(name, ())) :]]
+        name: [learned() for learned in group[len(finals.get(name, ())) :]]
         for name, group in groups.items()
     }
     if not any(lacking.values()):

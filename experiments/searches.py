@@ -1,5 +1,6 @@
 """Discoveries that experiments compare: each in a run folder of its own, so that a killed one goes on."""
 
+import json
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -104,6 +105,26 @@ def searched_curve(config: DiscoveryConfig, folder: str | Path) -> dict[str, Any
     """`curve` of a search, and its "seconds"; searched first where that has not ended yet."""
     _, outcome = search(config, folder)
     return {**curve(outcome.metrics), "seconds": round(outcome.seconds, 1)}
+
+
+def read_log(folder: Path) -> tuple[list[dict[str, Any]], list[float]]:
+    """What a run folder's log says of each generation, and its seconds; of a run in progress up to a cut line."""
+    metrics, timing = _lines(folder / "metrics.jsonl"), _lines(folder / "timing.jsonl")
+    number = min(len(metrics), len(timing))  # one is written before the other
+    return metrics[:number], [line["seconds"] for line in timing[:number]]
+
+
+def _lines(path: Path) -> list[dict[str, Any]]:
+    rows: list[dict[str, Any]] = []
+    for line in path.read_text().splitlines() if path.exists() else []:
+        try:
+            row = json.loads(line)
+        except json.JSONDecodeError:
+            break
+        if row.get("generation") != len(rows):
+            break
+        rows.append(row)
+    return rows
 
 
 def judgements(metrics: Sequence[Mapping[str, Any]]) -> list[tuple[int, dict[str, Any]]]:

@@ -122,7 +122,8 @@ def tiny(monkeypatch):
         asked.append(folder.name)
         folder.mkdir(parents=True)
         (folder / "metrics.jsonl").write_text("\n".join(json.dumps(x) for x in METRICS))
-        (folder / "timing.jsonl").write_text("\n".join(['{"seconds": 2.0}'] * len(METRICS)))
+        timing = [json.dumps({"generation": i, "seconds": 2.0}) for i in range(len(METRICS))]
+        (folder / "timing.jsonl").write_text("\n".join(timing))
         return replace(
             load_objective("dpo"), metadata={"cost": {"environment_steps_validation": 7}}
         )
