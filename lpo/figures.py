@@ -14,7 +14,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, MaxNLocator, NullFormatter
-from numpy.typing import NDArray
 
 from lpo.inner_loop import MetaTrainingConfig
 from scb.environments.registry import environment_spec
@@ -31,6 +30,7 @@ from scb.plotting import (
     WIDTH,
     Look,
     estimate_curve,
+    estimate_row,
     figure_style,
     figure_title,
     legend_below,
@@ -89,7 +89,11 @@ def meta_training_curve(metrics: list[dict[str, Any]], config: MetaTrainingConfi
         )
     environment = ", ".join(config.judged_in)
     generations = np.array([row["generation"] for row in metrics])
-    mean, std, best = (_column(metrics, f"fitness/{k}") for k in ("mean", "std", "max"))
+    # A log line holds None where a number was not finite, which becomes NaN.
+    mean, std, best = (
+        np.array([row.get(f"fitness/{kind}") for row in metrics], float)
+        for kind in ("mean", "std", "max")
+    )
     judged = [
         (row["generation"], row["mean/fitness"])
         for row in metrics
@@ -248,12 +252,9 @@ def learning_curves(curves: "Sequence[LearningCurves]") -> Figure:
         during = "no interval from one seed" if counts == [1] else "95 % intervals as bands"
         training.set_title(f"During training: {during}", fontsize=10, weight="normal")
         training.margins(x=0.02)
-        final.set_xticks(range(len(curves)), [curve.objective for curve in curves])
-        if len(curves) > 3 or max(len(curve.objective) for curve in curves) > 10:
-            final.tick_params(axis="x", rotation=30)
-            for label in final.get_xticklabels():
-                label.set_horizontalalignment("right")
-                label.set_rotation_mode("anchor")
+        crowded = len(curves) > 3 or max(len(curve.objective) for curve in curves) > 10
+        slanted = {"rotation": 30, "ha": "right", "rotation_mode": "anchor"} if crowded else {}
+        final.set_xticks(range(len(curves)), [curve.objective for curve in curves], **slanted)
         final.set_xlim(-0.6, len(curves) - 0.4)
         final.grid(axis="x", visible=False)
         final.set_ylabel("final return")
@@ -273,27 +274,18 @@ def suite_scores(scores: "SuiteScores") -> Figure:
     """
     style = looks(scores.objectives)
     thresholds = np.linspace(-0.1, 1.3, 141)
-    share, low, high = scores.profile(thresholds)
+    profiles, aggregates = scores.profile(thresholds), scores.aggregate()
     with figure_style():
         figure = Figure(figsize=(WIDTH, 4.0))
         profile, aggregate = figure.subplots(1, 2, width_ratios=(2.0, 1))
         for i, name in enumerate(scores.objectives):
             look = style[name]
-            profile.plot(
-                thresholds, share[i], color=look.color, linestyle=look.linestyle, label=name
-            )
-            profile.fill_between(
-                thresholds, low[i], high[i], color=look.color, alpha=0.18, linewidth=0
-            )
+            estimate_curve(profile, thresholds, profiles[i], look.color, look.linestyle, name)
+            estimate_row(aggregate, i, np.empty(0), aggregates[i], look.color)
         profile.set_xlabel("normalised score \u03c4 (0: random actions, 1: reference)")
         profile.set_ylabel("share of runs with a score above \u03c4")
         profile.set_ylim(0.0, 1.0)
         profile.set_title("Performance profiles: 95 % bands", fontsize=10, weight="normal")
-        for i, (name, found) in enumerate(zip(scores.objectives, scores.aggregate(), strict=True)):
-            color = style[name].color
-            ends = [found.value if end is None else end for end in (found.low, found.high)]
-            aggregate.plot(ends, [i, i], color=color, linewidth=3)
-            aggregate.plot([found.value], [i], style[name].marker, color=color, markersize=7)
         aggregate.set_yticks(range(len(scores.objectives)), scores.objectives)
         aggregate.invert_yaxis()
         aggregate.grid(axis="y", visible=False)
@@ -385,11 +377,6 @@ def _protocol(curve: "LearningCurves") -> str:
     scale = curve.policy_output_scale
     start = "" if scale == 1.0 else f", policy's last layer x {scale:g}"
     return f"{curve.environment}{physics}{start}: {actions} actions, {curve.episodes} episodes"
-
-
-def _column(metrics: list[dict[str, Any]], name: str) -> NDArray[np.floating]:
-    # A log line holds None where a number was not finite.
-    return np.array([np.nan if row.get(name) is None else row[name] for row in metrics], float)
 
 
 def _count(steps: float) -> str:

@@ -20,6 +20,7 @@ from scb.statistics import Estimate, iqm, normalized_score
 
 # Resampling is over seeds within environments, on [objectives, environments, seeds].
 RESAMPLES = 2000
+BEST_HERE = "the best objective here"
 
 
 def suites() -> dict[str, tuple[str, ...]]:
@@ -65,34 +66,34 @@ class SuiteScores:
         return self._estimates(1.0)
 
     def _estimates(self, times_reference: float) -> list[Estimate]:
-        generator = np.random.default_rng(0)
-        drawn = [_aggregate(_draw(self.scores, generator)) for _ in range(RESAMPLES)]
-        # Resampled or not, alike.
-        found = np.stack([_aggregate(self.scores), *drawn])
-        found = found - times_reference * found[:, :1]
-        size, ends = int(self.scores[0].size), np.percentile(found[1:], [2.5, 97.5], axis=0)
-        if self.scores.shape[2] == 1:  # one seed says nothing of its spread
-            return [Estimate(float(v), None, None, size) for v in found[0]]
-        return [
-            Estimate(float(v), float(low), float(high), size)
-            for v, low, high in zip(found[0], *ends, strict=True)
-        ]
+        def aggregate(runs: np.ndarray) -> np.ndarray:
+            return np.asarray(iqm(self._scaled(runs).reshape(len(runs), -1), axis=1))
 
-    def profile(self, thresholds: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        found = _with_resamples(self.scores, aggregate, RESAMPLES)
+        return _intervals(found - times_reference * found[:, :1], self.scores[0])
+
+    def _scaled(self, runs: np.ndarray) -> np.ndarray:
+        """Runs, where the best objective's are 1 by the best of these: which one that is is drawn with the seeds."""
+        own = np.array([source == BEST_HERE for source in self.sources])
+        best = iqm(runs, axis=2).max(axis=0)
+        # Where none of a resample beats random actions, the scale of all runs stays.
+        return runs / np.where(own & (best > 0), best, 1.0)[:, None]
+
+    def profile(self, thresholds: np.ndarray) -> list[list[Estimate]]:
         """Performance profiles: the share of runs above each threshold, environments weighted alike.
 
         Args:
           thresholds: [T] normalised scores.
 
         Returns:
-          ([objectives, T] shares, and the low and high ends of their 95 % intervals).
+          For every objective the shares with their 95 % intervals.
         """
-        above = (self.scores[..., None] > thresholds).astype(np.float64)
-        share = above.mean(axis=(1, 2))
-        generator = np.random.default_rng(0)
-        drawn = np.stack([_draw(above, generator).mean(axis=(1, 2)) for _ in range(RESAMPLES // 4)])
-        low, high = np.percentile(drawn, [2.5, 97.5], axis=0)
-        return share, low, high
+
+        def share(runs: np.ndarray) -> np.ndarray:
+            return np.mean(self._scaled(runs)[..., None] > thresholds, axis=(1, 2))
+
+        found = _with_resamples(self.scores, share, RESAMPLES // 4)
+        return [_intervals(found[:, i], self.scores[0]) for i in range(len(self.objectives))]
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON."""
@@ -111,16 +112,27 @@ class SuiteScores:
         }
 
 
-def _draw(scores: np.ndarray, generator: np.random.Generator) -> np.ndarray:
-    """The same shape, seeds drawn anew within every environment, alike for all objectives."""
+def _with_resamples(
+    scores: np.ndarray, statistic: Callable[[np.ndarray], np.ndarray], number: int
+) -> np.ndarray:
+    """[1 + number, ...] a statistic of the scores, and of as many with seeds drawn anew within every environment.
+
+    They are drawn alike for all objectives.
+    """
     _, environments, seeds = scores.shape[:3]
-    picked = generator.integers(0, seeds, (environments, seeds))
-    return scores[:, np.arange(environments)[:, None], picked]
+    generator, every = np.random.default_rng(0), np.arange(environments)[:, None]
+    picked = (generator.integers(0, seeds, (environments, seeds)) for _ in range(number))
+    return np.stack([statistic(scores), *(statistic(scores[:, every, p]) for p in picked)])
 
 
-def _aggregate(scores: np.ndarray) -> np.ndarray:
-    """[objectives] interquartile means over all runs."""
-    return np.asarray(iqm(scores.reshape(scores.shape[0], -1), axis=1))
+def _intervals(found: np.ndarray, runs: np.ndarray) -> list[Estimate]:
+    """[1 + resamples, N] -> N estimates of [environments, seeds] runs, without an interval where there is one seed."""
+    ends = np.percentile(found[1:], [2.5, 97.5], axis=0)
+    known = runs.shape[1] > 1
+    return [
+        Estimate(float(v), float(low) if known else None, float(high) if known else None, runs.size)
+        for v, low, high in zip(found[0], *ends, strict=True)
+    ]
 
 
 def suite_scores(comparisons: Mapping[str, Comparison], random: Mapping[str, float]) -> SuiteScores:
@@ -159,7 +171,7 @@ def reference_of(name: str, comparison: Comparison) -> tuple[float, str]:
     if reference is not None:
         return reference.value, reference.source
     best = max(float(iqm(curve.final)) for curve in comparison.curves)
-    return best, "the best objective here"
+    return best, BEST_HERE
 
 
 def run_suite(

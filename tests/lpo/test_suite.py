@@ -60,6 +60,20 @@ def test_one_seed_has_no_interval():
     assert {(x.low, x.high) for x in (*one.aggregate(), *one.differences())} == {(None, None)}
 
 
+def test_a_reference_that_is_chosen_among_the_objectives_is_chosen_anew_in_every_resample():
+    # Alone, an objective is its own reference: 1 whatever the seeds, and so without any spread.
+    catch = "Catch-bsuite"
+    alone = suite_scores({catch: comparison(catch, ppo=[2.0, 6.0, 7.0])}, {catch: 0.0})
+    (found,) = alone.aggregate()
+    assert (found.value, found.low, found.high) == pytest.approx((1.0, 1.0, 1.0))
+    # Under a published one it has some: (1 + 1 + 0.5) / 3 of CartPole's 500 over 20.
+    published = suite_scores(
+        {"CartPole-v1": comparison("CartPole-v1", ppo=[500.0, 500.0, 260.0])}, {"CartPole-v1": 20.0}
+    )
+    (found,) = published.aggregate()
+    assert found.value == pytest.approx(2.5 / 3) and found.low < found.value < found.high
+
+
 def test_published_brax_returns_are_of_one_physics():
     here = [curves("hopper", "ppo", [600.0, 700.0], backend="spring")]
     there = [curves("hopper", "ppo", [600.0, 700.0], backend="generalized")]
@@ -124,9 +138,10 @@ def test_aggregates_are_interquartile_means_and_differences_are_paired():
 
 def test_a_profile_is_the_share_of_runs_above_a_threshold():
     scores = scores_of([[[0.0, 0.4], [0.6, 1.0]], [[1.0, 1.0], [1.0, 1.0]]])
-    share, low, high = scores.profile(np.array([-0.1, 0.5, 0.9, 1.0]))
-    np.testing.assert_allclose(share, [[1.0, 0.5, 0.25, 0.0], [1.0, 1.0, 1.0, 0.0]])
-    assert np.all(low <= share) and np.all(share <= high)
+    first, second = scores.profile(np.array([-0.1, 0.5, 0.9, 1.0]))
+    assert [found.value for found in first] == [1.0, 0.5, 0.25, 0.0]
+    assert [found.value for found in second] == [1.0, 1.0, 1.0, 0.0]
+    assert all(found.low <= found.value <= found.high for found in (*first, *second))
 
 
 @pytest.fixture
