@@ -167,8 +167,7 @@ def measure(options: Options, report: dict[str, Any], save: Save) -> None:
         regimes: list[Regime],
         seed: int,
         objectives: list[Objective] = family,
-        scale: float | None = None,
-        steps: int | None = None,
+        **more: Any,
     ) -> None:
         def keep(measured: dict[str, Any]) -> None:
             report["stages"][name] = {"role": role, **measured}
@@ -180,8 +179,7 @@ def measure(options: Options, report: dict[str, Any], save: Save) -> None:
             objectives,
             environment,
             list(range(seed, seed + options.agents)),
-            steps=steps,
-            policy_output_scale=scale,
+            **more,
             tell=lambda line: print(line, flush=True),
             done={k: v for k, v in stored.items() if k != "role"},
             keep=keep,
@@ -190,8 +188,8 @@ def measure(options: Options, report: dict[str, Any], save: Save) -> None:
     variations = [Regime(PENDULUM, **variation) for variation in VARIATIONS]
     stage("pendulum", "Pendulum-v1", "the choice", variations, FIRST_SEED)
     small = [replace(regime, policy_output_scale=0.01) for regime in variations]
-    role = "the choice, last layer of the policy times 0.01"
-    stage("pendulum_small_last_layer", "Pendulum-v1", role, small, FIRST_SEED, scale=0.01)
+    name, role = CHOICES[1], "the choice, last layer of the policy times 0.01"
+    stage(name, "Pendulum-v1", role, small, FIRST_SEED, policy_output_scale=0.01)
     if not options.skip_confirmation:
         regimes = [Regime(PENDULUM, **variation) for variation in CONFIRMED]
         role = "the confirmation, objectives that are not in the family"

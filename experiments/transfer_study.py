@@ -48,9 +48,6 @@ class Evaluation:
     seeds: int = 20
     first_seed: int = REPORTING[11_000]
 
-    def seed_list(self) -> list[int]:
-        return list(range(self.first_seed, self.first_seed + self.seeds))
-
 
 EVALUATIONS = (
     Evaluation("Pendulum", "Pendulum-v1"),
@@ -193,21 +190,6 @@ def measure(options: Options, report: dict[str, Any], save: Save) -> None:
     report |= {"searches": searches, "evaluations": [asdict(e) for e in EVALUATIONS]}
     entries = report.setdefault("objectives", {})
 
-    def judged(name: str, evaluation: Evaluation, objectives: Mapping[str, Any]) -> None:
-        comparison = compare(
-            evaluation.environment,
-            list(objectives.values()),
-            evaluation.seed_list(),
-            spec=ppo_spec(evaluation.environment, evaluation.steps, evaluation.policy_output_scale),
-            backend=evaluation.backend,
-            points=1,
-        )
-        returns = entries[name].setdefault("returns", {}).setdefault(evaluation.name, {})
-        for seed, curves in zip(objectives, comparison.curves, strict=True):
-            returns[seed] = np.round(curves.final, 2).tolist()
-            print(f"{name} | {evaluation.name} | {seed} | {estimate(curves.final)}", flush=True)
-        save()
-
     for name in (*REFERENCES, *options.variations):
         entry = entries.setdefault(name, {})
         if name in REFERENCES:
@@ -216,11 +198,23 @@ def measure(options: Options, report: dict[str, Any], save: Save) -> None:
             objectives = {
                 str(seed): _learn(options, name, seed, entry) for seed in options.meta_seeds
             }
-        for evaluation in EVALUATIONS:
-            known = entry.get("returns", {}).get(evaluation.name, {})
-            missing = {seed: x for seed, x in objectives.items() if seed not in known}
-            if missing:
-                judged(name, evaluation, missing)
+        for at in EVALUATIONS:
+            returns = entry.setdefault("returns", {}).setdefault(at.name, {})
+            missing = {seed: x for seed, x in objectives.items() if seed not in returns}
+            if not missing:
+                continue
+            found = compare(
+                at.environment,
+                list(missing.values()),
+                list(range(at.first_seed, at.first_seed + at.seeds)),
+                spec=ppo_spec(at.environment, at.steps, at.policy_output_scale),
+                backend=at.backend,
+                points=1,
+            )
+            for seed, curves in zip(missing, found.curves, strict=True):
+                returns[seed] = np.round(curves.final, 2).tolist()
+                print(f"{name} | {at.name} | {seed} | {estimate(curves.final)}", flush=True)
+            save()
 
 
 def _learn(options: Options, name: str, seed: int, entry: dict[str, Any]) -> Any:
