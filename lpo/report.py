@@ -125,19 +125,6 @@ def _verdict(difference: Mapping[str, Any]) -> Verdict:
     return "worse" if difference["high"] < 0 else "undecided"
 
 
-def _columns(reference: str) -> dict[str, str]:
-    return {
-        "objective": "objective",
-        "final": "final return, IQM [95 %]",
-        "area": "area under curve, IQM [95 %]",
-        "difference": f"difference to {reference} [95 %]",
-        "n": "seeds",
-        "episodes": "episodes",
-        "backend": "physics",
-        "actions": "actions",
-    }
-
-
 def _rows(comparison: Mapping[str, Any], learned: str | None) -> list[dict[str, Any]]:
     rows = []
     for curve in comparison["curves"]:
@@ -219,21 +206,19 @@ def _embed(path: Path) -> dict[str, Any]:
     return {"source": f"data:image/png;base64,{encoded}", "width": width, "height": height}
 
 
-def _certificate_rows(certificate: Mapping[str, Any]) -> list[dict[str, Any]]:
-    def row(condition: str, measured: str, required: str, holds: bool | None) -> dict[str, Any]:
-        return {"condition": condition, "measured": measured, "required": required, "holds": holds}
-
+def _certificate_rows(certificate: Mapping[str, Any]) -> list[tuple[str, str, str, bool | None]]:
+    """Each a condition, what was measured, what is required, and whether it holds."""
     minimum, value = certificate["minimum"], certificate["value_at_one"]
     gradient, finite = certificate["gradient_at_one"], certificate["finite"]
     near, further = certificate["slope_at_0_001"], certificate["slope_at_0_01"]
     return [
-        row("smallest penalty f", f"{minimum:.3g}", "≥ 0", minimum >= 0),
-        row("largest |f| at ratio 1", f"{value:.3g}", "0", value == 0),
-        row("largest |df/dr| at ratio 1", f"{gradient:.3g}", "0", gradient == 0),
-        row("finite everywhere", "yes" if finite else "no", "yes", bool(finite)),
-        row("largest |df/dr| at |r − 1| = 0.001", f"{near:.3g}", "no condition", None),
-        row("largest |df/dr| at |r − 1| = 0.01", f"{further:.3g}", "no condition", None),
-        row(
+        ("smallest penalty f", f"{minimum:.3g}", "≥ 0", minimum >= 0),
+        ("largest |f| at ratio 1", f"{value:.3g}", "0", value == 0),
+        ("largest |df/dr| at ratio 1", f"{gradient:.3g}", "0", gradient == 0),
+        ("finite everywhere", "yes" if finite else "no", "yes", bool(finite)),
+        ("largest |df/dr| at |r − 1| = 0.001", f"{near:.3g}", "no condition", None),
+        ("largest |df/dr| at |r − 1| = 0.01", f"{further:.3g}", "no condition", None),
+        (
             "kink: mean rise of f around ratio 1",
             f"{certificate['kink']:.3g}",
             f"≤ {LARGEST_KINK}, or none at |r − 1| = 0.001",
@@ -267,7 +252,7 @@ def _comparison(name: str, comparison: Mapping[str, Any], learned: str) -> dict[
     curves = comparison["curves"]
     return {
         "name": name,
-        "columns": _columns(comparison["reference"]),
+        "reference": comparison["reference"],
         "rows": _rows(comparison, learned),
         "seeds": _seeds(curves[0]["seeds"]),
         "steps": thousands(max(curve["steps"][-1] for curve in curves)),
