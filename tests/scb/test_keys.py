@@ -17,6 +17,7 @@ from scb.discovery import DiscoveryConfig, discover, judge
 from scb.environments.synthetic import BanditConfig
 from scb.evolution import EvolutionConfig
 from scb.keys import key_at, named_key, root_key, split_key
+from scb.measurement import Place
 from scb.seeds import validation
 from scb.warm_start import WarmStartConfig
 from tests.recording import recorded
@@ -117,7 +118,8 @@ def test_a_discovery_from_a_warm_start_and_its_judgement_use_every_key_at_one_pl
     config = replace(DISCOVERY, init="expert", reward_std=1.0, warm_start=warm_start)
     with recorded() as record:
         problem, outcome = discover(config, quiet=True)
-        judge(problem.trainings["ppo"], outcome.mean, validation()[0], 2, 1)
+        place, weights = Place.named("CartPole-v1"), outcome.mean
+        judge(problem.specs["ppo"], problem.bandit, weights, place, validation()[0], 2, 1)
     assert record.draws() > 1000
     assert record.seeds == {0, 30_000}
     assert record.shared() == []
