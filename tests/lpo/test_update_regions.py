@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from matplotlib.collections import QuadMesh
 
-from experiments.understanding import words
+from experiments.rendering import ENVIRONMENT
 from lpo import drift_figures
 from lpo.drifts import LearnedDrift
 from lpo.objectives import Objective, load_objective
@@ -181,6 +181,7 @@ def test_the_figure_has_a_row_for_every_fraction_of_a_temporal_drift():
 
 
 def test_sentences_say_the_numbers():
+    words = ENVIRONMENT.get_template("understanding_words.j2").module.words
     said = words(analyze(load_objective("ppo")).as_dict())
     assert "this one stops everywhere, whatever the advantage's sign." in said
     # 1 - 0.3538, by the arithmetic above.
