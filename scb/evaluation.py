@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from gymnax.environments import environment
 from jax.typing import ArrayLike
 
+from scb.agents.normalization import RunningStatistics, update_statistics
 from scb.keys import key_at, split_key
 
 Policy = Callable[
@@ -18,6 +19,7 @@ Policy = Callable[
 class Episodes(NamedTuple):
     returns: jax.Array  # [E] undiscounted sum of rewards
     lengths: jax.Array  # [E] steps
+    observations: RunningStatistics | None = None  # of what the policy saw, where asked for
 
 
 def evaluate(
@@ -27,6 +29,7 @@ def evaluate(
     key: jax.Array,
     num_episodes: int,
     horizon: ArrayLike | None = None,
+    moments: bool = False,
 ) -> Episodes:
     """Runs `num_episodes` episodes side by side, until the last has ended.
 
@@ -38,6 +41,7 @@ def evaluate(
       num_episodes: E, static.
       horizon: steps after which an episode is cut even if the environment would go on; traced, so a
         curriculum does not recompile. None: the environment's own limit.
+      moments: whether to keep the mean and variance of the observations.
 
     Returns:
       Episodes of shape [E].
@@ -49,7 +53,9 @@ def evaluate(
     )
 
     def step(carry: Any) -> Any:
-        time, observation, state, active, returns, lengths = carry
+        time, observation, state, active, returns, lengths, seen = carry
+        if moments:
+            seen = update_statistics(seen, jnp.reshape(observation, (num_episodes, -1)), active)
         key_act, key_step = split_key(key_at(key_loop, time))
         action = jax.vmap(policy)(observation, split_key(key_act, num_episodes))
         # step_env, not step: a finished episode needs no reset, and its later rewards are masked.
@@ -60,7 +66,7 @@ def evaluate(
         returns = returns + jnp.where(active, jnp.reshape(reward, (num_episodes,)), 0.0)
         lengths = lengths + active
         active = active & ~(terminated | truncated)
-        return time + 1, observation, state, active, returns, lengths
+        return time + 1, observation, state, active, returns, lengths, seen
 
     start = (
         jnp.int32(0),
@@ -69,9 +75,10 @@ def evaluate(
         jnp.ones(num_episodes, bool),
         jnp.zeros(num_episodes),
         jnp.zeros(num_episodes, jnp.int32),
+        RunningStatistics.start(observation[0].size) if moments else None,
     )
     start = jax.tree.map(lambda x: jnp.asarray(x), start)
-    *_, returns, lengths = jax.lax.while_loop(
+    *_, returns, lengths, seen = jax.lax.while_loop(
         lambda carry: (carry[0] < limit) & jnp.any(carry[3]), step, start
     )
-    return Episodes(returns, lengths)
+    return Episodes(returns, lengths, seen)

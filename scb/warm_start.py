@@ -26,12 +26,16 @@ from scb.agents.spec import (
 )
 from scb.agents.tables import WARM_START
 from scb.curriculum import paper_curriculum
+from scb.environments.registry import environment_spec
 from scb.environments.synthetic import BanditParams, SyntheticBandit, Weights
 from scb.errors import UserError, at_least, one_of
 from scb.experts import Expert, PolicySearchConfig, evolve_expert, train_expert
 from scb.keys import split_key
+from scb.linear_expert import LinearSearchConfig, search_linear_expert
 
 CONSTRUCTIONS = ("advantage", "q", "action_distance")
+# What finds the experts that are no agents.
+SEARCHES = {"evolution": "evolution", "linear": "a linear search"}
 
 
 @dataclass(frozen=True)
@@ -42,12 +46,13 @@ class WarmStartConfig:
       construction: the reward's target. "advantage": (Q(s, a) - max_a Q(s, a)) / std; "q": (Q -
         mean) / std; "action_distance": -||a - a*|| (discrete: 1 where a = a*), a* the expert's mode
         action.
-      expert: the algorithm that finds it: one of the agents' ("ppo", "sac", ...), or "evolution" of a
-        small policy network. "auto" takes PPO where the environment has a setting of its own for
-        it, and evolution elsewhere.
+      expert: the algorithm that finds it: one of the agents' ("ppo", "sac", ...), "evolution" of a
+        small policy network, or "linear", augmented random search for a linear policy, which a bandit
+        holds better than a network. "auto" takes PPO where the environment has a setting of its own
+        for it, and evolution elsewhere.
       num_experts: agents trained on the environment; the best of them is the expert.
       expert_steps: environment steps of each; the environment's own setting where None.
-      expert_generations: of the evolution, where that finds the expert.
+      expert_generations: of the evolution or the linear search, where that finds the expert.
       min_spread: entries of the observation whose standard deviation is smaller are stretched about
         their mean until they have it, and the expert says what it does there; 0 for the states as
         they are. Agents learn little from an entry as small as a car's velocity. For
@@ -73,7 +78,7 @@ class WarmStartConfig:
 
     def __post_init__(self) -> None:
         one_of("warm-start construction", self.construction, CONSTRUCTIONS)
-        experts = ("auto", "evolution", *ALGORITHMS)
+        experts = ("auto", *SEARCHES, *ALGORITHMS)
         one_of("expert", self.expert, experts)
         at_least(0, self, "min_spread")
         if not 0 <= self.discount <= 1:
@@ -99,20 +104,23 @@ class ExpertDataset(NamedTuple):
 def expert_agent(
     name: str, space: spaces.Box | spaces.Discrete, config: WarmStartConfig
 ) -> AgentSpec | None:
-    """How the expert of an environment is trained; None where evolution finds it.
+    """How the expert of an environment is trained; None where a search finds it.
 
     Raises:
-      UserError: an algorithm that doesn't fit the action space, or steps that it can't be trained
-        for.
+      UserError: an expert that doesn't fit the action space, or steps that it can't be trained for.
     """
     algorithm = config.expert
     if algorithm == "auto":
         algorithm = "ppo" if has_values_for("ppo", name) else "evolution"
-    if algorithm == "evolution":
+    if algorithm == "linear" and isinstance(space, spaces.Discrete):
+        raise UserError(
+            f"a linear expert has continuous actions and {name} discrete ones: choose evolution, or an algorithm."
+        )
+    if algorithm in SEARCHES:
         if config.expert_steps is not None:
             raise UserError(
-                f"expert_steps is {config.expert_steps}, but evolution finds the expert of {name} and trains no "
-                "agent: leave it out, or choose an algorithm for the expert."
+                f"expert_steps is {config.expert_steps}, but {SEARCHES[algorithm]} finds the expert of {name} "
+                "and trains no agent: leave it out, or choose an algorithm for the expert."
             )
         return None
     check_algorithms([algorithm], kind_of_actions(space))
@@ -129,6 +137,12 @@ def find_expert(
 ) -> Expert:
     """An expert for an environment, by name as `scb.make` takes it."""
     spec = expert_agent(name, env.action_space(env_params), config)
+    if config.expert == "linear":
+        standing = environment_spec(name).standing_still() or 0.0
+        bonus = standing / env_params.max_steps_in_episode
+        return search_linear_expert(
+            env, env_params, key, LinearSearchConfig(config.expert_generations), bonus
+        )
     if spec is None:
         search = PolicySearchConfig()
         search = replace(

@@ -16,17 +16,38 @@ class RunningStatistics:
         return cls(count=jnp.float32(0.0), mean=jnp.zeros(size), squares=jnp.zeros(size))
 
 
-def update_statistics(statistics: RunningStatistics, batch: jax.Array) -> RunningStatistics:
-    """Adds a [B, O] batch of observations."""
-    size = batch.shape[0]
-    batch_mean = batch.mean(axis=0)
-    batch_squares = jnp.sum((batch - batch_mean) ** 2, axis=0)
-    delta = batch_mean - statistics.mean
+def update_statistics(
+    statistics: RunningStatistics, batch: jax.Array, counted: jax.Array | None = None
+) -> RunningStatistics:
+    """Adds a [B, O] batch of observations, or of them those [B] that are counted."""
+    if counted is None:
+        size: jax.Array | int = batch.shape[0]
+        batch_mean = batch.mean(axis=0)
+        batch_squares = jnp.sum((batch - batch_mean) ** 2, axis=0)
+    else:
+        size, weights = counted.sum(), counted[:, None]
+        batch_mean = jnp.sum(weights * batch, axis=0) / jnp.maximum(size, 1)
+        batch_squares = jnp.sum(weights * (batch - batch_mean) ** 2, axis=0)
+    return _merged(statistics, size, batch_mean, batch_squares)
+
+
+def merge_statistics(statistics: RunningStatistics, others: RunningStatistics) -> RunningStatistics:
+    """Adds what [N] others have seen."""
+    count = others.count.sum()
+    mean = jnp.sum(others.count[:, None] * others.mean, axis=0) / count
+    spread = others.count[:, None] * (others.mean - mean) ** 2
+    return _merged(statistics, count, mean, jnp.sum(others.squares + spread, axis=0))
+
+
+def _merged(
+    statistics: RunningStatistics, size: jax.Array | int, mean: jax.Array, squares: jax.Array
+) -> RunningStatistics:
+    delta = mean - statistics.mean
     count = statistics.count + size
     return RunningStatistics(
         count=count,
         mean=statistics.mean + delta * size / count,
-        squares=statistics.squares + batch_squares + delta**2 * statistics.count * size / count,
+        squares=statistics.squares + squares + delta**2 * statistics.count * size / count,
     )
 
 

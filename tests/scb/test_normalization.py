@@ -1,7 +1,13 @@
+import jax
 import jax.numpy as jnp
 import numpy as np
 
-from scb.agents.normalization import RunningStatistics, normalize, update_statistics
+from scb.agents.normalization import (
+    RunningStatistics,
+    merge_statistics,
+    normalize,
+    update_statistics,
+)
 
 
 def seen(*batches):
@@ -53,3 +59,22 @@ def test_normalisation_by_hand_and_its_limit():
 def test_before_any_observation_nothing_changes():
     observation = jnp.array([0.5, -3.0])
     np.testing.assert_allclose(normalize(RunningStatistics.start(2), observation), observation)
+
+
+def test_of_a_batch_only_those_count_that_are_counted():
+    # 1 and 5 of three.
+    statistics = update_statistics(
+        RunningStatistics.start(1),
+        jnp.array([[1.0], [77.0], [5.0]]),
+        jnp.array([True, False, True]),
+    )
+    assert (statistics.count, statistics.mean[0], statistics.squares[0]) == (2.0, 3.0, 8.0)
+
+
+def test_what_several_have_seen_is_what_one_would_have_seen():
+    first, *others = batches()
+    several = jax.tree.map(lambda *leaves: jnp.stack(leaves), *(seen(batch) for batch in others))
+    merged, alone = merge_statistics(seen(first), several), seen(*batches())
+    assert merged.count == 49
+    np.testing.assert_allclose(merged.mean, alone.mean, rtol=1e-5)
+    np.testing.assert_allclose(merged.squares, alone.squares, rtol=1e-5)

@@ -1,0 +1,143 @@
+"""A linear expert, by augmented random search (Mania et al., 2018, "V2-t").
+
+A linear policy of normalised observations hops, and a bandit's small networks hold it better than the
+networks of an agent that earns as much. What an environment pays for not falling is left out of the
+search's fitness: else it finds to stand still.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from evosax.algorithms import ARS
+from gymnax.environments import environment, spaces
+
+from scb.agents.normalization import RunningStatistics, merge_statistics, normalize
+from scb.errors import UserError, at_least, positive
+from scb.evaluation import Episodes, evaluate
+from scb.experts import EPISODES, Expert
+from scb.keys import key_at, named_key, split_key
+from scb.neuroevolution import network_action
+
+Linear = dict[str, jax.Array]  # {"matrix": [O, A], "bias": [A]}
+
+
+@dataclass(frozen=True)
+class LinearSearchConfig:
+    """Augmented random search.
+
+    Attributes:
+      generations: steps of the search.
+      directions: perturbations of a generation, each tried both ways for one episode.
+      best: of the directions, those that the step is made of.
+      sigma: standard deviation of the perturbations.
+      learning_rate: of the step.
+      judge_every: generations between judgements of the unperturbed policy, of 20 episodes each; the
+        policy that was judged best is the expert.
+    """
+
+    generations: int = 200
+    directions: int = 32
+    best: int = 8
+    sigma: float = 0.03
+    learning_rate: float = 0.02
+    judge_every: int = 10
+
+    def __post_init__(self) -> None:
+        at_least(1, self, "generations", "directions", "best", "judge_every")
+        positive(self, "sigma", "learning_rate")
+        if self.best > self.directions:
+            raise UserError(f"best is {self.best} of {self.directions} directions: take no more.")
+
+
+def search_linear_expert(
+    env: environment.Environment[Any, Any],
+    env_params: Any,
+    key: jax.Array,
+    config: LinearSearchConfig | None = None,
+    bonus: float = 0.0,
+) -> Expert:
+    """The best unperturbed policy of an augmented random search; its return is one on fresh start states.
+
+    Args:
+      env, env_params: with continuous actions.
+      key: decides everything.
+      config: of the search.
+      bonus: what every step pays without falling, which the fitness leaves out.
+    """
+    config = config or LinearSearchConfig()
+    space = env.action_space(env_params)
+    observations = int(np.prod(env.observation_space(env_params).shape))
+    actions = int(np.prod(space.shape))
+    zero = {"matrix": jnp.zeros((observations, actions)), "bias": jnp.zeros(actions)}
+    search = ARS(
+        2 * config.directions,
+        zero,
+        optimizer=optax.sgd(config.learning_rate),
+        std_schedule=optax.constant_schedule(config.sigma),
+    )
+    search.elite_ratio = config.best / config.directions
+    params = search.default_params
+
+    def roll(policies: Linear, seen: RunningStatistics, keys: jax.Array, episodes: int) -> Episodes:
+        def one(policy: Linear, key: jax.Array) -> Episodes:
+            act = _policy(policy, seen, space)
+            return evaluate(
+                env,
+                env_params,
+                lambda observation, _: act(jnp.ravel(observation)),
+                key,
+                episodes,
+                moments=True,
+            )
+
+        return jax.vmap(one)(policies, keys)
+
+    @jax.jit
+    def generation(state: Any, seen: RunningStatistics, key: jax.Array) -> Any:
+        key_ask, key_roll, key_tell = split_key(key, 3)
+        population, state = search.ask(key_ask, state, params)
+        # Both ways from the same start state.
+        keys = jnp.tile(split_key(key_roll, config.directions), 2)
+        episodes = roll(population, seen, keys, 1)
+        fitness = (episodes.returns - bonus * episodes.lengths)[:, 0]
+        state, _ = search.tell(key_tell, population, -fitness, state, params)
+        assert episodes.observations is not None
+        return state, merge_statistics(seen, episodes.observations), episodes.lengths.sum()
+
+    @jax.jit
+    def judged(policy: Linear, seen: RunningStatistics, key: jax.Array) -> Any:
+        alone = jax.tree.map(lambda x: x[None], policy)
+        episodes = roll(alone, seen, key[None], EPISODES)
+        return episodes.returns.mean(), episodes.lengths.sum()
+
+    state = search.init(named_key(key, "start"), zero, params)
+    seen, steps = RunningStatistics.start(observations), 0.0
+    expert, best = (zero, seen), -np.inf
+    keys, key_judge = named_key(key, "generations"), named_key(key, "judgement")
+    for number in range(1, config.generations + 1):
+        state, seen, taken = generation(state, seen, key_at(keys, number))
+        steps += float(taken)
+        if number % config.judge_every == 0 or number == config.generations:
+            mean = search.get_mean(state)
+            # The same start states for all, so that judgements are compared in pairs.
+            earned, taken = judged(mean, seen, key_judge)
+            steps += float(taken)
+            if earned > best:
+                expert, best = (mean, seen), float(earned)
+    earned, taken = judged(*expert, named_key(key, "return"))
+    return Expert(_policy(*expert, space), float(earned), int(steps + float(taken)))
+
+
+def _policy(
+    policy: Linear, seen: RunningStatistics, space: spaces.Box
+) -> Callable[[jax.Array], jax.Array]:
+    def act(observation: jax.Array) -> jax.Array:
+        outputs = normalize(seen, observation) @ policy["matrix"] + policy["bias"]
+        return network_action(jnp.tanh(outputs), space)
+
+    return act

@@ -1,0 +1,99 @@
+"""Augmented random search finds what a linear policy can do, and counts what that costs."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from scb.environments.registry import make
+from scb.errors import UserError
+from scb.linear_expert import LinearSearchConfig, search_linear_expert
+from scb.warm_start import WarmStartConfig, expert_agent, find_expert
+from tests.scb.probes import ContinuousCorridor, CorridorParams
+
+# Cells pay 1 - (a - t)^2 with t = -0.5 and 1.5, of actions in [-1, 2]: 2 at best. The best constant
+# action, 0.5, earns 0.
+PARAMS = CorridorParams(
+    rewards=jnp.array([[1.0, 1.0, -0.5], [1.0, 1.0, 1.5]]), last=1, max_steps_in_episode=2
+)
+SEARCH = LinearSearchConfig(
+    generations=30, directions=8, best=4, sigma=0.2, learning_rate=0.2, judge_every=20
+)
+
+
+def search(key=0, **settings):
+    config = replace(SEARCH, **settings)
+    return search_linear_expert(ContinuousCorridor(cells=2), PARAMS, jax.random.key(key), config)
+
+
+@pytest.fixture(scope="module")
+def expert():
+    return search()
+
+
+def test_a_linear_policy_solves_a_corridor(expert):
+    assert expert.mean_return > 1.8
+    first, second = (expert.policy(cell) for cell in jnp.eye(2))
+    assert first.shape == (1,)
+    assert float(first[0]) == pytest.approx(-0.5, abs=0.4)
+    assert float(second[0]) == pytest.approx(1.5, abs=0.4)
+    far = np.asarray(jax.vmap(expert.policy)(1e3 * jnp.eye(2)))
+    assert far.min() >= -1.0 and far.max() <= 2.0
+
+
+def test_its_steps_are_counted(expert):
+    # 30 generations of 2 * 8 episodes of 2 steps; judged after 20 and after the last by 20 episodes, and once more.
+    assert expert.environment_steps == 30 * 2 * 8 * 2 + 3 * 20 * 2
+
+
+def test_the_key_alone_decides_it(expert):
+    between = jax.random.normal(jax.random.key(2), (40, 2))
+    again, other = search(), search(key=1)
+    np.testing.assert_array_equal(jax.vmap(again.policy)(between), jax.vmap(expert.policy)(between))
+    assert (jax.vmap(other.policy)(between) != jax.vmap(expert.policy)(between)).any()
+
+
+class Ledge(ContinuousCorridor):
+    """Every step pays 1; an action a above 0.5 ends the episode, and pays 2 a more."""
+
+    def step_env(self, key, state, action, params):
+        observation, state, _, _, info = super().step_env(key, state, action, params)
+        leaves = action[0] > 0.5
+        return observation, state, 1.0 + jnp.where(leaves, 2.0 * action[0], 0.0), leaves, info
+
+
+@pytest.mark.parametrize(("bonus", "earned"), [(0.0, (30.0, 30.0)), (1.0, (2.0, 5.0))])
+def test_what_a_step_pays_without_falling_is_left_out(bonus, earned):
+    env = Ledge(cells=1)
+    params = env.default_params.replace(last=2, max_steps_in_episode=30)
+    config = replace(SEARCH, generations=10, judge_every=10)
+    expert = search_linear_expert(env, params, jax.random.key(0), config, bonus)
+    assert earned[0] <= expert.mean_return <= earned[1]
+
+
+def test_a_warm_start_takes_a_linear_expert():
+    env, params = make("Pendulum-v1")
+    config = WarmStartConfig(expert="linear", expert_generations=1)
+    expert = find_expert("Pendulum-v1", env, params, jax.random.key(0), config)
+    # A generation of 64 episodes, a judgement of 20, and 20 of the expert, of 200 steps each.
+    assert expert.environment_steps == (64 + 20 + 20) * 200
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments", "message"),
+    [
+        ("CartPole-v1", {}, "a linear expert has continuous actions and CartPole-v1 discrete ones"),
+        ("Pendulum-v1", {"expert_steps": 9}, "expert_steps is 9, but a linear search finds"),
+    ],
+)
+def test_a_linear_expert_that_cannot_be_found_is_refused(name, arguments, message):
+    env, params = make(name)
+    with pytest.raises(UserError, match=message):
+        expert_agent(name, env.action_space(params), WarmStartConfig(expert="linear", **arguments))
+
+
+def test_more_best_directions_than_there_are_are_refused():
+    with pytest.raises(UserError, match="best is 9 of 8 directions: take no more"):
+        LinearSearchConfig(directions=8, best=9)
