@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from gymnax.environments import environment
 from jax.typing import ArrayLike
 
-from scb.agents.normalization import RunningStatistics, update_statistics
+from scb.agents.normalization import RunningStatistics, merge_statistics
 from scb.keys import key_at, split_key
 
 Policy = Callable[
@@ -55,7 +55,8 @@ def evaluate(
     def step(carry: Any) -> Any:
         time, observation, state, active, returns, lengths, seen = carry
         if moments:
-            seen = update_statistics(seen, jnp.reshape(observation, (num_episodes, -1)), active)
+            flat = jnp.reshape(observation, (num_episodes, -1))
+            seen = merge_statistics(seen, RunningStatistics(active, flat, jnp.zeros_like(flat)))
         key_act, key_step = split_key(key_at(key_loop, time))
         action = jax.vmap(policy)(observation, split_key(key_act, num_episodes))
         # step_env, not step: a finished episode needs no reset, and its later rewards are masked.

@@ -19,7 +19,7 @@ from gymnax.environments import environment, spaces
 from scb.agents.normalization import RunningStatistics, merge_statistics, normalize
 from scb.errors import UserError, at_least, positive
 from scb.evaluation import Episodes, evaluate
-from scb.experts import EPISODES, Expert
+from scb.experts import EPISODES, Expert, judged
 from scb.keys import key_at, named_key, split_key
 from scb.neuroevolution import network_action
 
@@ -110,7 +110,7 @@ def search_linear_expert(
         return state, merge_statistics(seen, episodes.observations), episodes.lengths.sum()
 
     @jax.jit
-    def judged(policy: Linear, seen: RunningStatistics, key: jax.Array) -> Any:
+    def mean_return(policy: Linear, seen: RunningStatistics, key: jax.Array) -> Any:
         alone = jax.tree.map(lambda x: x[None], policy)
         episodes = roll(alone, seen, key[None], EPISODES)
         return episodes.returns.mean(), episodes.lengths.sum()
@@ -125,12 +125,11 @@ def search_linear_expert(
         if number % config.judge_every == 0 or number == config.generations:
             mean = search.get_mean(state)
             # The same start states for all, so that judgements are compared in pairs.
-            earned, taken = judged(mean, seen, key_judge)
+            earned, taken = mean_return(mean, seen, key_judge)
             steps += float(taken)
             if earned > best:
                 expert, best = (mean, seen), float(earned)
-    earned, taken = judged(*expert, named_key(key, "return"))
-    return Expert(_policy(*expert, space), float(earned), int(steps + float(taken)))
+    return judged(_policy(*expert, space), env, env_params, named_key(key, "return"), int(steps))
 
 
 def _policy(

@@ -16,25 +16,16 @@ class RunningStatistics:
         return cls(count=jnp.float32(0.0), mean=jnp.zeros(size), squares=jnp.zeros(size))
 
 
-def update_statistics(
-    statistics: RunningStatistics, batch: jax.Array, counted: jax.Array | None = None
-) -> RunningStatistics:
-    """Adds a [B, O] batch of observations, or of them those [B] that are counted."""
-    if counted is None:
-        size: jax.Array | int = batch.shape[0]
-        batch_mean = batch.mean(axis=0)
-        batch_squares = jnp.sum((batch - batch_mean) ** 2, axis=0)
-    else:
-        size, weights = counted.sum(), counted[:, None]
-        batch_mean = jnp.sum(weights * batch, axis=0) / jnp.maximum(size, 1)
-        batch_squares = jnp.sum(weights * (batch - batch_mean) ** 2, axis=0)
-    return _merged(statistics, size, batch_mean, batch_squares)
+def update_statistics(statistics: RunningStatistics, batch: jax.Array) -> RunningStatistics:
+    """Adds a [B, O] batch of observations."""
+    mean = batch.mean(axis=0)
+    return _merged(statistics, batch.shape[0], mean, jnp.sum((batch - mean) ** 2, axis=0))
 
 
 def merge_statistics(statistics: RunningStatistics, others: RunningStatistics) -> RunningStatistics:
-    """Adds what [N] others have seen."""
+    """Adds what [N] others have seen; of those that are one observation, count says whether it counts."""
     count = others.count.sum()
-    mean = jnp.sum(others.count[:, None] * others.mean, axis=0) / count
+    mean = jnp.sum(others.count[:, None] * others.mean, axis=0) / jnp.maximum(count, 1)
     spread = others.count[:, None] * (others.mean - mean) ** 2
     return _merged(statistics, count, mean, jnp.sum(others.squares + spread, axis=0))
 

@@ -63,11 +63,9 @@ def test_before_any_observation_nothing_changes():
 
 def test_of_a_batch_only_those_count_that_are_counted():
     # 1 and 5 of three.
-    statistics = update_statistics(
-        RunningStatistics.start(1),
-        jnp.array([[1.0], [77.0], [5.0]]),
-        jnp.array([True, False, True]),
-    )
+    batch, counted = jnp.array([[1.0], [77.0], [5.0]]), jnp.array([True, False, True])
+    single = RunningStatistics(counted, batch, jnp.zeros_like(batch))
+    statistics = merge_statistics(RunningStatistics.start(1), single)
     assert (statistics.count, statistics.mean[0], statistics.squares[0]) == (2.0, 3.0, 8.0)
 
 
