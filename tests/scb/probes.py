@@ -8,6 +8,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 from flax import struct
 from gymnax.environments import environment, spaces
@@ -16,6 +17,7 @@ from scb.agents.spec import ALGORITHMS
 from scb.environments.spec import Family, Made
 from scb.environments.synthetic import BanditConfig, SyntheticBandit
 from scb.evolution import EnvironmentSteps
+from scb.experts import Expert
 
 
 @struct.dataclass
@@ -118,6 +120,24 @@ class ContinuousCorridor(Corridor):
 
     def action_space(self, params: CorridorParams | None = None) -> spaces.Box:
         return spaces.Box(-1.0, 2.0, (1,), jnp.float32)
+
+
+# For two cells, which pay 1 - (a - t)^2 with t = -0.5 and 1.5: 2 at best. The best constant action,
+# 0.5, earns 0, and so do uniform actions or less.
+TWO_TARGETS = CorridorParams(
+    rewards=jnp.array([[1.0, 1.0, -0.5], [1.0, 1.0, 1.5]]), last=1, max_steps_in_episode=2
+)
+
+
+def assert_solves_two_targets(expert: Expert) -> None:
+    assert expert.mean_return > 1.8
+    first, second = (expert.policy(cell) for cell in jnp.eye(2))
+    assert first.shape == (1,)
+    assert float(first[0]) == pytest.approx(-0.5, abs=0.4)
+    assert float(second[0]) == pytest.approx(1.5, abs=0.4)
+    # Far outside of what it has seen, an action is still within the bounds.
+    far = np.asarray(jax.vmap(expert.policy)(1e3 * jnp.eye(2)))
+    assert far.min() >= -1.0 and far.max() <= 2.0
 
 
 def context_bandit() -> SyntheticBandit:

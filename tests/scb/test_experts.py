@@ -15,7 +15,13 @@ from scb.environments.registry import make
 from scb.errors import UserError
 from scb.evolution import EvolutionConfig
 from scb.experts import PolicySearchConfig, best_agent, evolve_expert, judged, train_expert
-from tests.scb.probes import ContinuousCorridor, Corridor, CorridorParams
+from tests.scb.probes import (
+    TWO_TARGETS,
+    ContinuousCorridor,
+    Corridor,
+    CorridorParams,
+    assert_solves_two_targets,
+)
 
 EVOLUTION = EvolutionConfig(
     population_size=16,
@@ -104,21 +110,9 @@ def test_the_key_alone_decides_the_expert(evolved):
 
 
 def test_an_evolved_policy_finds_continuous_actions_within_the_bounds():
-    # Cells pay 1 - (a - t)^2 with t = -0.5 and 1.5, of actions in [-1, 2]: 2 at best. The best
-    # constant action, 0.5, earns 0, and so do uniform actions or less.
-    params = CorridorParams(
-        rewards=jnp.array([[1.0, 1.0, -0.5], [1.0, 1.0, 1.5]]), last=1, max_steps_in_episode=2
-    )
     search = replace(SEARCH, evolution=replace(EVOLUTION, population_size=32, num_generations=40))
-    expert = evolve_expert(ContinuousCorridor(cells=2), params, search, jax.random.key(0))
-    assert expert.mean_return > 1.8
-    first, second = (expert.policy(cell) for cell in jnp.eye(2))
-    assert first.shape == (1,)
-    assert float(first[0]) == pytest.approx(-0.5, abs=0.4)
-    assert float(second[0]) == pytest.approx(1.5, abs=0.4)
-    # Far outside of what it has seen, an action is still within the bounds.
-    far = np.asarray(jax.vmap(expert.policy)(1e3 * jnp.eye(2)))
-    assert far.min() >= -1.0 and far.max() <= 2.0
+    expert = evolve_expert(ContinuousCorridor(cells=2), TWO_TARGETS, search, jax.random.key(0))
+    assert_solves_two_targets(expert)
 
 
 @pytest.mark.parametrize("paying", [0, 1])
