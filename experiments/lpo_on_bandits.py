@@ -28,6 +28,7 @@ from lpo.objectives import Objective, load_objective
 from scb import plotting
 from scb.agents.spec import AgentSpec, environment_agent
 from scb.errors import UserError
+from scb.rows import Rows
 from scb.seeds import REPORTING, reporting, validation
 from scb.statistics import Estimate, estimate, iqm, pooled_estimate
 
@@ -228,31 +229,39 @@ def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None
             entry["steps_to_judge"] = next(cost[name] for name in names if name in cost)
             entry["curves"].append(search_curve(*read_log(runs / f"{source}-{seed}")))
             save()
+
+    def kept(title: str) -> Rows:
+        """An agent that was trained is not trained again, in whatever part of a table a run is killed."""
+        return Rows(runs / f"{title}.rows.jsonl")
+
     for label, scale in SCALES.items():
-        table = evaluations.setdefault(f"Pendulum, {label}", {})
+        title = f"Pendulum, {label}"
+        table, rows = evaluations.setdefault(title, {}), kept(title)
         spec = environment_agent("ppo", "Pendulum-v1").with_values(policy_output_scale=scale)
         if "tuned" not in table:
-            table |= _tuned_clip(spec, plan["tuning_agents"])
-        _judge(table, "Pendulum-v1", table["tuned"], groups, plan["agents"], spec)
+            table |= _tuned_clip(spec, plan["tuning_agents"], kept(f"{title}, tuning"))
+        _judge(table, "Pendulum-v1", table["tuned"], groups, plan["agents"], spec, rows)
         save()
     hopper = plan["hopper"]
     backend, steps = hopper["backend"], hopper["steps"]
     first = {name: group[: hopper["searches"]] for name, group in groups.items()}
     # The clip is tuned on Pendulum, from whose bandit the objectives are carried over too.
     carried = evaluations["Pendulum, Flax's initialisation"]["tuned"]
+    title = f"Hopper, {backend} physics, {steps:,} steps"
     _judge(
-        evaluations.setdefault(f"Hopper, {backend} physics, {steps:,} steps", {}),
+        evaluations.setdefault(title, {}),
         "hopper",
         carried,
         first,
         hopper["agents"],
         environment_agent("ppo", "hopper").with_steps(steps).with_values(policy_output_scale=1.0),
+        kept(title),
         backend,
     )
     save()
 
 
-def _tuned_clip(spec: AgentSpec, agents: int) -> dict[str, Any]:
+def _tuned_clip(spec: AgentSpec, agents: int, rows: Rows) -> dict[str, Any]:
     """{"tuned": the best of CLIPS on agents that report nothing, "sweep": what each earned}."""
     curves = compare(
         "Pendulum-v1",
@@ -260,6 +269,7 @@ def _tuned_clip(spec: AgentSpec, agents: int) -> dict[str, Any]:
         validation(agents),
         spec=spec,
         points=1,
+        rows=rows,
     ).curves
     sweep = {c.objective: float(iqm(c.final)) for c in curves}
     return {"tuned": max(sweep, key=lambda clip: sweep[clip]), "sweep": sweep}
@@ -272,6 +282,7 @@ def _judge(
     groups: Mapping[str, Sequence[Callable[[], Objective]]],
     agents: int,
     spec: AgentSpec,
+    rows: Rows,
     backend: str | None = None,
 ) -> None:
     """Trains agents with PPO, the tuned clip, DPO and searches that the table lacks, and adds them to it."""
@@ -292,6 +303,7 @@ def _judge(
         spec=spec,
         backend=backend,
         points=15,
+        rows=rows,
     ).curves
     of = {curve.objective: curve for curve in curves}
     for name, group in lacking.items():

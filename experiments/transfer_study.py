@@ -27,6 +27,7 @@ from lpo.comparison import compare, ppo_spec
 from lpo.objectives import load_objective
 from scb.errors import UserError, unknown_name
 from scb.plotting import BLUE, GREY, VERMILLION, estimate_row
+from scb.rows import Rows
 from scb.seeds import REPORTING
 from scb.statistics import Estimate, estimate, pooled_estimate
 
@@ -210,6 +211,7 @@ def measure(options: Options, report: dict[str, Any], save: Save) -> None:
                 spec=ppo_spec(at.environment, at.steps, at.policy_output_scale),
                 backend=at.backend,
                 points=1,
+                rows=Rows(options.runs / f"{at.name}.rows.jsonl"),
             )
             for seed, curves in zip(missing, found.curves, strict=True):
                 returns[seed] = np.round(curves.final, 2).tolist()

@@ -11,7 +11,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 from matplotlib.figure import Figure
 
@@ -32,7 +31,9 @@ from scb.analysis.animation import picture, save_gif
 from scb.analysis.states import follow
 from scb.environments.registry import environment_spec
 from scb.errors import UserError
+from scb.experts import best_agent
 from scb.keys import root_key, split_key
+from scb.measurement import Judge
 from scb.statistics import Estimate, estimate
 
 HOPPER = "hopper (spring)"
@@ -60,26 +61,20 @@ def _show(name: str, plan: Mapping[str, Any]) -> dict[str, Any]:
     bandit, _ = bandit_of(environment)
     spec = bandit_agent("ppo", environment, sampled=False)
     agent = spec.agent(bandit)
-    key_train, key_choose, key_show = split_key(root_key(plan["seed"]), 3)
-    episodes = plan["brax_episodes" if place.backends else "episodes"]
-
-    @jax.jit
-    @jax.vmap
-    def train(key: Any) -> Any:
-        state = agent.train(key, spec.hyperparameters, bandit.default_params)
-        found = agent.evaluate(state, key_choose, episodes, env, env_params, mode=True)
-        return state, found.returns.mean()
-
-    states, returns = train(split_key(key_train, plan["agents"]))
+    key_agents, key_show = split_key(root_key(plan["seed"]))
+    judge = Judge(
+        env, env_params, plan["brax_episodes" if place.backends else "episodes"], mode=True
+    )
+    state, returns = best_agent(
+        agent, spec, bandit.default_params, key_agents, plan["agents"], judge
+    )
     if not np.isfinite(returns).all():
         raise UserError(f"an agent of {name} has no finite return: choose another seed.")
-    best = int(np.argmax(returns))
-    state = jax.tree.map(lambda x: x[best], states)
 
     def policy(observation: Any, key: Any) -> Any:
         return agent.act(state, observation, key, bandit.default_params, mode=True)
 
-    entry: dict[str, Any] = {"agents": estimate(np.asarray(returns, float)).as_dict()}
+    entry: dict[str, Any] = {"agents": estimate(returns).as_dict()}
     if name == HOPPER:
         _, shown = animation.save_brax_html(VIEWER, env, policy, key_show, plan["brax_steps"])
         return {**entry, "shown": round(shown, 1), "steps": plan["brax_steps"]}

@@ -6,7 +6,6 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from pathlib import Path
 from types import MappingProxyType
 from typing import Annotated, ClassVar
 
@@ -23,13 +22,12 @@ from lpo.suite import run_suite
 from lpo.suite import suite as suite_environments
 from scb import plotting
 from scb.artefacts import package_versions
-from scb.command_line import LongRun
+from scb.command_line import Measuring
 from scb.console import console
 from scb.environments.registry import environment_spec
 from scb.errors import UserError, at_least
 from scb.files import write_json
 from scb.measurement import Place, check_seeds
-from scb.rows import Rows
 from scb.runs import config_dict
 from scb.statistics import estimate
 
@@ -119,33 +117,9 @@ class EvaluateConfig(JudgedConfig):
             )
 
 
-@dataclass(frozen=True)
-class Kept:
-    """Where agents' returns are kept as they come.
-
-    Attributes:
-      out: folder for rows.jsonl and for the table and figure made of them; must be new or empty.
-      resume: a folder that an interrupted command wrote; its settings apply, and a flag that
-        contradicts them is an error.
-    """
-
-    out: Path | None = None
-    resume: Path | None = None
-
-
 @dataclass(frozen=True, kw_only=True)
-class Measuring(LongRun):
-    """A command that trains agents and keeps their rows, in a folder where one is named."""
-
-    output: Kept = field(default_factory=Kept)
-    preset: tyro.conf.Suppress[str] = "quick"
-
-    def opened(self) -> tuple[Path | None, Rows]:
-        """The folder of the results, and the rows in it; without a folder in memory."""
-        if self.output == Kept():
-            return None, Rows()
-        folder = self.open().folder
-        return folder, Rows(folder / "rows.jsonl")
+class Comparing(Measuring):
+    """A command that compares objectives on one environment."""
 
     def compare(self, objectives: Sequence[Objective]) -> Comparison:
         """Trains with the objectives, and leaves rows, comparison.json and curves.png where a folder is named."""
@@ -173,7 +147,7 @@ class Measuring(LongRun):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Train(Measuring):
+class Train(Comparing):
     """Train PPO with an objective in an environment, and print how well it ends."""
 
     program = "lpo train"
@@ -189,7 +163,7 @@ class Train(Measuring):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Evaluate(Measuring):
+class Evaluate(Comparing):
     """Compare objectives: train PPO with each on the same seeds, and print final scores with intervals.
 
     With --out every agent's returns are kept in rows.jsonl as they come, for --resume and for

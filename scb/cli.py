@@ -74,7 +74,7 @@ def _commands() -> dict[str, Any]:
 
     return {
         "discover": commands.Discover,
-        "train": commands.train,
+        "train": commands.Train,
         "explain": explain_command,
         "list": commands.list_command,
         "import-published": import_published_command,

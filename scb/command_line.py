@@ -8,7 +8,7 @@ import argparse
 import shlex
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass, field, fields, is_dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Self, TypeVar, get_type_hints
 
@@ -16,6 +16,7 @@ import tyro
 from tyro.constructors import PrimitiveConstructorSpec
 
 from scb.errors import UserError, one_of
+from scb.rows import Rows
 from scb.runs import Run, config_dict, read_config
 
 T = TypeVar("T")
@@ -165,6 +166,35 @@ class LongRun(ABC):
         output, wandb = self.output, getattr(self.output, "wandb", None)
         stored = {"command": self.command, "config": config_dict(self.config)}
         return Run.open(output.resume or output.out, stored, output.resume is not None, wandb)
+
+
+@dataclass(frozen=True)
+class Kept:
+    """Where agents' returns are kept as they come.
+
+    Attributes:
+      out: folder for rows.jsonl and for what is made of them; must be new or empty.
+      resume: a folder that an interrupted command wrote; its settings apply, and a flag that
+        contradicts them is an error.
+    """
+
+    out: Path | None = None
+    resume: Path | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Measuring(LongRun):
+    """A command that trains agents and keeps their rows, in a folder where one is named."""
+
+    output: Kept = field(default_factory=Kept)
+    preset: tyro.conf.Suppress[str] = "quick"
+
+    def opened(self) -> tuple[Path | None, Rows]:
+        """The folder of the results, and the rows in it; without a folder in memory."""
+        if self.output == Kept():
+            return None, Rows()
+        folder = self.open().folder
+        return folder, Rows(folder / "rows.jsonl")
 
 
 def call(

@@ -11,7 +11,7 @@ import tyro
 from rich.table import Column, Table
 
 from scb.agents.spec import algorithms_for, bandit_agent
-from scb.command_line import LongRun, Output
+from scb.command_line import LongRun, Measuring, Output
 from scb.console import console
 from scb.discovery import BanditDiscovery, DiscoveryConfig, evaluation_place, judge
 from scb.environments.registry import environment_spec
@@ -189,20 +189,11 @@ def _origin(bandit: str) -> dict[str, Any]:
     }
 
 
-def train(
-    bandit: str = "Synthetic-Pendulum-v1",
-    algorithm: str = "ppo",
-    evaluation_environment: str | None = None,
-    backend: str | None = None,
-    agents: int = 20,
-    episodes: int = 50,
-    seed: int = 0,
-    fixed_hyperparameters: bool = False,
-    sampled_actions: bool = False,
-) -> None:
-    """Train agents in a bandit and evaluate them in the environment that it stands for.
+@dataclass(frozen=True)
+class TrainConfig:
+    """What `scb train` does.
 
-    Args:
+    Attributes:
       bandit: a zoo name such as Synthetic-Pendulum-v1, or path.npz (a synthetic MDP's too).
       algorithm: such as ppo, sac, dqn, ddqn, ddpg or td3.
       evaluation_environment: where to evaluate; the bandit's own where left out.
@@ -213,18 +204,57 @@ def train(
       fixed_hyperparameters: the paper's underlined values instead of draws from its lists.
       sampled_actions: evaluate sampled actions rather than the most likely ones.
     """
-    at_least(1, agents=agents, episodes=episodes)
-    at_least(0, seed=seed)
-    loaded = open_synthetic(bandit)
-    judge_in = evaluation_place(loaded, bandit, evaluation_environment, backend)
-    spec = bandit_agent(algorithm, judge_in.name, not fixed_hyperparameters)
-    weights = loaded.default_params.weights
-    by_actions = judge(
-        spec, loaded, weights, judge_in, seed, agents, episodes, mode=not sampled_actions
-    )
-    (returns,) = by_actions.values()
-    print(f"returns on {judge_in.name}: {' '.join(f'{r:.0f}' for r in np.sort(returns))}")
-    print(f"IQM: {estimate(returns)}")
+
+    bandit: str = "Synthetic-Pendulum-v1"
+    algorithm: str = "ppo"
+    evaluation_environment: str | None = None
+    backend: str | None = None
+    agents: int = 20
+    episodes: int = 50
+    seed: int = 0
+    fixed_hyperparameters: bool = False
+    sampled_actions: bool = False
+
+    def __post_init__(self) -> None:
+        at_least(1, self, "agents", "episodes")
+        at_least(0, self, "seed")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Train(Measuring):
+    """Train agents in a bandit and evaluate them in the environment that it stands for.
+
+    With --out every agent's return and hyperparameters are kept in rows.jsonl, for --resume and for
+    other statistics: pandas.read_json("rows.jsonl", lines=True).
+    """
+
+    program = "scb train"
+    presets = MappingProxyType({"quick": lambda given: TrainConfig()})
+
+    config: Annotated[TrainConfig, tyro.conf.arg(name="")] = field(default_factory=TrainConfig)
+
+    def run(self) -> None:
+        config: TrainConfig = self.config
+        bandit = open_synthetic(config.bandit)
+        judge_in = evaluation_place(
+            bandit, config.bandit, config.evaluation_environment, config.backend
+        )
+        spec = bandit_agent(config.algorithm, judge_in.name, not config.fixed_hyperparameters)
+        _, rows = self.opened()  # last: a mistake must not leave a folder behind
+        by_actions = judge(
+            spec,
+            bandit,
+            bandit.default_params.weights,
+            judge_in,
+            config.seed,
+            config.agents,
+            config.episodes,
+            mode=not config.sampled_actions,
+            rows=rows,
+        )
+        (returns,) = by_actions.values()
+        print(f"returns on {judge_in.name}: {' '.join(f'{r:.0f}' for r in np.sort(returns))}")
+        print(f"IQM: {estimate(returns)}")
 
 
 def list_command() -> None:

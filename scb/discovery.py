@@ -49,7 +49,7 @@ from scb.evolution import EnvironmentSteps, EvolutionConfig, Outcome, evolve
 from scb.keys import named_key, root_key, split_key
 from scb.lists import read_lists, write_lists
 from scb.measurement import MODE, SAMPLED, Agents, Judge, Place, measure, train_and_judge
-from scb.rows import pivot
+from scb.rows import Rows, pivot
 from scb.runs import Run, Stopwatch
 from scb.warm_start import (
     WarmStartConfig,
@@ -423,6 +423,7 @@ def judge(
     num_agents: int = 20,
     num_episodes: int = 50,
     mode: bool | None = None,
+    rows: Rows | None = None,
 ) -> dict[str, np.ndarray]:
     """[num_agents] mean returns in the evaluation environment of agents trained in a synthetic one.
 
@@ -431,19 +432,21 @@ def judge(
       synthetic, weights: where they train.
       judge_in: the evaluation environment.
       seed: decides hyperparameters, training and evaluation.
+      rows: where agents are kept and found; None for memory.
 
     Returns:
       {"sampled_actions": [N], "mode_actions": [N]} of the same agents; with `mode` given, only that
       one.
     """
     actions = (SAMPLED, MODE) if mode is None else (MODE if mode else SAMPLED,)
-    rows = measure(
+    found = measure(
         spec,
         Place(synthetic.name, synthetic, synthetic.params(weights)),
         judge_in,
         Agents.drawn_from(spec, seed, num_agents),
         episodes=num_episodes,
         actions=actions,
+        rows=rows,
     )
-    returns = pivot(rows, "actions", "agent")
+    returns = pivot(found, "actions", "agent")
     return {f"{kind}_actions": of_it for kind, of_it in zip(actions, returns, strict=True)}

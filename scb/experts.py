@@ -62,33 +62,34 @@ def judged(
 
 
 def best_agent(
-    agent: Agent,
-    spec: AgentSpec,
-    env_params: Any,
-    key: jax.Array,
-    num_agents: int,
-    num_episodes: int,
-) -> tuple[Any, float]:
-    """(the state of the best of several agents trained alike, its mean return), by episodes of mode actions.
+    agent: Agent, spec: AgentSpec, params: Any, key: jax.Array, num_agents: int, judge: Judge
+) -> tuple[Any, np.ndarray]:
+    """The state of the best of several agents trained alike, and [num_agents] mean returns, NaN for what is not finite.
+
+    Args:
+      agent, spec: the agents, and what they are trained with.
+      params: of the environment that they train in.
+      key: decides everything.
+      judge: of each.
 
     Raises:
       UserError: no agent has a finite return.
     """
-    judges = {"return": Judge(agent.env, env_params, num_episodes, mode=True)}
-    training_params = spec.training_params(env_params)
 
     @jax.jit
     def train(key: jax.Array) -> tuple[Any, jax.Array]:
-        state, earned = train_and_judge(agent, spec.hyperparameters, key, training_params, judges)
+        judges = {"return": judge}
+        state, earned = train_and_judge(agent, spec.hyperparameters, key, params, judges)
         return state, earned["return"].returns.mean()
 
-    states, returns = jax.vmap(train)(split_key(key, num_agents))
-    if not bool(jnp.isfinite(returns).any()):
+    states, earned = jax.vmap(train)(split_key(key, num_agents))
+    returns = np.where(np.isfinite(earned), np.asarray(earned, float), np.nan)
+    if np.isnan(returns).all():
         raise UserError(
             f"none of {num_agents} agents has a finite return: lower the learning rate."
         )
-    best = int(jnp.argmax(jnp.where(jnp.isfinite(returns), returns, -jnp.inf)))
-    return jax.tree.map(lambda x: x[best], states), float(returns[best])
+    best = int(np.nanargmax(returns))
+    return jax.tree.map(lambda x: x[best], states), returns
 
 
 def train_expert(
@@ -100,14 +101,17 @@ def train_expert(
 ) -> Expert:
     """The best of `num_experts` agents trained on the environment itself, by 20 episodes of mode actions."""
     agent = spec.agent(env)
-    state, best = best_agent(agent, spec, env_params, key, num_experts, EPISODES)
+    judge = Judge(env, env_params, EPISODES, mode=True)
+    state, returns = best_agent(
+        agent, spec, spec.training_params(env_params), key, num_experts, judge
+    )
 
     def policy(observation: jax.Array) -> jax.Array:
         return agent.act(state, observation, key, env_params, mode=True)
 
     steps = spec.steps * num_experts
     evaluation = num_experts * EPISODES * int(env_params.max_steps_in_episode)
-    return Expert(policy, best, steps + evaluation)
+    return Expert(policy, float(np.nanmax(returns)), steps + evaluation)
 
 
 @dataclass(frozen=True)

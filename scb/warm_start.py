@@ -34,8 +34,36 @@ from scb.keys import split_key
 from scb.linear_expert import LinearSearchConfig, search_linear_expert
 
 CONSTRUCTIONS = ("advantage", "q", "action_distance")
-# What finds the experts that are no agents.
-SEARCHES = {"evolution": "evolution", "linear": "a linear search"}
+
+
+def _evolved(name: str, env: Any, env_params: Any, key: jax.Array, generations: int) -> Expert:
+    search = PolicySearchConfig()
+    search = replace(
+        search,
+        curriculum=paper_curriculum(name, generations),
+        evolution=replace(search.evolution, num_generations=generations),
+    )
+    return evolve_expert(env, env_params, search, key)
+
+
+def _linear(name: str, env: Any, env_params: Any, key: jax.Array, generations: int) -> Expert:
+    standing = environment_spec(name).standing_still() or 0.0
+    bonus = standing / env_params.max_steps_in_episode
+    return search_linear_expert(env, env_params, key, LinearSearchConfig(generations), bonus)
+
+
+class _Search(NamedTuple):
+    """What finds experts that are no agents: in words, how, and whether actions must be continuous."""
+
+    what: str
+    find: Callable[[str, Any, Any, jax.Array, int], Expert]
+    continuous: bool = False
+
+
+SEARCHES = {
+    "evolution": _Search("evolution", _evolved),
+    "linear": _Search("a linear search", _linear, continuous=True),
+}
 
 
 @dataclass(frozen=True)
@@ -109,23 +137,29 @@ def expert_agent(
     Raises:
       UserError: an expert that doesn't fit the action space, or steps that it can't be trained for.
     """
-    algorithm = config.expert
-    if algorithm == "auto":
-        algorithm = "ppo" if has_values_for("ppo", name) else "evolution"
-    if algorithm == "linear" and isinstance(space, spaces.Discrete):
-        raise UserError(
-            f"a linear expert has continuous actions and {name} discrete ones: choose evolution, or an algorithm."
-        )
+    algorithm = _chosen(name, config)
     if algorithm in SEARCHES:
+        search = SEARCHES[algorithm]
+        if search.continuous and isinstance(space, spaces.Discrete):
+            raise UserError(
+                f"the expert of {search.what} has continuous actions and {name} discrete ones: choose evolution, or "
+                "an algorithm."
+            )
         if config.expert_steps is not None:
             raise UserError(
-                f"expert_steps is {config.expert_steps}, but {SEARCHES[algorithm]} finds the expert of {name} "
+                f"expert_steps is {config.expert_steps}, but {search.what} finds the expert of {name} "
                 "and trains no agent: leave it out, or choose an algorithm for the expert."
             )
         return None
     check_algorithms([algorithm], kind_of_actions(space))
     spec = environment_agent(algorithm, name).with_values(**WARM_START.get((algorithm, name), {}))
     return spec.with_values(total_steps=config.expert_steps)
+
+
+def _chosen(name: str, config: WarmStartConfig) -> str:
+    if config.expert != "auto":
+        return config.expert
+    return "ppo" if has_values_for("ppo", name) else "evolution"
 
 
 def find_expert(
@@ -137,20 +171,9 @@ def find_expert(
 ) -> Expert:
     """An expert for an environment, by name as `scb.make` takes it."""
     spec = expert_agent(name, env.action_space(env_params), config)
-    if config.expert == "linear":
-        standing = environment_spec(name).standing_still() or 0.0
-        bonus = standing / env_params.max_steps_in_episode
-        return search_linear_expert(
-            env, env_params, key, LinearSearchConfig(config.expert_generations), bonus
-        )
     if spec is None:
-        search = PolicySearchConfig()
-        search = replace(
-            search,
-            curriculum=paper_curriculum(name, config.expert_generations),
-            evolution=replace(search.evolution, num_generations=config.expert_generations),
-        )
-        return evolve_expert(env, env_params, search, key)
+        search = SEARCHES[_chosen(name, config)]
+        return search.find(name, env, env_params, key, config.expert_generations)
     return train_expert(env, env_params, spec, key, config.num_experts)
 
 

@@ -25,6 +25,7 @@ from scb.environments.synthetic import BanditParams, BanditState, SyntheticBandi
 from scb.evaluation import Policy, evaluate
 from scb.experts import best_agent
 from scb.keys import root_key, split_key
+from scb.measurement import Judge
 
 Reward = Callable[[jax.Array, jax.Array], jax.Array]  # ([O] observation, action) -> []
 
@@ -102,8 +103,11 @@ def train_sac_expert(
     agent = spec.agent(env)
     assert isinstance(agent, SAC)
 
-    state, mean_return = best_agent(agent, spec, env_params, key, num_agents, num_episodes)
-    return SACExpert(agent, state, env_params, mean_return)
+    judge = Judge(env, env_params, num_episodes, mode=True)
+    state, returns = best_agent(
+        agent, spec, spec.training_params(env_params), key, num_agents, judge
+    )
+    return SACExpert(agent, state, env_params, float(np.nanmax(returns)))
 
 
 def action_reward(expert: SACExpert, space: spaces.Box | spaces.Discrete) -> Reward:

@@ -115,7 +115,7 @@ def test_one_search_decides_nothing_and_searches_of_other_sizes_are_not_compared
 @pytest.fixture
 def tiny(monkeypatch):
     """A preset of a search on either, and what was searched and judged; neither takes time."""
-    asked = []
+    asked, kept = [], []
     worth = {"ppo": -9.0, "ppo-0.5": -3.0}  # the best clip
 
     def objective_of_run(config, folder):
@@ -128,7 +128,8 @@ def tiny(monkeypatch):
             load_objective("dpo"), metadata={"cost": {"environment_steps_validation": 7}}
         )
 
-    def compare(environment, objectives, seeds, spec, backend=None, points=15):
+    def compare(environment, objectives, seeds, spec, rows, backend=None, points=15):
+        kept.append(rows.path)
         scale = spec.hyperparameters.policy_output_scale
         asked.append((environment, scale, *(o.name for o in objectives)))
         return Comparison(
@@ -155,11 +156,11 @@ def tiny(monkeypatch):
         "tuning_agents": 2,
         "hopper": {"backend": "spring", "steps": 100, "agents": 2, "searches": 1},
     }
-    return plan, asked
+    return plan, asked, kept
 
 
 def test_what_a_report_has_is_not_measured_again(tiny, tmp_path):
-    plan, asked = tiny
+    plan, asked, kept = tiny
     plan["runs"], report = str(tmp_path / "runs"), {"preset": "tiny"}
     module.measure(plan, report, lambda: None)
     both = ("LPO (bandit) 0", "LPO (environment) 0")
@@ -169,6 +170,10 @@ def test_what_a_report_has_is_not_measured_again(tiny, tmp_path):
     table = report["evaluations"]["Pendulum, small last layer"]
     assert table["finals"]["ppo-0.5"] == [[-3.0, -4.0]]
     assert table["finals"]["LPO (bandit)"] == [[-14.0, -15.0]]
+    # Every table keeps its agents in a file of its own: two of them train under one name with other settings.
+    assert len(set(kept)) == len(kept) == 5 and {path.parent for path in kept} == {
+        tmp_path / "runs" / "tiny"
+    }
 
     asked.clear()
     module.measure(plan, report, lambda: None)
@@ -185,7 +190,7 @@ def test_what_a_report_has_is_not_measured_again(tiny, tmp_path):
 
 
 def test_a_report_of_other_searches_is_refused(tiny, tmp_path):
-    plan, _ = tiny
+    plan, *_ = tiny
     plan["runs"], report = str(tmp_path / "runs"), {"preset": "tiny"}
     module.measure(plan, report, lambda: None)
     plan["searches"]["bandit"]["settings"] = {"of": "something else"}

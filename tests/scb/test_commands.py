@@ -22,7 +22,7 @@ from scb.agents.ppo import PPOConfig
 from scb.agents.spec import bandit_agent
 from scb.cli import main
 from scb.command_line import Output
-from scb.commands import Discover
+from scb.commands import Discover, TrainConfig
 from scb.curriculum import CurriculumConfig, paper_curriculum
 from scb.discovery import BanditDiscovery, DiscoveryConfig
 from scb.environments.registry import make
@@ -361,6 +361,24 @@ def test_training_prints_the_sorted_returns_and_their_mean(bandit_file):
     assert call(*train, "--seed", "1").out != result.out
 
 
+def test_training_keeps_agents_for_other_statistics_and_goes_on(bandit_file, tmp_path):
+    run, rows = tmp_path / "run", tmp_path / "run" / "rows.jsonl"
+    train = ["train", "--bandit", bandit_file, "--agents", "3", "--episodes", "2"]
+    first = call(*train, "--out", run)
+    kept = rows.read_text()
+    found = [json.loads(line) for line in kept.splitlines()]
+    assert first.out == call(*train).out
+    assert [row["agent"] for row in found] == [0, 1, 2]
+    assert all(1e-5 < row["learning_rate"] < 0.02 for row in found)
+    # Killed while the second agent was written.
+    rows.write_text(kept[: kept.index("\n") + 40])
+    resumed = call("train", "--resume", run)
+    assert (resumed.code, resumed.out) == (0, first.out) and rows.read_text() == kept
+    assert call("train", "--resume", run, "--agents", "4").code == 2
+    assert call(*train, "--algorithm", "td3", "--out", tmp_path / "none").code == 2
+    assert not (tmp_path / "none").exists()
+
+
 @pytest.mark.parametrize("algorithm", [pytest.param("sac", marks=pytest.mark.slow), "dqn", "ddqn"])
 def test_every_fitting_algorithm_trains_in_a_bandit(bandit_file, algorithm):
     train = ["train", "--bandit", bandit_file, "--agents", "2", "--episodes", "1"]
@@ -607,7 +625,14 @@ def test_help_is_shown_for_every_command(arguments):
 
 
 def test_every_flag_of_a_discovery_is_explained_in_a_group_of_its_own():
-    for config in (DiscoveryConfig, BanditConfig, WarmStartConfig, EvolutionConfig, Output):
+    for config in (
+        DiscoveryConfig,
+        BanditConfig,
+        WarmStartConfig,
+        EvolutionConfig,
+        Output,
+        TrainConfig,
+    ):
         for field in fields(config):
             assert f"\n      {field.name}: " in config.__doc__
     shown = call("discover", "--help").out

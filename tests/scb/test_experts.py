@@ -15,6 +15,7 @@ from scb.environments.registry import make
 from scb.errors import UserError
 from scb.evolution import EvolutionConfig
 from scb.experts import PolicySearchConfig, best_agent, evolve_expert, judged, train_expert
+from scb.measurement import Judge
 from tests.scb.probes import (
     TWO_TARGETS,
     ContinuousCorridor,
@@ -179,14 +180,16 @@ class Ranked:
         return SimpleNamespace(returns=jnp.full(num_episodes, returns))
 
 
-SETTING = SimpleNamespace(hyperparameters=None, training_params=lambda env_params: env_params)
+SETTING = SimpleNamespace(hyperparameters=None)
+JUDGE = Judge(None, None, episodes=3)
 
 
 def test_an_agent_without_a_finite_return_is_not_the_best():
-    state, best = best_agent(Ranked(0.5), SETTING, None, jax.random.key(0), 20, 3)
-    assert 0.0 < float(state) == best <= 0.5
+    state, returns = best_agent(Ranked(0.5), SETTING, None, jax.random.key(0), 20, JUDGE)
+    assert 0.0 < float(state) == np.nanmax(returns) <= 0.5
+    assert np.isnan(returns).any()
 
 
 def test_agents_of_which_none_has_a_finite_return_are_refused():
     with pytest.raises(UserError, match="none of 4 agents has a finite return"):
-        best_agent(Ranked(-1.0), SETTING, None, jax.random.key(0), 4, 3)
+        best_agent(Ranked(-1.0), SETTING, None, jax.random.key(0), 4, JUDGE)

@@ -75,7 +75,11 @@ def test_a_warm_start_takes_a_linear_expert():
 @pytest.mark.parametrize(
     ("name", "arguments", "message"),
     [
-        ("CartPole-v1", {}, "a linear expert has continuous actions and CartPole-v1 discrete ones"),
+        (
+            "CartPole-v1",
+            {},
+            "the expert of a linear search has continuous actions and CartPole-v1 discrete ones",
+        ),
         ("Pendulum-v1", {"expert_steps": 9}, "expert_steps is 9, but a linear search finds"),
     ],
 )
