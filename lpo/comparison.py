@@ -13,7 +13,9 @@ import numpy as np
 
 from lpo.objectives import Objective
 from scb.agents.spec import AgentSpec, environment_agent
+from scb.environments.registry import environment_spec
 from scb.errors import UserError
+from scb.files import plain
 from scb.measurement import MODE, SAMPLED, Place, measure
 from scb.rows import Rows, pivot
 from scb.statistics import Estimate, estimate, paired_difference
@@ -30,6 +32,8 @@ class LearningCurves:
       returns: [S, P] mean return of `episodes` episodes, per seed.
       mode_actions: whether evaluation took the most likely actions or sampled ones.
       policy_output_scale: factor on the policy's last layer at initialisation.
+      lengths, speeds: [S, P] mean steps of those episodes, and their mean forward velocity, NaN where the
+        environment has none; None of curves that were made elsewhere.
     """
 
     environment: str
@@ -41,6 +45,8 @@ class LearningCurves:
     episodes: int
     mode_actions: bool
     policy_output_scale: float = 1.0
+    lengths: np.ndarray | None = None
+    speeds: np.ndarray | None = None
 
     @property
     def final(self) -> np.ndarray:
@@ -52,13 +58,32 @@ class LearningCurves:
         """[S] mean return over the training, the untrained agent left out."""
         return self.returns[:, 1:].mean(axis=1)
 
+    @property
+    def standing_still(self) -> float | None:
+        """What an episode without a fall and without moving earns here; None where that means nothing."""
+        return environment_spec(self.environment).standing_still(self.backend)
+
+    @property
+    def above_standing_still(self) -> float | None:
+        """Share of the agents that end above that."""
+        standing = self.standing_still
+        return None if standing is None else float(np.mean(self.final > standing))
+
     def as_dict(self) -> dict[str, Any]:
+        moving = {
+            name: [plain(x) for x in values[:, -1]]
+            for name, values in (("final_lengths", self.lengths), ("final_speeds", self.speeds))
+            if values is not None
+        }
         return {
-            **vars(self),
+            **{k: v for k, v in vars(self).items() if k not in ("lengths", "speeds")},
             "steps": self.steps.tolist(),
             "returns": self.returns.tolist(),
             "final_iqm": estimate(self.final).as_dict(),
             "area_iqm": estimate(self.area).as_dict(),
+            **moving,
+            "standing_still": self.standing_still,
+            "above_standing_still": self.above_standing_still,
         }
 
 
@@ -73,11 +98,23 @@ class Comparison:
         reference = self.curves[0]
         return {c.objective: paired_difference(c.final, reference.final) for c in self.curves[1:]}
 
+    @property
+    def caution(self) -> str:
+        """What to hold against the comparison, in a sentence; empty for nothing."""
+        standing = self.curves[0].standing_still
+        if standing is None or any(c.above_standing_still for c in self.curves):
+            return ""
+        return (
+            f"No agent is above standing still ({standing:g}): of moving, this tells one objective from another "
+            "nothing. Train for longer, or with other physics."
+        )
+
     def as_dict(self) -> dict[str, Any]:
         return {
             "curves": [c.as_dict() for c in self.curves],
             "reference": self.curves[0].objective,
             "paired_differences": {k: v.as_dict() for k, v in self.differences().items()},
+            "caution": self.caution,
         }
 
 
@@ -142,7 +179,10 @@ def compare(
         tell=tell,
     )
     steps = np.asarray(list(dict.fromkeys(row["step"] for row in found)))
-    returns = pivot(found, "objective", "seed", "step")
+    measured = (
+        pivot(found, "objective", "seed", "step", value=value)
+        for value in ("return", "length", "speed")
+    )
     return Comparison(
         [
             LearningCurves(
@@ -150,13 +190,15 @@ def compare(
                 place.backend,
                 objective.name,
                 steps,
-                of_it,
+                returns,
                 list(seeds),
                 episodes,
                 mode_actions,
                 float(spec.hyperparameters.policy_output_scale),
+                lengths,
+                speeds,
             )
-            for objective, of_it in zip(objectives, returns, strict=True)
+            for objective, returns, lengths, speeds in zip(objectives, *measured, strict=True)
         ]
     )
 

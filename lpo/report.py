@@ -258,7 +258,19 @@ def _comparison(name: str, comparison: Mapping[str, Any], learned: str) -> dict[
         "steps": thousands(max(curve["steps"][-1] for curve in curves)),
         "few_seeds": min(len(curve["seeds"]) for curve in curves) < _FEW_SEEDS,
         "backend": curves[0]["backend"],
+        "standing": f"{curves[0].get('standing_still') or 0:g}",
+        "moving": [_moving(c) for c in curves if c.get("above_standing_still") is not None],
+        "caution": comparison.get("caution", ""),
     }
+
+
+def _moving(curve: Mapping[str, Any]) -> str:
+    """How many of an objective's agents end above standing still, and how fast they all are."""
+    agents = len(curve["seeds"])
+    speeds = [x for x in curve.get("final_speeds", ()) if x is not None]
+    speed = f", {sum(speeds) / len(speeds):.2f} m/s" if speeds else ""
+    above = round(curve["above_standing_still"] * agents)
+    return f"{curve['objective']} {above} of {agents}{speed}"
 
 
 def _context(results: Mapping[str, Any], figures: Mapping[str, Path]) -> dict[str, Any]:

@@ -220,4 +220,6 @@ def run_suite(
         comparisons[environment_name] = comparison
         finals = ", ".join(f"{c.objective} {float(iqm(c.final)):.1f}" for c in comparison.curves)
         tell(f"{environment_name} (random {random[environment_name]:.1f}): {finals}")
+        if comparison.caution:
+            tell(f"{environment_name}: {comparison.caution}")
     return suite_scores(comparisons, random), comparisons

@@ -15,7 +15,7 @@ from rich.table import Table
 
 from lpo import figures
 from lpo.alignment import Regime, correlation_text, known_drifts, measure_alignment
-from lpo.comparison import Comparison, check_names, compare, ppo_spec
+from lpo.comparison import Comparison, LearningCurves, check_names, compare, ppo_spec
 from lpo.fitness import LABELS
 from lpo.objectives import Objective, load_objective
 from lpo.suite import run_suite
@@ -192,18 +192,22 @@ class Evaluate(Comparing):
         if self.config.suite is not None:
             self.run_suite(self.config.suite, objectives)
             return
-        table = Table(
-            "objective",
-            "final IQM [95 %]",
-            "area under the curve",
-            f"difference to {self.config.objectives[0]}",
-        )
         comparison = self.compare(objectives)
+        first, *_ = comparison.curves
+        columns = ["objective", "final IQM [95 %]", "area under the curve"]
+        table = Table(*columns, f"difference to {first.objective}")
+        if first.standing_still is not None:
+            table.add_column(f"above standing still ({first.standing_still:g})")
+            table.add_column("m/s")
+            table.add_column("steps an episode")
         differences = comparison.differences()
         for c in comparison.curves:
             final, area = str(estimate(c.final)), str(estimate(c.area))
-            table.add_row(c.objective, final, area, str(differences.get(c.objective, "")))
+            cells = [c.objective, final, area, str(differences.get(c.objective, ""))]
+            table.add_row(*cells, *_moving(c))
         console().print(table)
+        if comparison.caution:
+            console().print(comparison.caution)
 
     def run_suite(self, name: str, objectives: Sequence[Objective]) -> None:
         config, seeds = self.config, self.config.seed_list()
@@ -340,6 +344,16 @@ class Align(Measuring):
         printer.print(table)
         if folder is not None:
             plotting.save(figures.alignment_heatmap(report), folder / "alignment.png")
+
+
+def _moving(curves: LearningCurves) -> tuple[str, ...]:
+    """How many agents end above standing still, their mean speed and length of episodes; empty where none is known."""
+    standing, speeds, lengths = curves.standing_still, curves.speeds, curves.lengths
+    if standing is None or speeds is None or lengths is None:
+        return ()
+    above = int((curves.final > standing).sum())
+    share = f"{above} of {len(curves.final)}"
+    return share, f"{np.nanmean(speeds[:, -1]):.2f}", f"{np.nanmean(lengths[:, -1]):.0f}"
 
 
 def _named_apart(names: Sequence[str]) -> list[Objective]:

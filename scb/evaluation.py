@@ -20,6 +20,7 @@ class Episodes(NamedTuple):
     returns: jax.Array  # [E] undiscounted sum of rewards
     lengths: jax.Array  # [E] steps
     observations: RunningStatistics | None = None  # of what the policy saw, where asked for
+    speeds: jax.Array | None = None  # [E] mean forward velocity, of environments that have one
 
 
 def evaluate(
@@ -34,7 +35,7 @@ def evaluate(
     """Runs `num_episodes` episodes side by side, until the last has ended.
 
     Args:
-      env: any gymnax 1.x environment.
+      env: any gymnax 1.x environment. Where it has a `forward_velocity` of a state, episodes have speeds.
       env_params: its parameters.
       policy: (observation, key) -> action, for one environment.
       key: decides start states, transitions and the policy's randomness.
@@ -47,13 +48,14 @@ def evaluate(
       Episodes of shape [E].
     """
     limit = env_params.max_steps_in_episode if horizon is None else horizon
+    velocity = getattr(env, "forward_velocity", None)
     key_reset, key_loop = split_key(key)
     observation, state = jax.vmap(env.reset_env, in_axes=(0, None))(
         split_key(key_reset, num_episodes), env_params
     )
 
     def step(carry: Any) -> Any:
-        time, observation, state, active, returns, lengths, seen = carry
+        time, observation, state, active, returns, lengths, seen, distance = carry
         if moments:
             flat = jnp.reshape(observation, (num_episodes, -1))
             seen = merge_statistics(seen, RunningStatistics(active, flat, jnp.zeros_like(flat)))
@@ -66,8 +68,10 @@ def evaluate(
         truncated = jax.vmap(env.is_truncated, in_axes=(0, None))(state, env_params)
         returns = returns + jnp.where(active, jnp.reshape(reward, (num_episodes,)), 0.0)
         lengths = lengths + active
+        if velocity is not None:
+            distance = distance + jnp.where(active, jax.vmap(velocity)(state), 0.0)
         active = active & ~(terminated | truncated)
-        return time + 1, observation, state, active, returns, lengths, seen
+        return time + 1, observation, state, active, returns, lengths, seen, distance
 
     start = (
         jnp.int32(0),
@@ -77,9 +81,10 @@ def evaluate(
         jnp.zeros(num_episodes),
         jnp.zeros(num_episodes, jnp.int32),
         RunningStatistics.start(observation[0].size) if moments else None,
+        None if velocity is None else jnp.zeros(num_episodes),
     )
     start = jax.tree.map(lambda x: jnp.asarray(x), start)
-    *_, returns, lengths, seen = jax.lax.while_loop(
+    *_, returns, lengths, seen, distance = jax.lax.while_loop(
         lambda carry: (carry[0] < limit) & jnp.any(carry[3]), step, start
     )
-    return Episodes(returns, lengths, seen)
+    return Episodes(returns, lengths, seen, None if distance is None else distance / lengths)

@@ -224,8 +224,9 @@ def measure(
 
     Returns:
       A row for every objective, agent, point and kind of actions, in this order, with the columns
-      environment, backend, trained_in, algorithm, objective, seed, agent, step, actions, return, length (means
-      of the episodes), those of `agents.drawn`, and configuration.
+      environment, backend, trained_in, algorithm, objective, seed, agent, step, actions, return, length, speed
+      (means of the episodes; the speed None where the environment has no `forward_velocity`), those of
+      `agents.drawn`, and configuration.
 
     Raises:
       UserError: the rows hold such agents measured under another configuration.
@@ -305,6 +306,7 @@ def measure(
                             "actions": kind,
                             "return": plain(np.ravel(earned[kind][0][position])[point]),
                             "length": plain(np.ravel(earned[kind][1][position])[point]),
+                            "speed": plain(np.ravel(earned[kind][2][position])[point]),
                             **drawn,
                         }
                         for point, step in enumerate(steps)
@@ -363,6 +365,13 @@ def _program(
         training_params, judge_params = jax.tree.unflatten(structure, leaves)
         judges = {name: Judge(judge_env, judge_params, episodes, name == MODE) for name in actions}
         _, earned = train_and_judge(agent, hyperparameters, key, training_params, judges, every)
-        return {k: (x.returns.mean(-1), x.lengths.mean(-1)) for k, x in earned.items()}
+        return {
+            k: (
+                x.returns.mean(-1),
+                x.lengths.mean(-1),
+                jnp.full(x.returns.shape[:-1], jnp.nan) if x.speeds is None else x.speeds.mean(-1),
+            )
+            for k, x in earned.items()
+        }
 
     return map_population(one, size, (0, 0, *(None for x in numbers if x is None)))

@@ -134,7 +134,8 @@ def pivot(rows: Iterable[Row], *axes: str, value: str = "return") -> np.ndarray:
     for row in rows:
         place = tuple(at[row[axis]] for at, axis in zip(positions, axes, strict=True))
         filled[place] += 1
-        array[place] = np.nan if row[value] is None else row[value]
+        # A file of an earlier version lacks columns.
+        array[place] = np.nan if row.get(value) is None else row[value]
     if not (filled == 1).all():
         raise ValueError(f"the rows are not one for every combination of {', '.join(axes)}.")
     return array

@@ -217,6 +217,10 @@ class BraxEnvironment(environment.Environment[BraxState, BraxParams]):
         at_limit = state.time >= params.max_steps_in_episode
         return jnp.logical_and(at_limit, jnp.logical_not(self.is_terminated(state, params)))
 
+    def forward_velocity(self, state: BraxState) -> jax.Array:
+        """[] metres a second along x, as brax measures it over the last step; NaN where brax measures none."""
+        return jnp.asarray(state.brax_state.metrics.get("x_velocity", jnp.nan), jnp.float32)
+
     @staticmethod
     def _start(brax_state: "brax.envs.State") -> tuple[jax.Array, BraxState]:
         return brax_state.obs, BraxState(time=jnp.zeros((), jnp.int32), brax_state=brax_state)

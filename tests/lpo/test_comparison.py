@@ -50,6 +50,25 @@ def test_a_difference_is_positive_where_the_objective_is_better_than_the_referen
     assert differences["none"].value == -4
 
 
+def hoppers(objective: str, ends: list[float]) -> LearningCurves:
+    returns = np.array([[10.0, end] for end in ends])
+    place, steps, seeds = ("hopper", "spring", objective), np.array([0, 10]), list(range(len(ends)))
+    speeds = np.full(returns.shape, 0.25)
+    return LearningCurves(*place, steps, returns, seeds, 5, True, 1.0, 10 * returns, speeds)
+
+
+def test_where_no_agent_is_above_standing_still_it_is_said_that_nothing_can_be_told():
+    fallen, moving = hoppers("ppo", [400.0, 1000.0]), hoppers("dpo", [900.0, 1001.0])
+    assert [c.above_standing_still for c in (fallen, moving)] == [0.0, 0.5]
+    assert Comparison([fallen]).caution.startswith("No agent is above standing still (1000)")
+    assert Comparison([fallen, moving]).caution == ""
+    stored = Comparison([fallen, moving]).as_dict()["curves"][1]
+    assert stored["final_lengths"] == [9000.0, 10010.0] and stored["final_speeds"] == [0.25, 0.25]
+    assert (stored["standing_still"], stored["above_standing_still"]) == (1000.0, 0.5)
+    # A pendulum that hangs still earns no more than a random one.
+    assert curves().above_standing_still is None and Comparison([curves()]).caution == ""
+
+
 def test_dictionaries_are_json_and_hold_what_was_measured():
     comparison = Comparison([curves("ppo"), curves("dpo")])
     content = comparison.as_dict()

@@ -261,6 +261,17 @@ def test_physics_and_actions_are_named(tmp_path):
         assert list(row["cells"].values())[-3:] == ["20", "spring", "sampled"]
 
 
+def test_a_page_says_how_many_agents_are_above_standing_still(tmp_path):
+    speeds = np.full((12, 3), 0.5)
+    moving = comparison(1230.0, environment="hopper", backend="spring", speeds=speeds)
+    said = write(tmp_path, results(comparisons={"hopper": moving.as_dict()})).text
+    assert "standing still (1000), with the mean speed of all: ppo 0 of 12, 0.50 m/s;" in said
+    assert "mine 12 of 12, 0.50 m/s." in said and "No agent is above" not in said
+    still = comparison(30.0, environment="hopper", backend="spring", speeds=speeds)
+    said = write(tmp_path, results(comparisons={"hopper": still.as_dict()})).text
+    assert "No agent is above standing still (1000): of moving, this tells" in said
+
+
 def test_a_failed_certificate_is_not_hidden(tmp_path):
     made = results()
     made["objective"]["certificate"] |= {"holds": False, "minimum": -0.25}

@@ -126,6 +126,24 @@ def test_actions_are_clipped_to_the_actuators_bounds(env):
     assert not np.array_equal(after(1.0), after(0.5))
 
 
+def test_a_pole_has_no_forward_velocity(env):
+    _, state = env.reset(jax.random.key(0), env.default_params)
+    assert np.isnan(env.forward_velocity(state))
+
+
+@pytest.mark.slow
+def test_forward_velocity_is_the_way_of_a_step():
+    hopper = BraxEnvironment("hopper", "spring")
+    _, state = hopper.reset(jax.random.key(0), hopper.default_params)
+    _, after, *_ = hopper.step_env(
+        jax.random.key(1), state, jnp.array([0.5, -0.5, 1.0]), hopper.default_params
+    )
+    way = after.brax_state.pipeline_state.x.pos[0, 0] - state.brax_state.pipeline_state.x.pos[0, 0]
+    np.testing.assert_allclose(
+        hopper.forward_velocity(after), way / hopper.brax_env.dt, rtol=1e-3, atol=1e-4
+    )
+
+
 def test_an_action_of_another_shape_is_refused(env):
     _, state = env.reset(jax.random.key(0), env.default_params)
     with pytest.raises(AssertionError, match="shape"):

@@ -115,3 +115,18 @@ def test_it_matches_stepping_gymnaxs_environment_by_hand():
     np.testing.assert_allclose(episodes.returns, total, rtol=1e-5)
     np.testing.assert_array_equal(episodes.lengths, steps)
     assert steps == 25
+
+
+class Rolling(Corridor):
+    """Whose forward velocity is the cell that a step ends in."""
+
+    def forward_velocity(self, state):
+        return state.cell.astype(jnp.float32)
+
+
+def test_an_episodes_speed_is_the_mean_over_its_own_steps():
+    found = evaluate(Rolling(), PAYING, right, jax.random.key(0), EPISODES)
+    pairs = set(zip(found.lengths.tolist(), found.speeds.tolist(), strict=True))
+    # From cell 0 into 1, 2 and the next round's 0; what follows the end is not counted.
+    assert pairs == {(3, 1.0), (2, 1.0), (1, 0.0)}
+    assert evaluate(Corridor(), PAYING, right, jax.random.key(0), 2).speeds is None

@@ -103,6 +103,7 @@ def test_a_row_says_who_was_measured_where_and_how(file):
         "step": 72,
         "actions": "mode",
         "length": 1.0,
+        "speed": None,
     }
 
 
