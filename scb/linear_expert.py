@@ -16,9 +16,11 @@ import optax
 from evosax.algorithms import ARS
 from gymnax.environments import environment, spaces
 
+from scb.agents.agent import clip_to_space
 from scb.agents.normalization import RunningStatistics, merge_statistics, normalize
 from scb.errors import UserError, at_least, positive
-from scb.evaluation import Episodes, evaluate
+from scb.evaluation import Episodes, Policy, evaluate
+from scb.evolution import map_population
 from scb.experts import EPISODES, Expert, judged
 from scb.keys import key_at, named_key, split_key
 from scb.neuroevolution import network_action
@@ -36,6 +38,9 @@ class LinearSearchConfig:
       best: of the directions, those that the step is made of.
       sigma: standard deviation of the perturbations.
       learning_rate: of the step.
+      action_noise: standard deviation of Gaussian noise on the actions of the search's episodes, as a
+        share of half their range. Under it a policy is found that bears errors, such as those of an
+        agent that learned from it; judgements are without it.
       judge_every: generations between judgements of the unperturbed policy, of 20 episodes each; the
         policy that was judged best is the expert.
     """
@@ -45,10 +50,12 @@ class LinearSearchConfig:
     best: int = 8
     sigma: float = 0.03
     learning_rate: float = 0.02
+    action_noise: float = 0.0
     judge_every: int = 10
 
     def __post_init__(self) -> None:
         at_least(1, self, "generations", "directions", "best", "judge_every")
+        at_least(0, self, "action_noise")
         positive(self, "sigma", "learning_rate")
         if self.best > self.directions:
             raise UserError(f"best is {self.best} of {self.directions} directions: take no more.")
@@ -83,36 +90,32 @@ def search_linear_expert(
     search.elite_ratio = config.best / config.directions
     params = search.default_params
 
-    def roll(policies: Linear, seen: RunningStatistics, keys: jax.Array, episodes: int) -> Episodes:
-        def one(policy: Linear, key: jax.Array) -> Episodes:
-            act = _policy(policy, seen, space)
-            return evaluate(
-                env,
-                env_params,
-                lambda observation, _: act(jnp.ravel(observation)),
-                key,
-                episodes,
-                moments=True,
-            )
+    def one(policy: Linear, seen: RunningStatistics, key: jax.Array) -> Episodes:
+        act = noisy(_policy(policy, seen, space), space, config.action_noise)
+        return evaluate(env, env_params, act, key, 1, moments=True)
 
-        return jax.vmap(one)(policies, keys)
+    roll = map_population(one, 2 * config.directions, (0, None, 0))
 
     @jax.jit
-    def generation(state: Any, seen: RunningStatistics, key: jax.Array) -> Any:
-        key_ask, key_roll, key_tell = split_key(key, 3)
+    def ask(state: Any, key: jax.Array) -> Any:
+        key_ask, key_roll = split_key(key)
         population, state = search.ask(key_ask, state, params)
-        # Both ways from the same start state.
-        keys = jnp.tile(split_key(key_roll, config.directions), 2)
-        episodes = roll(population, seen, keys, 1)
+        # Both ways from the same start state, with the same noise.
+        return population, state, jnp.tile(split_key(key_roll, config.directions), 2)
+
+    @jax.jit
+    def tell(
+        state: Any, population: Any, episodes: Episodes, seen: RunningStatistics, key: jax.Array
+    ) -> Any:
         fitness = (episodes.returns - bonus * episodes.lengths)[:, 0]
-        state, _ = search.tell(key_tell, population, -fitness, state, params)
+        state, _ = search.tell(key, population, -fitness, state, params)
         assert episodes.observations is not None
         return state, merge_statistics(seen, episodes.observations), episodes.lengths.sum()
 
     @jax.jit
     def mean_return(policy: Linear, seen: RunningStatistics, key: jax.Array) -> Any:
-        alone = jax.tree.map(lambda x: x[None], policy)
-        episodes = roll(alone, seen, key[None], EPISODES)
+        act = noisy(_policy(policy, seen, space), space, 0.0)
+        episodes = evaluate(env, env_params, act, key, EPISODES)
         return episodes.returns.mean(), episodes.lengths.sum()
 
     state = search.init(named_key(key, "start"), zero, params)
@@ -120,7 +123,10 @@ def search_linear_expert(
     expert, best = (zero, seen), -np.inf
     keys, key_judge = named_key(key, "generations"), named_key(key, "judgement")
     for number in range(1, config.generations + 1):
-        state, seen, taken = generation(state, seen, key_at(keys, number))
+        key_ask, key_tell = split_key(key_at(keys, number))
+        population, state, key_roll = ask(state, key_ask)
+        episodes = roll(population, seen, key_roll)
+        state, seen, taken = tell(state, population, episodes, seen, key_tell)
         steps += float(taken)
         if number % config.judge_every == 0 or number == config.generations:
             mean = search.get_mean(state)
@@ -130,6 +136,23 @@ def search_linear_expert(
             if earned > best:
                 expert, best = (mean, seen), float(earned)
     return judged(_policy(*expert, space), env, env_params, named_key(key, "return"), int(steps))
+
+
+def noisy(policy: Callable[[jax.Array], jax.Array], space: spaces.Box, noise: float) -> Policy:
+    """A policy of flattened observations, with Gaussian noise on its actions, as `evaluate` takes it.
+
+    Args:
+      noise: standard deviation, as a share of half the actions' range; actions stay within their bounds.
+    """
+    half = noise * (space.high - space.low) / 2
+
+    def act(observation: jax.Array, key: jax.Array) -> jax.Array:
+        action = jnp.reshape(policy(jnp.ravel(observation)), space.shape)
+        if noise == 0:
+            return action
+        return clip_to_space(action + half * jax.random.normal(key, space.shape), space)
+
+    return act
 
 
 def _policy(

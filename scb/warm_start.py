@@ -30,14 +30,16 @@ from scb.environments.registry import environment_spec
 from scb.environments.synthetic import BanditParams, SyntheticBandit, Weights
 from scb.errors import UserError, at_least, one_of
 from scb.experts import Expert, PolicySearchConfig, evolve_expert, train_expert
-from scb.keys import split_key
-from scb.linear_expert import LinearSearchConfig, search_linear_expert
+from scb.keys import named_key, split_key
+from scb.linear_expert import LinearSearchConfig, noisy, search_linear_expert
 
 CONSTRUCTIONS = ("advantage", "q", "action_distance")
 
 
-def _evolved(name: str, env: Any, env_params: Any, key: jax.Array, generations: int) -> Expert:
-    search = PolicySearchConfig()
+def _evolved(
+    name: str, env: Any, env_params: Any, key: jax.Array, config: "WarmStartConfig"
+) -> Expert:
+    search, generations = PolicySearchConfig(), config.expert_generations
     search = replace(
         search,
         curriculum=paper_curriculum(name, generations),
@@ -46,17 +48,23 @@ def _evolved(name: str, env: Any, env_params: Any, key: jax.Array, generations: 
     return evolve_expert(env, env_params, search, key)
 
 
-def _linear(name: str, env: Any, env_params: Any, key: jax.Array, generations: int) -> Expert:
+def _linear(
+    name: str, env: Any, env_params: Any, key: jax.Array, config: "WarmStartConfig"
+) -> Expert:
     standing = environment_spec(name).standing_still() or 0.0
     bonus = standing / env_params.max_steps_in_episode
-    return search_linear_expert(env, env_params, key, LinearSearchConfig(generations), bonus)
+    search = LinearSearchConfig(config.expert_generations)
+    if config.expert_noise:
+        # Where actions err anyway a larger step is no more noise, and finds gains that bear errors.
+        search = replace(search, sigma=0.15, learning_rate=0.09, action_noise=config.expert_noise)
+    return search_linear_expert(env, env_params, key, search, bonus)
 
 
 class _Search(NamedTuple):
     """What finds experts that are no agents: in words, how, and whether actions must be continuous."""
 
     what: str
-    find: Callable[[str, Any, Any, jax.Array, int], Expert]
+    find: Callable[[str, Any, Any, jax.Array, "WarmStartConfig"], Expert]
     continuous: bool = False
 
 
@@ -81,13 +89,19 @@ class WarmStartConfig:
       num_experts: agents trained on the environment; the best of them is the expert.
       expert_steps: environment steps of each; the environment's own setting where None.
       expert_generations: of the evolution or the linear search, where that finds the expert.
+      expert_noise: standard deviation of Gaussian noise on the expert's actions, as a share of half their
+        range: where a linear search looks for it, so that it bears the errors of agents that learn
+        from the bandit, and on the trajectories whose states the bandit's contexts are fitted to. With 0
+        those mix expert and random actions.
       min_spread: entries of the observation whose standard deviation is smaller are stretched about
         their mean until they have it, and the expert says what it does there; 0 for the states as
         they are. Agents learn little from an entry as small as a car's velocity. For
         "action_distance" only: Q-values cannot be simulated from states that don't exist.
       discount: of the Q-function.
       num_states: states that the dataset holds.
-      num_actions: actions that are tried in each of them.
+      num_actions: actions that are tried in each of them, uniform but for the expert's.
+      near_actions: of those, how many lie about the expert's, with a standard deviation of 0.15 of
+        their range.
       horizon: steps after which a Monte-Carlo return is cut off.
       fit_steps: Adam steps of each regression.
     """
@@ -97,10 +111,12 @@ class WarmStartConfig:
     num_experts: int = 8
     expert_steps: int | None = None
     expert_generations: int = 80
+    expert_noise: float = 0.0
     min_spread: float = 0.0
     discount: float = 0.95
     num_states: int = 4096
     num_actions: int = 16
+    near_actions: int = 0
     horizon: int = 100
     fit_steps: int = 4000
 
@@ -108,7 +124,7 @@ class WarmStartConfig:
         one_of("warm-start construction", self.construction, CONSTRUCTIONS)
         experts = ("auto", *SEARCHES, *ALGORITHMS)
         one_of("expert", self.expert, experts)
-        at_least(0, self, "min_spread")
+        at_least(0, self, "min_spread", "expert_noise", "near_actions")
         if not 0 <= self.discount <= 1:
             raise UserError(f"discount is {self.discount}: it must be between 0 and 1.")
         if self.min_spread > 0 and self.construction != "action_distance":
@@ -118,6 +134,11 @@ class WarmStartConfig:
             )
         at_least(1, self, "num_experts", "num_states", "num_actions")
         at_least(1, self, "horizon", "fit_steps", "expert_generations")
+        if self.near_actions >= self.num_actions:
+            raise UserError(
+                f"near_actions is {self.near_actions} of {self.num_actions} actions, one of them the expert's: take "
+                f"at most {self.num_actions - 1}."
+            )
 
 
 class ExpertDataset(NamedTuple):
@@ -137,6 +158,10 @@ def expert_agent(
     Raises:
       UserError: an expert that doesn't fit the action space, or steps that it can't be trained for.
     """
+    if isinstance(space, spaces.Discrete) and (config.expert_noise or config.near_actions):
+        raise UserError(
+            f"expert_noise and near_actions are of continuous actions, and {name} has discrete ones: leave them out."
+        )
     algorithm = _chosen(name, config)
     if algorithm in SEARCHES:
         search = SEARCHES[algorithm]
@@ -173,7 +198,7 @@ def find_expert(
     spec = expert_agent(name, env.action_space(env_params), config)
     if spec is None:
         search = SEARCHES[_chosen(name, config)]
-        return search.find(name, env, env_params, key, config.expert_generations)
+        return search.find(name, env, env_params, key, config)
     return train_expert(env, env_params, spec, key, config.num_experts)
 
 
@@ -187,13 +212,14 @@ def expert_dataset(
     """Q-values by simulation: from a stored state take an action once, then follow the expert.
 
     States come from trajectories that mix expert and random actions, each with its own proportion,
-    so that they cover what an agent meets on its way to becoming an expert. All actions of a state
+    so that they cover what an agent meets on its way to becoming an expert, or from the expert's with
+    `expert_noise`. All actions of a state
     share one key: their differences are exact where the environment is deterministic.
 
     Returns:
       (the dataset, environment steps it took).
     """
-    space = env.action_space(env_params)
+    space, noise = env.action_space(env_params), config.expert_noise
     key_roll, key_pick, _, key_q = split_key(key, 4)
 
     def expert_policy(observation: jax.Array) -> jax.Array:
@@ -205,10 +231,14 @@ def expert_dataset(
     def step(carry: Any, key: jax.Array) -> Any:
         env_state, observation, skill = carry
         key_random, key_mix, key_step = split_key(key, 3)
-        random_action = space.sample(key_random)
-        action = jnp.where(
-            jax.random.uniform(key_mix) < skill, expert_policy(observation), random_action
-        )
+        if noise:
+            assert not isinstance(space, spaces.Discrete)
+            action = noisy(expert.policy, space, noise)(observation, key_random)
+        else:
+            random_action = space.sample(key_random)
+            action = jnp.where(
+                jax.random.uniform(key_mix) < skill, expert_policy(observation), random_action
+            )
         next_observation, next_state, *_ = env.step(key_step, env_state, action, env_params)
         return (next_state, next_observation, skill), (env_state, observation)
 
@@ -246,11 +276,18 @@ def expert_dataset(
     @jax.vmap
     def label(env_state: Any, observation: jax.Array, key: jax.Array) -> Any:
         key_random, key_follow = split_key(key)
+        key_near = named_key(key, "near")
         best = jnp.reshape(expert_policy(observation), space.shape)
         if isinstance(space, spaces.Discrete):
             actions = jnp.arange(space.n)
         else:
-            random = jax.vmap(space.sample)(split_key(key_random, config.num_actions - 1))
+            number = config.num_actions - 1
+            random = jax.vmap(space.sample)(split_key(key_random, number))
+            if config.near_actions:
+                about = noisy(expert.policy, space, 0.3)
+                near = jax.vmap(about, in_axes=(None, 0))(observation, split_key(key_near, number))
+                which = jnp.arange(number) < config.near_actions
+                random = jnp.where(jnp.expand_dims(which, range(1, random.ndim)), near, random)
             actions = jnp.concatenate([best[None], random])
         if config.construction == "action_distance":
             q = jnp.zeros(actions.shape[0])  # it only asks what the expert does

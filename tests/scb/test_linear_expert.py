@@ -46,6 +46,27 @@ def test_the_key_alone_decides_it(expert):
     assert (jax.vmap(other.policy)(between) != jax.vmap(expert.policy)(between)).any()
 
 
+def test_a_policy_that_bears_errors_is_found_under_noise():
+    """Beside the cliff the best action without noise is 0.5; whoever errs keeps away from it."""
+
+    class Cliff(ContinuousCorridor):
+        def step_env(self, key, state, action, params):
+            observation, state, _, _, info = super().step_env(key, state, action, params)
+            falls = action[0] > 0.5
+            return observation, state, jnp.where(falls, -5.0, action[0]), jnp.bool_(True), info
+
+    def best(noise):
+        size = {"generations": 100, "best": 8, "sigma": 0.1, "learning_rate": 0.1}
+        config = replace(SEARCH, **size, action_noise=noise)
+        env = Cliff(cells=1)
+        found = search_linear_expert(env, env.default_params, jax.random.key(0), config)
+        return float(found.policy(jnp.ones(1))[0])
+
+    # With a deviation of 0.3 * 1.5 an action of -0.35 earns most; without noise 0.5, to which the search's own
+    # deviations keep a distance.
+    assert best(0.3) < 0.0 < 0.3 < best(0.0) <= 0.5
+
+
 class Ledge(ContinuousCorridor):
     """Every step pays 1; an action a above 0.5 ends the episode, and pays 2 a more."""
 

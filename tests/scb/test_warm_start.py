@@ -25,7 +25,7 @@ from scb.warm_start import (
     fit_bandit,
     reward_targets,
 )
-from tests.scb.probes import Corridor, CorridorParams, context_bandit
+from tests.scb.probes import ContinuousCorridor, Corridor, CorridorParams, context_bandit
 
 TINY = PPOConfig(
     num_envs=2, num_steps=8, num_epochs=1, num_minibatches=1, total_steps=16, hidden_sizes=(4,)
@@ -164,6 +164,50 @@ def test_the_action_distance_asks_the_expert_only_and_simulates_no_q_values():
     # The expert takes 0 everywhere: of the two actions the first is right, half of all; deviation 1/2.
     target = reward_targets(dataset, "action_distance", discrete=True)
     np.testing.assert_allclose(target, np.tile([2.0, 0.0], (16, 1)), rtol=1e-5)
+
+
+@pytest.fixture(scope="module")
+def noisy_dataset():
+    """Of the pendulum, whose torques lie in [-2, 2] and whose expert holds 0.5."""
+    env, params = make("Pendulum-v1")
+    half = Expert(lambda observation: jnp.full(1, 0.5), mean_return=0.0, environment_steps=0)
+    config = WarmStartConfig(expert_noise=0.1, num_states=512, num_actions=11, near_actions=6)
+    return expert_dataset(half, env, params, jax.random.key(4), config)[0]
+
+
+def test_tried_actions_lie_about_the_experts_and_everywhere(noisy_dataset):
+    tried = np.asarray(noisy_dataset.action)[..., 0]
+    np.testing.assert_array_equal(tried[:, 0], 0.5)
+    near, uniform = tried[:, 1:7], tried[:, 7:]
+    # 0.15 of a range of 4; the bound at 2, 2.5 deviations away, takes little of that. Uniform: 4 / sqrt(12).
+    assert near.mean() == pytest.approx(0.5, abs=0.05) and near.std() == pytest.approx(
+        0.6, rel=0.05
+    )
+    assert uniform.std() == pytest.approx(4 / np.sqrt(12), rel=0.05)
+    assert len(np.unique(tried[:, 1:])) > 512 * 9
+
+
+def test_what_the_expert_does_there_is_without_noise(noisy_dataset):
+    np.testing.assert_array_equal(noisy_dataset.expert_action, 0.5)
+
+
+class Echo(ContinuousCorridor):
+    """Observes the action before, in an episode without end."""
+
+    def step_env(self, key, state, action, params):
+        _, state, reward, _, info = super().step_env(key, state, action, params)
+        return jnp.full(self.cells, action[0]), state, reward, jnp.bool_(False), info
+
+
+def test_states_are_those_that_the_expert_visits_under_noise():
+    env = Echo(cells=1)
+    params = env.default_params.replace(max_steps_in_episode=1000)
+    config = WarmStartConfig(expert_noise=0.2, num_states=2048)
+    dataset, _ = expert_dataset(
+        idle(env.action_space(params)), env, params, jax.random.key(3), config
+    )
+    # The expert's 0 with a deviation of 0.2 times half of a range of 3; one in 200 is a start.
+    assert np.std(dataset.observation) == pytest.approx(0.3, rel=0.1)
 
 
 def test_the_horizon_cuts_the_return():
@@ -428,6 +472,11 @@ def test_evolution_gets_the_papers_curriculum_at_its_own_length(monkeypatch):
         ({"num_experts": 0}, "num_experts is 0: it must be at least 1"),
         ({"num_states": 0}, "num_states is 0"),
         ({"num_actions": -2}, "num_actions is -2"),
+        (
+            {"near_actions": 16},
+            "near_actions is 16 of 16 actions, one of them the expert's: take at most 15",
+        ),
+        ({"expert_noise": -0.1}, "expert_noise is -0.1: it must be 0 or larger"),
         ({"horizon": 0}, "horizon is 0"),
         ({"fit_steps": 0}, "fit_steps is 0"),
         ({"expert_generations": 0}, "expert_generations is 0"),
