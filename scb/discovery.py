@@ -222,8 +222,8 @@ class BanditDiscovery:
         check_fits(start, self.env, self.env_params, self.config.environment)
         if start.weight_shapes() != self.bandit.weight_shapes():
             raise UserError(
-                f"{name} has other layer sizes than the bandit to discover: start from one whose hidden_size is "
-                f"{self.config.bandit.hidden_size}."
+                f"{name} has other layer sizes than the bandit to discover: start from one of the form "
+                f"{self.config.bandit.form} whose hidden_size is {self.config.bandit.hidden_size}."
             )
         return start.default_params.weights
 
@@ -238,6 +238,10 @@ class BanditDiscovery:
             return weights
         assert isinstance(self.bandit, SyntheticBandit)
         return standardize_reward(self.bandit, weights, self.config.reward_std)
+
+    def units(self, solution: Weights) -> Weights | None:
+        """What a change of 1 is for each weight."""
+        return self.bandit.units(solution) if isinstance(self.bandit, SyntheticBandit) else None
 
     @cached_property
     def _expert_fit(self) -> Weights:
@@ -365,12 +369,7 @@ def standardize_reward(bandit: SyntheticBandit, weights: Weights, std: float) ->
             f"a standard deviation of {std}: leave reward_std out, or start from other weights."
         )
     factor = std / spread
-    # Through the network's last layer, which is linear.
-    reward = dict(weights["reward"])
-    name = max(reward)
-    last = jax.tree.map(lambda x: x * factor, reward[name])
-    reward[name] = {**last, "bias": last["bias"] - factor * rewards.mean()}
-    return {**weights, "reward": reward}
+    return bandit.with_reward(weights, factor, -factor * float(rewards.mean()))
 
 
 def check_fits(

@@ -9,7 +9,7 @@ distribution's mean, checkpoints, resume, and logs.
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Annotated, Any, Protocol
+from typing import Annotated, Any, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -121,6 +121,14 @@ class Problem(Protocol):
 
     def judgement_steps(self) -> EnvironmentSteps:
         """Environment steps of one `evaluate_mean`."""
+
+
+@runtime_checkable
+class Scaled(Protocol):
+    """A problem whose numbers are of different sizes."""
+
+    def units(self, solution: Any) -> Any:
+        """Of the first solution: what a change of 1 is for each number, or None where it is 1 for all."""
 
 
 @dataclass(frozen=True)
@@ -262,7 +270,9 @@ def evolve(
     solution = problem.initial_solution(key_solution)
     strategy = strategy_for(config, solution)
     state = {
-        "strategy": strategy.start(key_strategy, solution),
+        "strategy": strategy.start(
+            key_strategy, solution, problem.units(solution) if isinstance(problem, Scaled) else None
+        ),
         "best_mean": solution,
         "best_mean_fitness": jnp.float32(-jnp.inf),
         "best_mean_generation": jnp.int32(-1),

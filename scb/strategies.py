@@ -74,10 +74,20 @@ class Strategy:
         if hasattr(self._params, "std_init"):
             # evosax starts SNES at a standard deviation of 1; the paper's is 0.05.
             self._params = self._params.replace(std_init=config.sigma)
-        self._sigma = config.sigma
+        self._sigma, self._name = config.sigma, config.strategy
         self._size = config.population_size
 
-    def start(self, key: jax.Array, solution: Any) -> Any:
+    def start(self, key: jax.Array, solution: Any, units: Any = None) -> Any:
+        """The state before the first ask; `units`, a tree like the solution, are factors on its initial deviations."""
+        if units is not None:
+            state = self._algorithm.init(key, solution, self._params)
+            factors = jax.flatten_util.ravel_pytree(units)[0]
+            if np.shape(getattr(state, "std", 0.0)) != factors.shape:
+                raise UserError(
+                    f"{self._name} has one deviation for all weights, and those of this bandit have different sizes: "
+                    "choose SNES, or the form networks."
+                )
+            return state.replace(std=state.std * factors)
         if self.has_mean:
             return self._algorithm.init(key, solution, self._params)
         key_population, key_init = split_key(key)

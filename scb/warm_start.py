@@ -26,9 +26,10 @@ from scb.agents.spec import (
 )
 from scb.agents.tables import WARM_START
 from scb.curriculum import paper_curriculum
+from scb.environments.linear import fitted
 from scb.environments.registry import environment_spec
 from scb.environments.synthetic import BanditParams, SyntheticBandit, Weights
-from scb.errors import UserError, at_least, one_of
+from scb.errors import UserError, at_least, one_of, positive
 from scb.experts import Expert, PolicySearchConfig, evolve_expert, train_expert
 from scb.keys import named_key, split_key
 from scb.linear_expert import LinearSearchConfig, noisy, search_linear_expert
@@ -97,6 +98,9 @@ class WarmStartConfig:
         their mean until they have it, and the expert says what it does there; 0 for the states as
         they are. Agents learn little from an entry as small as a car's velocity. For
         "action_distance" only: Q-values cannot be simulated from states that don't exist.
+      stretch: factor on the states' deviations from their mean, after that; the expert says what it does
+        there. Agents that meet more than they need learn better what they need. For
+        "action_distance" only.
       discount: of the Q-function.
       num_states: states that the dataset holds.
       num_actions: actions that are tried in each of them, uniform but for the expert's.
@@ -113,6 +117,7 @@ class WarmStartConfig:
     expert_generations: int = 80
     expert_noise: float = 0.0
     min_spread: float = 0.0
+    stretch: float = 1.0
     discount: float = 0.95
     num_states: int = 4096
     num_actions: int = 16
@@ -127,11 +132,14 @@ class WarmStartConfig:
         at_least(0, self, "min_spread", "expert_noise", "near_actions")
         if not 0 <= self.discount <= 1:
             raise UserError(f"discount is {self.discount}: it must be between 0 and 1.")
-        if self.min_spread > 0 and self.construction != "action_distance":
-            raise UserError(
-                f"min_spread is {self.min_spread}, which the construction {self.construction} cannot use: "
-                "take action_distance, or a min_spread of 0."
-            )
+        positive(self, "stretch")
+        for field, none in (("min_spread", 0), ("stretch", 1)):
+            value = getattr(self, field)
+            if value != none and self.construction != "action_distance":
+                raise UserError(
+                    f"{field} is {value}, which the construction {self.construction} cannot use: "
+                    f"take action_distance, or a {field} of {none}."
+                )
         at_least(1, self, "num_experts", "num_states", "num_actions")
         at_least(1, self, "horizon", "fit_steps", "expert_generations")
         if self.near_actions >= self.num_actions:
@@ -296,8 +304,8 @@ def expert_dataset(
         return actions, q, best
 
     actions, q, best = label(env_states, observations, split_key(key_q, config.num_states))
-    if config.min_spread > 0:
-        observations, best = _stretched(observations, config.min_spread, expert_policy)
+    if config.min_spread > 0 or config.stretch != 1:
+        observations, best = _stretched(observations, config, expert_policy)
         best = jnp.reshape(best, (config.num_states, *space.shape))
         if not isinstance(space, spaces.Discrete):
             actions = actions.at[:, 0].set(best)
@@ -309,12 +317,13 @@ def expert_dataset(
 
 
 def _stretched(
-    observations: jax.Array, min_spread: float, policy: Callable[[jax.Array], jax.Array]
+    observations: jax.Array, config: WarmStartConfig, policy: Callable[[jax.Array], jax.Array]
 ) -> tuple[jax.Array, jax.Array]:
-    """[S, O] states whose every entry has at least this standard deviation, and what the expert does there."""
+    """[S, O] states whose every entry has at least the least deviation, stretched; and what the expert does there."""
     flat = jnp.reshape(observations, (observations.shape[0], -1))
     mean, std = flat.mean(axis=0), flat.std(axis=0)
-    stretched = mean + (flat - mean) * jnp.maximum(1.0, min_spread / (std + 1e-8))
+    factors = config.stretch * jnp.maximum(1.0, config.min_spread / (std + 1e-8))
+    stretched = mean + (flat - mean) * factors
     return stretched, jax.jit(jax.vmap(policy))(stretched)
 
 
@@ -346,6 +355,8 @@ def fit_bandit(
       (weights, {"reward_r2": explained variance of the reward, "energy_distance": of the
       contexts}).
     """
+    if bandit.linear:
+        return _fit_linear(bandit, dataset, config)
     key_init, key_reward, key_context = split_key(key, 3)
     weights = bandit.init_weights(key_init)
     target = reward_targets(dataset, config.construction, bandit.discrete)
@@ -389,6 +400,25 @@ def fit_bandit(
         "energy_distance": float(distance),
     }
     return jax.tree.map(np.asarray, {"initial_state": context, "reward": reward}), report
+
+
+def _fit_linear(
+    bandit: SyntheticBandit, dataset: ExpertDataset, config: WarmStartConfig
+) -> tuple[Weights, dict[str, float]]:
+    """The closed form, and how much of the expert's actions it explains."""
+    if config.construction != "action_distance":
+        raise UserError(
+            f"the construction is {config.construction}, and a linear bandit's reward is a distance of actions: take "
+            "action_distance."
+        )
+    states = np.asarray(dataset.observation)
+    best = np.reshape(dataset.expert_action, (len(states), -1))
+    low, high = bandit.bounds
+    weights = fitted(states, best, low, high)
+    reward = weights["reward"]
+    shares = np.tanh((states - reward["center"]) @ reward["kernel"] + reward["bias"])
+    errors = (low + high) / 2 + shares * (high - low) / 2 - best
+    return weights, {"action_r2": float(1.0 - errors.var() / best.var(axis=0).mean())}
 
 
 def energy_distance(a: jax.Array, b: jax.Array) -> jax.Array:

@@ -14,15 +14,18 @@ from typing import Any, TypeAlias, TypeVar, cast
 import distrax
 import jax
 import jax.numpy as jnp
+import numpy as np
+from flax import linen as nn
 from flax import struct
 from gymnax.environments import environment, spaces
 from jax.typing import ArrayLike
 
 from scb.agents.networks import ACTIVATIONS, MLP
+from scb.environments.linear import PolicyDistance, units
 from scb.errors import UserError, at_least, one_of
 from scb.keys import root_key, split_key
 
-Weights: TypeAlias = dict[str, dict[str, dict[str, jax.Array]]]
+Weights: TypeAlias = dict[str, dict[str, Any]]
 
 
 def _one_hot_latent(logits: jax.Array, key: jax.Array) -> jax.Array:
@@ -36,6 +39,9 @@ LATENTS: dict[str, Callable[[jax.Array, int], jax.Array]] = {
     # The paper's second categorical: probabilities softmax(1, 2, ..., n).
     "softmax_categorical": lambda key, size: _one_hot_latent(jnp.arange(1.0, size + 1.0), key),
 }
+
+
+FORMS = ("networks", "linear")
 
 
 @struct.dataclass
@@ -65,6 +71,9 @@ class BanditConfig:
     """What decides a bandit's shapes and program; defaults are the paper's.
 
     Attributes:
+      form: networks (as the paper, of one hidden layer each) or linear (contexts normally distributed, and
+        the reward a distance to a linear policy's action; for continuous actions), which has no
+        hidden layer and no activation.
       hidden_size: units of each network's hidden layer.
       activation: tanh, relu or swish.
       latent: normal, uniform, categorical or softmax_categorical.
@@ -75,8 +84,10 @@ class BanditConfig:
     activation: str = "tanh"
     latent: str = "normal"
     latent_size: int | None = None
+    form: str = "networks"
 
     def __post_init__(self) -> None:
+        one_of("bandit form", self.form, FORMS)
         one_of("bandit activation", self.activation, ACTIVATIONS)
         one_of("latent distribution", self.latent, LATENTS)
         at_least(1, self, "hidden_size", "latent_size")
@@ -171,7 +182,7 @@ class SyntheticEnvironment(environment.Environment[_State, _Params]):
         """[O] observation, action -> [] reward without noise: in one-step episodes the Q-function."""
         return self._learned("reward", self._inputs(context, action), params)[0]
 
-    def _network(self, name: str) -> MLP:
+    def _network(self, name: str) -> nn.Module:
         size = self.observation_size if name in ("initial_state", "transition") else 1
         return MLP((self.config.hidden_size,), size, self.config.activation)
 
@@ -203,6 +214,48 @@ class SyntheticBandit(SyntheticEnvironment[BanditState, BanditParams]):
         name: str = "SyntheticBandit",
     ) -> None:
         super().__init__(observation_size, action_space, config or BanditConfig(), weights, name)
+        if self.linear and self.discrete:
+            raise UserError(
+                f"{name} has discrete actions, and a linear bandit continuous ones: choose the form networks."
+            )
+
+    @property
+    def linear(self) -> bool:
+        """Whether it is of the form linear."""
+        return self.config.form == "linear"
+
+    def _network(self, name: str) -> nn.Module:
+        if not self.linear:
+            return super()._network(name)
+        if name == "initial_state":
+            return MLP((), self.observation_size, self.config.activation)
+        return PolicyDistance(*(tuple(x.tolist()) for x in self.bounds))
+
+    @property
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """[A] lowest and [A] highest actions, of continuous ones."""
+        space = cast(spaces.Box, self._action_space)
+        low, high = (
+            np.broadcast_to(np.asarray(x), space.shape).ravel() for x in (space.low, space.high)
+        )
+        return low, high
+
+    def units(self, weights: Weights) -> Weights | None:
+        """What a change of 1 is for each weight; None where it is 1 for all."""
+        return units(weights) if self.linear else None
+
+    def with_reward(self, weights: Weights, factor: float, shift: float) -> Weights:
+        """The bandit whose reward is `factor * reward + shift`."""
+        reward = dict(weights["reward"])
+        if self.linear:
+            reward["log_scale"] = reward["log_scale"] + jnp.log(factor)
+            reward["offset"] = reward["offset"] * factor + shift
+        else:
+            # Through the network's last layer, which is linear.
+            name = max(reward)
+            last = jax.tree.map(lambda x: x * factor, reward[name])
+            reward[name] = {**last, "bias": last["bias"] + shift}
+        return {**weights, "reward": reward}
 
     def reset_env(self, key: jax.Array, params: BanditParams) -> tuple[jax.Array, BanditState]:
         context = self.draw_context(key, params)

@@ -206,7 +206,11 @@ def synthetic_for(
                 f"max_steps is {max_steps}, and parameterization I has episodes of 1 step: leave it out, "
                 "or choose TI."
             )
-        return bandit_for(env, env_params, BanditConfig(*layers), name)
+        return bandit_for(env, env_params, BanditConfig(*layers, config.form), name)
+    if config.form != "networks":
+        raise UserError(
+            f"form is {config.form}, a bandit's, and parameterization {parameterization} is none: leave it out."
+        )
     if max_steps is None:
         max_steps = int(env_params.max_steps_in_episode)
     mdp_config = MDPConfig(*layers, parameterization=parameterization, max_steps=max_steps)

@@ -1,0 +1,93 @@
+"""Bandits of some tens of numbers: a linear policy to come close to, in contexts that are normally distributed.
+
+A network of a bandit's usual size has a thousand weights, of which an expert needs few: the reward here is the
+distance to the action of a linear policy, and a context is a linear function of its latent. Evolution climbs
+in so few dimensions where it hardly moves in a thousand, and the bandit can be read off its weights.
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import linen as nn
+
+
+class PolicyDistance(nn.Module):
+    """offset - scale * ||a - a*||^power for a* = tanh((s - center) kernel + bias), in halves of the actions' range.
+
+    Scale and power start at 1 and are stored as their logarithms, so that they stay positive.
+    """
+
+    low: tuple[float, ...]
+    high: tuple[float, ...]
+
+    @nn.compact
+    def __call__(self, inputs: jax.Array) -> jax.Array:
+        """[O + A] observation and action -> [1]."""
+        low, high = np.asarray(self.low), np.asarray(self.high)
+        observation, action = jnp.split(inputs, [inputs.shape[-1] - low.size])
+        zeros = nn.initializers.zeros
+        center = self.param("center", zeros, observation.shape)
+        kernel = self.param(
+            "kernel", nn.initializers.lecun_normal(), (observation.size, action.size)
+        )
+        best = jnp.tanh((observation - center) @ kernel + self.param("bias", zeros, action.shape))
+        difference = (action - (low + high) / 2) / ((high - low) / 2) - best
+        scale, power = (jnp.exp(self.param(x, zeros, ())) for x in ("log_scale", "log_power"))
+        # A power below 2 has no gradient at zero distance.
+        distance = (jnp.sum(difference**2) + 1e-4) ** (power / 2)
+        return jnp.reshape(self.param("offset", zeros, ()) - scale * distance, (1,))
+
+
+def fitted(
+    observations: np.ndarray, actions: np.ndarray, low: np.ndarray, high: np.ndarray
+) -> dict[str, Any]:
+    """Weights whose contexts have the mean and covariance of states, and whose policy is closest to the actions there.
+
+    Args:
+      observations: [S, O].
+      actions: [S, A] of the expert.
+      low, high: [A] the actions' bounds.
+    """
+    states = np.asarray(observations, np.float64)
+    center, covariance = states.mean(axis=0), np.cov(states.T).reshape(states.shape[1], -1)
+    spread = np.sqrt(np.diag(covariance)) + 1e-6
+    # Entries that the others determine make a covariance singular.
+    root = np.linalg.cholesky(covariance + np.diag(1e-6 * spread**2))
+    shares = (np.asarray(actions, np.float64) - (low + high) / 2) / ((high - low) / 2)
+    before_tanh = np.arctanh(np.clip(shares, -0.999, 0.999))
+    inputs = np.column_stack([(states - center) / spread, np.ones(len(states))])
+    solution = np.linalg.lstsq(inputs, before_tanh, rcond=None)[0]
+    reward = {
+        "center": center,
+        "kernel": solution[:-1] / spread[:, None],
+        "bias": solution[-1],
+        "log_scale": np.zeros(()),
+        "log_power": np.zeros(()),
+        "offset": np.zeros(()),
+    }
+    contexts = {"Dense_0": {"kernel": root.T, "bias": center}}
+    weights = {"initial_state": contexts, "reward": reward}
+    return jax.tree.map(lambda x: np.asarray(x, np.float32), weights)
+
+
+def units(weights: Any) -> Any:
+    """What a change of 1 is for each weight: a deviation of a context's entry, or what moves the input of tanh by 1."""
+    contexts, reward = weights["initial_state"]["Dense_0"], weights["reward"]
+    spread = jnp.sqrt(jnp.sum(jnp.asarray(contexts["kernel"]) ** 2, axis=0)) + 1e-6
+    return {
+        "initial_state": {
+            "Dense_0": {
+                "kernel": jnp.broadcast_to(spread, contexts["kernel"].shape),
+                "bias": spread,
+            }
+        },
+        "reward": {
+            **jax.tree.map(jnp.ones_like, reward),
+            "center": spread,
+            "kernel": jnp.broadcast_to(1 / spread[:, None], reward["kernel"].shape),
+            # It makes no difference to most agents.
+            "offset": jnp.full((), 0.01),
+        },
+    }

@@ -1,0 +1,152 @@
+"""Bandits of the form linear: contexts normally distributed, rewards a distance to a linear policy."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from gymnax.environments import spaces
+
+from scb.discovery import BanditDiscovery, DiscoveryConfig, standardize_reward
+from scb.environments.linear import fitted
+from scb.environments.registry import make
+from scb.environments.synthetic import BanditConfig, SyntheticBandit, bandit_for
+from scb.environments.synthetic_mdp import synthetic_for
+from scb.environments.zoo import load_bandit, save_bandit
+from scb.errors import UserError
+from scb.evolution import EvolutionConfig, evolve
+from scb.warm_start import ExpertDataset, WarmStartConfig, fit_bandit
+
+LINEAR = BanditConfig(form="linear")
+SPACE = spaces.Box(jnp.array([-1.0, 0.0]), jnp.array([1.0, 4.0]), (2,), jnp.float32)
+# Two entries of very different sizes, and correlated.
+CENTER = np.array([5.0, -0.2])
+ROOT = np.array([[10.0, 0.0], [0.03, 0.04]])
+KERNEL = np.array([[0.05, 0.0], [4.0, -9.0]])
+BIAS = np.array([0.3, -0.1])
+
+
+def policy(states):
+    return np.array([0.0, 2.0]) + np.array([1.0, 2.0]) * np.tanh((states - CENTER) @ KERNEL + BIAS)
+
+
+@pytest.fixture(scope="module")
+def states():
+    return CENTER + np.random.default_rng(0).normal(size=(4000, 2)) @ ROOT.T
+
+
+@pytest.fixture(scope="module")
+def bandit(states):
+    weights = fitted(states, policy(states), np.array([-1.0, 0.0]), np.array([1.0, 4.0]))
+    return SyntheticBandit(2, SPACE, LINEAR, weights, "Synthetic-Pair")
+
+
+def test_a_fit_is_the_policy_and_its_states(bandit, states):
+    params = bandit.default_params
+    contexts = np.asarray(
+        jax.vmap(lambda k: bandit.draw_context(k, params))(
+            jax.random.split(jax.random.key(1), 8000)
+        )
+    )
+    np.testing.assert_array_less(
+        np.abs(contexts.mean(axis=0) - CENTER), 0.05 * contexts.std(axis=0)
+    )
+    np.testing.assert_allclose(np.cov(contexts.T), ROOT @ ROOT.T, rtol=0.06)
+    reward = jax.vmap(bandit.mean_reward, in_axes=(0, 0, None))
+    best = reward(states, policy(states), params)
+    # Nearly 0, the distance's own floor of sqrt(1e-4).
+    np.testing.assert_allclose(best, -0.01, atol=0.01)
+
+
+def test_the_reward_is_the_distance_in_halves_of_the_range(bandit):
+    best = policy(CENTER[None])[0]
+    off = best + np.array([0.3, -0.8])
+    reward = float(bandit.mean_reward(jnp.asarray(CENTER, jnp.float32), off, bandit.default_params))
+    # (0.3 / 1, 0.8 / 2) is 0.5 away.
+    assert reward == pytest.approx(-0.5, abs=0.01)
+    weights = dict(bandit.default_params.weights)
+    weights["reward"] = {**weights["reward"], "log_power": jnp.log(2.0), "log_scale": jnp.log(3.0)}
+    squared = float(
+        bandit.mean_reward(jnp.asarray(CENTER, jnp.float32), off, bandit.params(weights))
+    )
+    assert squared == pytest.approx(-3 * 0.25, abs=0.02)
+
+
+def test_units_are_what_moves_a_context_or_the_policy_by_as_much(bandit):
+    units = bandit.units(bandit.default_params.weights)
+    spread = np.array([10.0, 0.05])
+    np.testing.assert_allclose(units["reward"]["center"], spread, rtol=0.05)
+    kernel = units["initial_state"]["Dense_0"]["kernel"]
+    np.testing.assert_allclose(kernel, np.tile(spread, (2, 1)), rtol=0.05)
+    np.testing.assert_allclose(units["reward"]["kernel"][1], 20.0, rtol=0.05)
+    networks = SyntheticBandit(2, SPACE)
+    assert networks.units(networks.init_weights(jax.random.key(0))) is None
+
+
+def test_a_file_gives_back_the_same_bandit(bandit, tmp_path):
+    metadata = {"config": {}, "seeds": {}, "results": {}, "cost": {}, "command": "made here"}
+    path = tmp_path / "Synthetic-Pair.npz"
+    save_bandit(path, bandit, bandit.default_params.weights, metadata)
+    loaded = load_bandit(path)
+    assert loaded.config == BanditConfig(form="linear", latent_size=2)
+    context, action = jnp.array([1.0, 0.1]), jnp.array([0.5, 3.0])
+    same = [b.mean_reward(context, action, b.default_params) for b in (bandit, loaded)]
+    assert same[0] == same[1]
+
+
+def test_its_reward_can_be_given_another_scale(bandit):
+    weights = standardize_reward(bandit, bandit.default_params.weights, 3.0)
+    rewards = bandit.sample_rewards(bandit.params(weights), jax.random.key(5), 4000)
+    assert float(rewards.std()) == pytest.approx(3.0, rel=0.05)
+    assert float(rewards.mean()) == pytest.approx(0.0, abs=0.2)
+
+
+def pendulum(**changes):
+    config = DiscoveryConfig(
+        bandit=LINEAR,
+        agents_per_candidate=1,
+        evaluation_episodes=1,
+        warm_start=WarmStartConfig(expert="linear", expert_generations=2, num_states=256),
+        evolution=EvolutionConfig(
+            population_size=4,
+            num_generations=2,
+            sigma=0.1,
+            mean_evaluations=2,
+            **{"strategy": "SNES", **changes},
+        ),
+    )
+    problem = BanditDiscovery(config)
+    return problem, evolve(problem, config.evolution, quiet=True)
+
+
+def test_one_is_fitted_to_an_expert_and_evolved():
+    problem, outcome = pendulum()
+    assert problem.warm_start_report["action_r2"] > 0.99
+    start = problem.initial_solution(jax.random.key(0))
+    moved = jax.tree.map(lambda a, b: np.abs(a - b), outcome.mean, start)
+    units = problem.units(start)
+    # SNES moves every number by some of its deviations, 0.1 units each.
+    steps = jax.tree.leaves(jax.tree.map(lambda d, u: d / u, moved, units))
+    assert all((step > 0).all() and (step < 1).all() for step in steps)
+
+
+def test_a_strategy_with_one_deviation_for_all_is_refused():
+    with pytest.raises(UserError, match="Open_ES has one deviation for all weights"):
+        pendulum(strategy="Open_ES")
+
+
+def test_what_a_linear_bandit_cannot_be_is_refused():
+    env, params = make("CartPole-v1")
+    with pytest.raises(UserError, match="discrete actions, and a linear bandit continuous ones"):
+        bandit_for(env, params, LINEAR, "Synthetic-CartPole-v1")
+    env, params = make("Pendulum-v1")
+    with pytest.raises(
+        UserError, match="form is linear, a bandit's, and parameterization TI is none"
+    ):
+        synthetic_for(env, params, "TI", LINEAR, "x")
+    with pytest.raises(UserError, match="unknown bandit form 'liner': did you mean linear"):
+        BanditConfig(form="liner")
+    dataset = ExpertDataset(*[jnp.zeros((4, 1))] * 4)
+    with pytest.raises(UserError, match="the construction is q, and a linear bandit's reward"):
+        fit_bandit(
+            SyntheticBandit(2, SPACE, LINEAR), dataset, jax.random.key(0), WarmStartConfig("q")
+        )
