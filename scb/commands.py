@@ -119,6 +119,7 @@ class Discover(LongRun):
         config, best = problem.config, self.config.select == "best"
         spec = environment_spec(config.environment)
         folder = self.open()
+        problem.folder = folder.folder
         outcome = evolve(problem, config.evolution, folder)
         folder.close()
         weights = outcome.best_mean if best else outcome.mean
@@ -278,7 +279,19 @@ def list_command() -> None:
         table.add_row(name, *cells, minutes)
     console().print(table)
     for name in zoo_names():
-        print(f"{name}: {bandit_metadata(name)['command']}")
+        metadata = bandit_metadata(name)
+        print(f"{name} ({found(metadata)}): {metadata['command']}")
+
+
+def found(metadata: Mapping[str, Any]) -> str:
+    """How a bandit was: fitted to an expert or from random weights, evolved or not."""
+    discovery = metadata["config"]["discovery"]
+    earlier = metadata["config"].get("started_from")
+    start = "random weights" if discovery["init"] == "random" else "fitted"
+    evolved = earlier or metadata["cost"].get(
+        "generation", discovery["evolution"]["num_generations"]
+    )
+    return f"{start}, evolved" if evolved else start
 
 
 def _seconds(cost: Mapping[str, Any], started_from: Mapping[str, Any] | None) -> float:

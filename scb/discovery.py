@@ -8,6 +8,7 @@ their return in the evaluation environment. The same search finds the paper's fu
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from pathlib import Path
 from typing import Annotated, Any
 
 import jax
@@ -43,14 +44,14 @@ from scb.environments.synthetic import (
     bandit_for,
 )
 from scb.environments.synthetic_mdp import PARAMETERIZATIONS, SyntheticMDP, synthetic_for
-from scb.environments.zoo import open_bandit
+from scb.environments.zoo import bandit_metadata, load_bandit, open_bandit, save_bandit
 from scb.errors import UserError, at_least, one_of, positive
 from scb.evolution import EnvironmentSteps, EvolutionConfig, Outcome, evolve
 from scb.keys import named_key, root_key, split_key
 from scb.lists import read_lists, write_lists
 from scb.measurement import MODE, SAMPLED, Agents, Judge, Place, measure, train_and_judge
 from scb.rows import Rows, pivot
-from scb.runs import Run, Stopwatch
+from scb.runs import Run, Stopwatch, config_dict
 from scb.warm_start import (
     WarmStartConfig,
     expert_agent,
@@ -205,6 +206,8 @@ class BanditDiscovery:
             check_curriculum(config.curriculum, limit, config.environment)
             self._horizon, self._longest = horizon(config.curriculum), config.curriculum.longest
         self.warm_start_report: dict[str, float] = {}
+        # Of a run: the fit is kept there, so that a resumed one need not look for an expert again.
+        self.folder: Path | None = None
         # Read now, so that a wrong name is told before anything is computed or written.
         self._start = None if config.start is None else self._weights_of(config.start)
 
@@ -246,7 +249,11 @@ class BanditDiscovery:
     @cached_property
     def _expert_fit(self) -> Weights:
         assert isinstance(self.bandit, SyntheticBandit)
-        # Of the seed alone, so that a resumed run starts from the same fit.
+        path = None if self.folder is None else self.folder / "warm_start.npz"
+        if path is not None and path.with_suffix(".json").exists():  # it is written last
+            self.warm_start_report = dict(bandit_metadata(str(path))["cost"])
+            return load_bandit(path).default_params.weights
+        # Of the seed alone.
         key_expert, key_data, key_fit = split_key(
             named_key(root_key(self.config.evolution.seed), "expert"), 3
         )
@@ -260,6 +267,18 @@ class BanditDiscovery:
             "seconds": round(watch.lap(), 1),
             **report,
         }
+        if path is not None:
+            metadata = {
+                "config": {
+                    "evaluation_environment": self.config.environment,
+                    "discovery": config_dict(self.config),
+                },
+                "seeds": {"discovery": self.config.evolution.seed},
+                "results": {},
+                "cost": self.warm_start_report,
+                "command": "scb discover: the fit that the run starts from",
+            }
+            save_bandit(path, self.bandit, weights, metadata)
         return weights
 
     def evaluate(
@@ -410,6 +429,7 @@ def discover(
 ) -> tuple[BanditDiscovery, Outcome]:
     """Evolves a bandit. The returned problem holds the bandit's shapes, the outcome its weights."""
     problem = BanditDiscovery(config)
+    problem.folder = None if run is None else run.folder
     return problem, evolve(problem, config.evolution, run, quiet)
 
 

@@ -22,7 +22,7 @@ from scb.agents.ppo import PPOConfig
 from scb.agents.spec import bandit_agent
 from scb.cli import main
 from scb.command_line import Output
-from scb.commands import Discover, TrainConfig
+from scb.commands import Discover, TrainConfig, found
 from scb.curriculum import CurriculumConfig, paper_curriculum
 from scb.discovery import BanditDiscovery, DiscoveryConfig
 from scb.environments.registry import make
@@ -394,11 +394,18 @@ def test_listing_names_every_bandit_of_the_zoo():
     lines = [line.strip(" │") for line in result.out.splitlines()]
     for name in zoo_names():
         assert any(line.startswith(f"{name} ") for line in lines)
-        assert f"{name}: {bandit_metadata(name)['command']}" in lines
+        metadata = bandit_metadata(name)
+        assert f"{name} ({found(metadata)}): {metadata['command']}" in lines
     assert "…" not in result.out
     # Hopper: 807.0 s, from a run of 849.6 s, from a warm start of 595.0 s: 37.5 minutes.
     (row,) = (line for line in lines if line.startswith("Synthetic-hopper ") and ":" not in line)
     assert row.split()[-1] == "38"
+    ways = {name: found(bandit_metadata(name)) for name in zoo_names()}
+    assert (
+        ways["Synthetic-Acrobot-v1"] == "fitted" and ways["Synthetic-hopper"] == "fitted, evolved"
+    )
+    config = {"discovery": {"init": "random", "evolution": {"num_generations": 9}}}
+    assert found({"config": config, "cost": {}}) == "random weights, evolved"
 
 
 def test_a_reader_that_stops_early_is_no_error(monkeypatch):

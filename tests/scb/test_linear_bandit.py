@@ -100,8 +100,8 @@ def test_its_reward_can_be_given_another_scale(bandit):
     assert float(rewards.mean()) == pytest.approx(0.0, abs=0.2)
 
 
-def pendulum(**changes):
-    config = DiscoveryConfig(
+def pendulum_config(**changes):
+    return DiscoveryConfig(
         bandit=LINEAR,
         agents_per_candidate=1,
         evaluation_episodes=1,
@@ -114,6 +114,10 @@ def pendulum(**changes):
             **{"strategy": "SNES", **changes},
         ),
     )
+
+
+def pendulum(**changes):
+    config = pendulum_config(**changes)
     problem = BanditDiscovery(config)
     return problem, evolve(problem, config.evolution, quiet=True)
 
@@ -127,6 +131,17 @@ def test_one_is_fitted_to_an_expert_and_evolved():
     # SNES moves every number by some of its deviations, 0.1 units each.
     steps = jax.tree.leaves(jax.tree.map(lambda d, u: d / u, moved, units))
     assert all((step > 0).all() and (step < 1).all() for step in steps)
+
+
+def test_a_run_looks_for_its_expert_once(tmp_path, monkeypatch):
+    first, resumed = (BanditDiscovery(pendulum_config()) for _ in range(2))
+    first.folder = resumed.folder = tmp_path
+    start = first.initial_solution(jax.random.key(0))
+    monkeypatch.delattr("scb.discovery.find_expert")
+    again = resumed.initial_solution(jax.random.key(0))
+    jax.tree.map(np.testing.assert_array_equal, again, start)
+    assert resumed.warm_start_report == first.warm_start_report
+    assert load_bandit(tmp_path / "warm_start.npz").linear
 
 
 def test_a_strategy_with_one_deviation_for_all_is_refused():
