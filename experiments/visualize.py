@@ -36,8 +36,8 @@ from scb.keys import root_key, split_key
 from scb.measurement import Judge
 from scb.statistics import Estimate, estimate
 
-HOPPER = "hopper (spring)"
-STANDING = environment_spec("hopper").standing["spring"]
+HOPPER = "hopper"
+STANDING = environment_spec(HOPPER).standing["generalized"]
 FRAMES = 6  # of the film strip
 PICTURES = 125  # of a GIF at most: five seconds
 VIEWER = Path("runs/visualize/hopper.html")
@@ -55,11 +55,10 @@ def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None
 
 
 def _show(name: str, plan: Mapping[str, Any]) -> dict[str, Any]:
-    environment, backend = ("hopper", "spring") if name == HOPPER else (name, None)
-    place = environment_spec(environment)
-    env, env_params = place.make(backend)
-    bandit, _ = bandit_of(environment)
-    spec = bandit_agent("ppo", environment, sampled=False)
+    place = environment_spec(name)
+    env, env_params = place.make()
+    bandit, _ = bandit_of(name)
+    spec = bandit_agent("ppo", name, sampled=False)
     agent = spec.agent(bandit)
     key_agents, key_show = split_key(root_key(plan["seed"]))
     judge = Judge(

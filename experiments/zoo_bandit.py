@@ -59,13 +59,15 @@ def measure(options: Options, report: dict[str, Any], save: Save) -> None:
         metadata = dict(bandit_metadata(str(path)))
         # The weights' bytes decide the checksum, so that it stays the same in every folder.
         backend = metadata["config"].get("backend")
-        metadata["results"] = results_of(table, metadata["sha256"], backend) or metadata["results"]
+        if measured := results_of(table, metadata["sha256"], backend):
+            metadata["results"] = measured
+            reporting = {result["seed"] for result in measured.values()}
+            metadata["seeds"] = {**metadata["seeds"], "reporting": min(reporting)}
         for own in ("schema_version", "name", "versions", "sha256", "kind"):
             metadata.pop(own)
         weights = bandit.default_params.weights
         written = save_bandit(options.folder / path.name, bandit, weights, metadata)
-        measured = ", ".join(metadata["results"]) or "nothing yet"
-        print(f"{written}: measured {measured}")
+        print(f"{written}: measured {', '.join(metadata['results']) or 'nothing yet'}")
 
 
 EXPERIMENT = Experiment(
