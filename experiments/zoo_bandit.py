@@ -61,8 +61,8 @@ def measure(options: Options, report: dict[str, Any], save: Save) -> None:
         backend = metadata["config"].get("backend")
         if measured := results_of(table, metadata["sha256"], backend):
             metadata["results"] = measured
-            reporting = {result["seed"] for result in measured.values()}
-            metadata["seeds"] = {**metadata["seeds"], "reporting": min(reporting)}
+            (seed,) = {result["seed"] for result in measured.values()}
+            metadata["seeds"] = {**metadata["seeds"], "reporting": seed}
         for own in ("schema_version", "name", "versions", "sha256", "kind"):
             metadata.pop(own)
         weights = bandit.default_params.weights
