@@ -22,7 +22,7 @@ from scb import plotting
 from scb.agents.spec import bandit_agent
 from scb.analysis import components
 from scb.analysis.states import follow
-from scb.discovery import judge
+from scb.judgement import judge
 from scb.keys import key_at, root_key, split_key
 from scb.measurement import Place
 from scb.seeds import ILLUSTRATING, REPORTING

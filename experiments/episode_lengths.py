@@ -64,7 +64,7 @@ def _measure_limit(
     problem, outcome = searches.search(config_of(environment, limit, plan), folder)
     place = environment_spec(environment)
     entry["random"], entry["limit"] = round(place.random_return(), 2), place.episode_limit
-    space = problem.env.action_space(problem.env_params)
+    space = problem.place.env.action_space(problem.place.params)
     returns: dict[str, list[float]] = {}
     failed = 0
     for algorithm in plan["judged_by"] or algorithms_for(space):
@@ -91,7 +91,9 @@ def returns_and_lengths(
     def one(hyperparameters: Any, key: Any, weights: Any) -> Any:
         params = problem.bandit.params(weights)
         judges = {
-            "environment": Judge(problem.env, problem.env_params, plan["episodes"], mode=True),
+            "environment": Judge(
+                problem.place.env, problem.place.params, plan["episodes"], mode=True
+            ),
             "synthetic": Judge(problem.bandit, params, plan["episodes"]),
         }
         agent = spec.agent(problem.bandit)

@@ -19,14 +19,14 @@ import numpy as np
 
 from experiments.harness import Experiment, Save
 from experiments.rendering import number, text
-from scb import make
 from scb.agents.spec import algorithms_for, bandit_agent
-from scb.discovery import judge
 from scb.environments.synthetic import BanditConfig, bandit_for
+from scb.fitting import fit_bandit
+from scb.judgement import judge
 from scb.keys import root_key, split_key
 from scb.measurement import Place
 from scb.statistics import estimate
-from scb.warm_start import WarmStartConfig, expert_dataset, find_expert, fit_bandit
+from scb.warm_start import WarmStartConfig, expert_dataset, find_expert
 
 # Not the seeds that results are reported on.
 SEED = 7_000
@@ -73,11 +73,12 @@ def measure(options: Options, report: dict[str, Any], save: Save) -> None:
     report |= {"seed": SEED, "agents": options.agents, "episodes": options.episodes}
     report.setdefault("environments", {})
     for name in options.environment:
-        env, env_params = make(name)
+        judge_in = Place.named(name)
+        env, env_params = judge_in.env, judge_in.params
         space = env.action_space(env_params)
         key_expert, key_data, key_fit = split_key(root_key(SEED), 3)
         start = time.perf_counter()
-        expert = find_expert(name, env, env_params, key_expert, WarmStartConfig())
+        expert = find_expert(judge_in, key_expert, WarmStartConfig())
         seconds = time.perf_counter() - start
         print(
             f"{name}: the expert's return is {expert.mean_return:.1f} ({seconds:.0f} s)", flush=True
@@ -89,12 +90,13 @@ def measure(options: Options, report: dict[str, Any], save: Save) -> None:
             "returns": {},
         }
         bandit = bandit_for(env, env_params, BanditConfig(), name)
-        judge_in = Place(name, env, env_params)
         for arm, fields in ARMS.items():
             config = WarmStartConfig(**fields)
             start = time.perf_counter()
-            dataset, _ = expert_dataset(expert, env, env_params, key_data, config)
-            weights, fit = fit_bandit(bandit, dataset, key_fit, config)
+            dataset, _ = expert_dataset(expert, judge_in, key_data, config)
+            weights, fit = fit_bandit(
+                bandit, dataset, key_fit, config.construction, config.fit_steps
+            )
             row: dict[str, Any] = {"fit": fit, "fit_seconds": round(time.perf_counter() - start, 1)}
             for algorithm in options.algorithms or algorithms_for(space):
                 spec = bandit_agent(algorithm, name)

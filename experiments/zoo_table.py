@@ -27,12 +27,12 @@ from experiments.harness import Experiment, Save
 from experiments.rendering import digits
 from experiments.zoo_table_page import ACTIONS, BANDITS, TARGETS, facts, figure, pairs, place, rank
 from scb.agents.spec import AgentSpec, algorithms_for, bandit_agent
-from scb.discovery import check_fits, judge
 from scb.environments.registry import environment_spec
 from scb.environments.synthetic import BanditConfig, SyntheticBandit
 from scb.environments.zoo import bandit_metadata, open_bandit, zoo_names
 from scb.errors import UserError, at_least
 from scb.importer import PUBLISHED_BANDITS, published_bandit
+from scb.judgement import check_fits, judge
 from scb.measurement import Place
 from scb.runs import config_dict
 from scb.seeds import REPORTING

@@ -13,14 +13,12 @@ from rich.table import Column, Table
 from scb.agents.spec import algorithms_for, bandit_agent
 from scb.command_line import LongRun, Measuring, Output
 from scb.console import console
-from scb.discovery import BanditDiscovery, DiscoveryConfig, evaluation_place, judge
+from scb.discovery import BanditDiscovery, DiscoveryConfig
 from scb.environments.registry import environment_spec
-from scb.environments.synthetic import SyntheticBandit, Weights
-from scb.environments.synthetic_mdp import SyntheticMDP
 from scb.environments.zoo import bandit_metadata, open_synthetic, save_bandit, zoo_names
 from scb.errors import at_least
-from scb.evolution import EvolutionConfig, evolve
-from scb.measurement import Place
+from scb.evolution import EvolutionConfig
+from scb.judgement import evaluation_place, judge, judge_all
 from scb.runs import config_dict
 from scb.seeds import VALIDATING
 from scb.statistics import estimate
@@ -119,8 +117,7 @@ class Discover(LongRun):
         config, best = problem.config, self.config.select == "best"
         spec = environment_spec(config.environment)
         folder = self.open()
-        problem.folder = folder.folder
-        outcome = evolve(problem, config.evolution, folder)
+        outcome = problem.search(folder)
         folder.close()
         weights = outcome.best_mean if best else outcome.mean
         results = {}
@@ -128,7 +125,7 @@ class Discover(LongRun):
             results = judge_all(
                 problem.bandit,
                 weights,
-                Place(config.environment, problem.env, problem.env_params),
+                problem.place,
                 not config.fixed_hyperparameters,
                 self.judgement.judge_agents,
                 self.judgement.judge_episodes,
@@ -150,34 +147,6 @@ class Discover(LongRun):
         }
         path = save_bandit(folder.folder / f"{spec.bandit}.npz", problem.bandit, weights, metadata)
         console().print(f"bandit: {path}", soft_wrap=True)
-
-
-def judge_all(
-    synthetic: SyntheticBandit | SyntheticMDP,
-    weights: Weights,
-    judge_in: Place,
-    sampled: bool = True,
-    num_agents: int = 20,
-    num_episodes: int = 50,
-) -> dict[str, Any]:
-    """What agents of every fitting algorithm earn, by name of the algorithm in capitals, printed as it comes."""
-    results = {}
-    for algorithm in algorithms_for(judge_in.env.action_space(judge_in.params)):
-        spec = bandit_agent(algorithm, judge_in.name, sampled)
-        returns = judge(
-            spec, synthetic, weights, judge_in, VALIDATING.start, num_agents, num_episodes
-        )
-        results[algorithm.upper()] = {
-            "agents": num_agents,
-            "episodes": num_episodes,
-            "hyperparameters": "sampled from the paper's lists" if spec.lists else "fixed",
-            **{actions: estimate(x).as_dict() for actions, x in returns.items()},
-        }
-        line = "; ".join(
-            f"{actions.replace('_', ' ')} IQM {estimate(x)}" for actions, x in returns.items()
-        )
-        console().print(f"{algorithm.upper()} on {judge_in.name}: {line}")
-    return results
 
 
 def _origin(bandit: str) -> dict[str, Any]:

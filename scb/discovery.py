@@ -13,9 +13,7 @@ from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 import tyro
-from gymnax.environments import environment
 from jax.typing import ArrayLike
 
 from scb.agents.spec import (
@@ -36,29 +34,23 @@ from scb.curriculum import (
     read_curriculum,
     with_limit,
 )
-from scb.environments.registry import environment_spec, make
+from scb.environments.registry import environment_spec
 from scb.environments.synthetic import (
     BanditConfig,
     SyntheticBandit,
     Weights,
-    bandit_for,
 )
-from scb.environments.synthetic_mdp import PARAMETERIZATIONS, SyntheticMDP, synthetic_for
+from scb.environments.synthetic_mdp import PARAMETERIZATIONS, synthetic_for
 from scb.environments.zoo import bandit_metadata, load_bandit, open_bandit, save_bandit
 from scb.errors import UserError, at_least, one_of, positive
 from scb.evolution import EnvironmentSteps, EvolutionConfig, Outcome, evolve
+from scb.fitting import standardize_reward
+from scb.judgement import check_fits
 from scb.keys import named_key, root_key, split_key
 from scb.lists import read_lists, write_lists
-from scb.measurement import MODE, SAMPLED, Agents, Judge, Place, measure, train_and_judge
-from scb.rows import Rows, pivot
-from scb.runs import Run, Stopwatch, config_dict
-from scb.warm_start import (
-    WarmStartConfig,
-    expert_agent,
-    expert_dataset,
-    find_expert,
-    fit_bandit,
-)
+from scb.measurement import Judge, Place, train_and_judge
+from scb.runs import Run, config_dict
+from scb.warm_start import WarmStartConfig, expert_agent, warm_start
 
 INITS = ("random", "expert")
 MODES = ("all", "sequential")
@@ -169,8 +161,8 @@ class BanditDiscovery:
     """The evolution problem: a candidate is a synthetic environment's weights."""
 
     def __init__(self, config: DiscoveryConfig) -> None:
-        self.env, self.env_params = make(config.environment, config.backend)
-        space = self.env.action_space(self.env_params)
+        self.place = Place.named(config.environment, config.backend)
+        space = self.place.env.action_space(self.place.params)
         if not config.algorithms:
             config = replace(config, algorithms=algorithms_for(space))
         if isinstance(config.curriculum, str):
@@ -192,8 +184,8 @@ class BanditDiscovery:
             expert_agent(config.environment, space, config.warm_start)
         self.config = config
         self.bandit = synthetic_for(
-            self.env,
-            self.env_params,
+            self.place.env,
+            self.place.params,
             config.parameterization,
             config.bandit,
             environment_spec(config.environment).bandit,
@@ -202,14 +194,18 @@ class BanditDiscovery:
         self.specs = {name: self._spec(name) for name in dict.fromkeys(config.algorithms)}
         self._horizon, self._longest = None, None
         if isinstance(config.curriculum, CurriculumConfig):
-            limit = int(self.env_params.max_steps_in_episode)
+            limit = int(self.place.params.max_steps_in_episode)
             check_curriculum(config.curriculum, limit, config.environment)
             self._horizon, self._longest = horizon(config.curriculum), config.curriculum.longest
         self.warm_start_report: dict[str, float] = {}
-        # Of a run: the fit is kept there, so that a resumed one need not look for an expert again.
-        self.folder: Path | None = None
+        self._folder: Path | None = None
         # Read now, so that a wrong name is told before anything is computed or written.
         self._start = None if config.start is None else self._weights_of(config.start)
+
+    def search(self, run: Run | None = None, quiet: bool = False) -> Outcome:
+        """Evolves; in a run's folder the fit is kept, so that a resumed one need not look for an expert again."""
+        self._folder = None if run is None else run.folder
+        return evolve(self, self.config.evolution, run, quiet)
 
     def _spec(self, name: str) -> AgentSpec:
         config = self.config
@@ -222,7 +218,7 @@ class BanditDiscovery:
 
     def _weights_of(self, name: str) -> Weights:
         start = open_bandit(name)
-        check_fits(start, self.env, self.env_params, self.config.environment)
+        check_fits(start, self.place.env, self.place.params, self.config.environment)
         if start.weight_shapes() != self.bandit.weight_shapes():
             raise UserError(
                 f"{name} has other layer sizes than the bandit to discover: start from one of the form "
@@ -249,24 +245,17 @@ class BanditDiscovery:
     @cached_property
     def _expert_fit(self) -> Weights:
         assert isinstance(self.bandit, SyntheticBandit)
-        path = None if self.folder is None else self.folder / "warm_start.npz"
+        path = None if self._folder is None else self._folder / "warm_start.npz"
         if path is not None and path.with_suffix(".json").exists():  # it is written last
             self.warm_start_report = dict(bandit_metadata(str(path))["cost"])
             return load_bandit(path).default_params.weights
-        # Of the seed alone.
-        key_expert, key_data, key_fit = split_key(
-            named_key(root_key(self.config.evolution.seed), "expert"), 3
+        weights, self.warm_start_report = warm_start(
+            self.bandit,
+            self.specs,
+            self.place,
+            named_key(root_key(self.config.evolution.seed), "expert"),  # of the seed alone
+            self.config.warm_start,
         )
-        warm, watch = self.config.warm_start, Stopwatch()
-        expert = find_expert(self.config.environment, self.env, self.env_params, key_expert, warm)
-        dataset, dataset_steps = expert_dataset(expert, self.env, self.env_params, key_data, warm)
-        weights, report = fit_bandit(self.bandit, dataset, key_fit, warm)
-        self.warm_start_report = {
-            "expert_return": expert.mean_return,
-            "environment_steps": expert.environment_steps + dataset_steps,
-            "seconds": round(watch.lap(), 1),
-            **report,
-        }
         if path is not None:
             metadata = {
                 "config": {
@@ -276,7 +265,7 @@ class BanditDiscovery:
                 "seeds": {"discovery": self.config.evolution.seed},
                 "results": {},
                 "cost": self.warm_start_report,
-                "command": "scb discover: the fit that the run starts from",
+                "command": "scb discover (what its search starts from)",
             }
             save_bandit(path, self.bandit, weights, metadata)
         return weights
@@ -285,7 +274,7 @@ class BanditDiscovery:
         self, candidate: Weights, key: jax.Array, generation: jax.Array
     ) -> dict[str, jax.Array]:
         config = self.config
-        limit, env_params = None, self.env_params
+        limit, env_params = None, self.place.params
         if self._horizon is not None and self._longest is not None:
             limit, env_params = self._horizon(generation), with_limit(env_params, self._longest)
 
@@ -333,7 +322,7 @@ class BanditDiscovery:
             hyperparameters,
             key,
             self.bandit.params(weights),
-            {"return": Judge(self.env, env_params, episodes, mode, limit)},
+            {"return": Judge(self.place.env, env_params, episodes, mode, limit)},
         )
         return earned["return"].returns.mean()
 
@@ -343,7 +332,7 @@ class BanditDiscovery:
             key_draw, key_agent = split_key(named_key(key, name) if i else key)
             drawn = jax.tree.map(lambda x: x[0], spec.sample(key_draw, 1))
             results[f"fitness/{name}"] = self._earned(
-                name, candidate, drawn, key_agent, self.env_params
+                name, candidate, drawn, key_agent, self.place.params
             )
         return {"fitness": jnp.stack(list(results.values())).mean(), **results}
 
@@ -357,7 +346,7 @@ class BanditDiscovery:
         else:
             turns = [self.specs[name].steps for name in config.algorithms]
             training, evaluations = sum(turns) // len(turns), 1
-        limit = self._longest or int(self.env_params.max_steps_in_episode)
+        limit = self._longest or int(self.place.params.max_steps_in_episode)
         return EnvironmentSteps(
             training=agents * training,
             evaluation=agents * evaluations * config.evaluation_episodes * limit,
@@ -368,60 +357,8 @@ class BanditDiscovery:
         episodes = len(self.specs) * self.config.evaluation_episodes
         return EnvironmentSteps(
             training=sum(spec.steps for spec in self.specs.values()),
-            evaluation=episodes * int(self.env_params.max_steps_in_episode),
+            evaluation=episodes * int(self.place.params.max_steps_in_episode),
         )
-
-
-def standardize_reward(bandit: SyntheticBandit, weights: Weights, std: float) -> Weights:
-    """The bandit whose reward is an affine function of the given one: of mean zero and standard deviation `std`.
-
-    Both are over its contexts and uniform actions. What agents should do in it stays the same.
-    """
-    rewards = bandit.sample_rewards(
-        bandit.params(weights), named_key(root_key(0), "reward scale"), 10_000
-    )
-    spread = float(rewards.std())
-    # Of a constant, in 32 bits, some rounding is left.
-    if not spread > 1e-6 * max(1.0, float(jnp.abs(rewards).max())):
-        raise UserError(
-            f"the reward that the search starts from is {float(rewards.mean()):.4g} everywhere, and no factor gives it "
-            f"a standard deviation of {std}: leave reward_std out, or start from other weights."
-        )
-    factor = std / spread
-    return bandit.with_reward(weights, factor, -factor * float(rewards.mean()))
-
-
-def check_fits(
-    bandit: SyntheticBandit | SyntheticMDP,
-    env: environment.Environment[Any, Any],
-    env_params: Any,
-    environment_name: str,
-) -> None:
-    """Raises a UserError where a bandit has other observation or action shapes than an environment."""
-    other = bandit_for(env, env_params, BanditConfig(), environment_name)
-    ours, theirs = (
-        f"{b.observation_size} observations and {b.num_actions} "
-        + ("discrete actions" if b.discrete else "action dimensions")
-        for b in (bandit, other)
-    )
-    if ours != theirs:
-        raise UserError(
-            f"bandit {bandit.name} has {ours}, {environment_name} has {theirs}: take the bandit of that environment."
-        )
-
-
-def evaluation_place(
-    bandit: SyntheticBandit | SyntheticMDP, name: str, environment: str | None, backend: str | None
-) -> Place:
-    """Where agents of a bandit, opened by this name, are judged: in what it stands for where no other is named.
-
-    Raises:
-      UserError: it stands for none, or does not fit the environment.
-    """
-    target = environment or environment_spec(name).evaluation_environment
-    place = Place.named(target, backend)
-    check_fits(bandit, place.env, place.params, target)
-    return place
 
 
 def discover(
@@ -429,43 +366,4 @@ def discover(
 ) -> tuple[BanditDiscovery, Outcome]:
     """Evolves a bandit. The returned problem holds the bandit's shapes, the outcome its weights."""
     problem = BanditDiscovery(config)
-    problem.folder = None if run is None else run.folder
-    return problem, evolve(problem, config.evolution, run, quiet)
-
-
-def judge(
-    spec: AgentSpec,
-    synthetic: SyntheticBandit | SyntheticMDP,
-    weights: Weights,
-    judge_in: Place,
-    seed: int,
-    num_agents: int = 20,
-    num_episodes: int = 50,
-    mode: bool | None = None,
-    rows: Rows | None = None,
-) -> dict[str, np.ndarray]:
-    """[num_agents] mean returns in the evaluation environment of agents trained in a synthetic one.
-
-    Args:
-      spec: the agents'; what it has lists for is drawn.
-      synthetic, weights: where they train.
-      judge_in: the evaluation environment.
-      seed: decides hyperparameters, training and evaluation.
-      rows: where agents are kept and found; None for memory.
-
-    Returns:
-      {"sampled_actions": [N], "mode_actions": [N]} of the same agents; with `mode` given, only that
-      one.
-    """
-    actions = (SAMPLED, MODE) if mode is None else (MODE if mode else SAMPLED,)
-    found = measure(
-        spec,
-        Place(synthetic.name, synthetic, synthetic.params(weights)),
-        judge_in,
-        Agents.drawn_from(spec, seed, num_agents),
-        episodes=num_episodes,
-        actions=actions,
-        rows=rows,
-    )
-    returns = pivot(found, "actions", "agent")
-    return {f"{kind}_actions": of_it for kind, of_it in zip(actions, returns, strict=True)}
+    return problem, problem.search(run, quiet)

@@ -41,6 +41,8 @@ class LinearSearchConfig:
       action_noise: standard deviation of Gaussian noise on the actions of the search's episodes, as a
         share of half their range. Under it a policy is found that bears errors, such as those of an
         agent that learned from it; judgements are without it.
+      episode_steps: at which the search's episodes are cut; the environment's own limit where None. Where
+        nothing ends an episode early a gait shows in a fraction of it. Judgements are of whole episodes.
       judge_every: generations between judgements of the unperturbed policy, of 20 episodes each; the
         policy that was judged best is the expert.
     """
@@ -51,10 +53,11 @@ class LinearSearchConfig:
     sigma: float = 0.03
     learning_rate: float = 0.02
     action_noise: float = 0.0
+    episode_steps: int | None = None
     judge_every: int = 10
 
     def __post_init__(self) -> None:
-        at_least(1, self, "generations", "directions", "best", "judge_every")
+        at_least(1, self, "generations", "directions", "best", "episode_steps", "judge_every")
         at_least(0, self, "action_noise")
         positive(self, "sigma", "learning_rate")
         if self.best > self.directions:
@@ -92,7 +95,7 @@ def search_linear_expert(
 
     def one(policy: Linear, seen: RunningStatistics, key: jax.Array) -> Episodes:
         act = noisy(_policy(policy, seen, space), space, config.action_noise)
-        return evaluate(env, env_params, act, key, 1, moments=True)
+        return evaluate(env, env_params, act, key, 1, config.episode_steps, moments=True)
 
     roll = map_population(one, 2 * config.directions, (0, None, 0))
 

@@ -5,7 +5,7 @@ expert's states, has the expert's policy as its optimum. Regression finds such a
 what it cannot know is which of them *trains* well, and that is what evolution is for.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -13,8 +13,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
-from gymnax.environments import environment, spaces
+from gymnax.environments import spaces
 
 from scb.agents.spec import (
     ALGORITHMS,
@@ -25,53 +24,53 @@ from scb.agents.spec import (
     kind_of_actions,
 )
 from scb.agents.tables import WARM_START
+from scb.aggregation import TRAJECTORIES, Learners, Visited, trajectory
 from scb.curriculum import paper_curriculum
-from scb.environments.linear import fitted
 from scb.environments.registry import environment_spec
-from scb.environments.synthetic import BanditParams, SyntheticBandit, Weights
+from scb.environments.synthetic import SyntheticBandit, Weights
 from scb.errors import UserError, at_least, one_of, positive
 from scb.experts import Expert, PolicySearchConfig, evolve_expert, train_expert
+from scb.fitting import CONSTRUCTIONS, ExpertDataset, fit_bandit
 from scb.keys import named_key, split_key
 from scb.linear_expert import LinearSearchConfig, noisy, search_linear_expert
+from scb.measurement import Place
+from scb.runs import Stopwatch
 
-CONSTRUCTIONS = ("advantage", "q", "action_distance")
 
-
-def _evolved(
-    name: str, env: Any, env_params: Any, key: jax.Array, config: "WarmStartConfig"
-) -> Expert:
+def _evolved(place: Place, key: jax.Array, config: "WarmStartConfig") -> Expert:
     search, generations = PolicySearchConfig(), config.expert_generations
     search = replace(
         search,
-        curriculum=paper_curriculum(name, generations),
+        curriculum=paper_curriculum(place.name, generations),
         evolution=replace(search.evolution, num_generations=generations),
     )
-    return evolve_expert(env, env_params, search, key)
+    return evolve_expert(place.env, place.params, search, key)
 
 
-def _linear(
-    name: str, env: Any, env_params: Any, key: jax.Array, config: "WarmStartConfig"
-) -> Expert:
-    standing = environment_spec(name).standing_still() or 0.0
-    bonus = standing / env_params.max_steps_in_episode
-    search = LinearSearchConfig(config.expert_generations)
+def _linear(place: Place, key: jax.Array, config: "WarmStartConfig") -> Expert:
+    standing = environment_spec(place.name).standing_still(place.backend) or 0.0
+    bonus = standing / place.params.max_steps_in_episode
+    search = LinearSearchConfig(
+        config.expert_generations, episode_steps=config.expert_episode_steps
+    )
     if config.expert_noise:
         # Where actions err anyway a larger step is no more noise, and finds gains that bear errors.
         search = replace(search, sigma=0.15, learning_rate=0.09, action_noise=config.expert_noise)
-    return search_linear_expert(env, env_params, key, search, bonus)
+    return search_linear_expert(place.env, place.params, key, search, bonus)
 
 
 class _Search(NamedTuple):
-    """What finds experts that are no agents: in words, how, and whether actions must be continuous."""
+    """What finds experts that are no agents: in words, how, and what it needs and knows."""
 
     what: str
-    find: Callable[[str, Any, Any, jax.Array, "WarmStartConfig"], Expert]
-    continuous: bool = False
+    find: Callable[[Place, jax.Array, "WarmStartConfig"], Expert]
+    continuous: bool = False  # actions, which it needs
+    cuts: bool = False  # episodes, where told to
 
 
 SEARCHES = {
     "evolution": _Search("evolution", _evolved),
-    "linear": _Search("a linear search", _linear, continuous=True),
+    "linear": _Search("a linear search", _linear, continuous=True, cuts=True),
 }
 
 
@@ -94,6 +93,7 @@ class WarmStartConfig:
         range: where a linear search looks for it, so that it bears the errors of agents that learn
         from the bandit, and on the trajectories whose states the bandit's contexts are fitted to. With 0
         those mix expert and random actions.
+      expert_episode_steps: at which a linear search cuts its episodes; the environment's own limit where None.
       min_spread: entries of the observation whose standard deviation is smaller are stretched about
         their mean until they have it, and the expert says what it does there; 0 for the states as
         they are. Agents learn little from an entry as small as a car's velocity. For
@@ -108,6 +108,10 @@ class WarmStartConfig:
         their range.
       horizon: steps after which a Monte-Carlo return is cut off.
       fit_steps: Adam steps of each regression.
+      aggregation_rounds: of dataset aggregation (Ross et al., 2011): agents train in the fit, states that
+        they visit join the dataset with what the expert does there, and all is fitted again. The fit
+        whose agents earn most is kept: rounds scatter.
+      aggregation_agents: of each algorithm of the inner loop, in every round and after the last.
     """
 
     construction: str = "action_distance"
@@ -116,6 +120,7 @@ class WarmStartConfig:
     expert_steps: int | None = None
     expert_generations: int = 80
     expert_noise: float = 0.0
+    expert_episode_steps: int | None = None
     min_spread: float = 0.0
     stretch: float = 1.0
     discount: float = 0.95
@@ -124,12 +129,14 @@ class WarmStartConfig:
     near_actions: int = 0
     horizon: int = 100
     fit_steps: int = 4000
+    aggregation_rounds: int = 0
+    aggregation_agents: int = 8
 
     def __post_init__(self) -> None:
         one_of("warm-start construction", self.construction, CONSTRUCTIONS)
         experts = ("auto", *SEARCHES, *ALGORITHMS)
         one_of("expert", self.expert, experts)
-        at_least(0, self, "min_spread", "expert_noise", "near_actions")
+        at_least(0, self, "min_spread", "expert_noise", "near_actions", "aggregation_rounds")
         if not 0 <= self.discount <= 1:
             raise UserError(f"discount is {self.discount}: it must be between 0 and 1.")
         positive(self, "stretch")
@@ -141,21 +148,13 @@ class WarmStartConfig:
                     f"take action_distance, or a {field} of {none}."
                 )
         at_least(1, self, "num_experts", "num_states", "num_actions")
-        at_least(1, self, "horizon", "fit_steps", "expert_generations")
+        at_least(1, self, "horizon", "fit_steps", "expert_generations", "expert_episode_steps")
+        at_least(1, self, "aggregation_agents")
         if self.near_actions >= self.num_actions:
             raise UserError(
                 f"near_actions is {self.near_actions} of {self.num_actions} actions, one of them the expert's: take "
                 f"at most {self.num_actions - 1}."
             )
-
-
-class ExpertDataset(NamedTuple):
-    """States that agents of mixed skill visit, with the expert's Q-values of random actions there."""
-
-    observation: jax.Array  # [S, O]
-    action: jax.Array  # [S, K, ...]
-    q: jax.Array  # [S, K]; zeros for "action_distance", which needs none
-    expert_action: jax.Array  # [S, ...]
 
 
 def expert_agent(
@@ -171,6 +170,11 @@ def expert_agent(
             f"expert_noise and near_actions are of continuous actions, and {name} has discrete ones: leave them out."
         )
     algorithm = _chosen(name, config)
+    if config.expert_episode_steps and not (algorithm in SEARCHES and SEARCHES[algorithm].cuts):
+        raise UserError(
+            f"expert_episode_steps is {config.expert_episode_steps}, and the expert of {name} is found by {algorithm}, "
+            "which has whole episodes: leave it out, or choose linear."
+        )
     if algorithm in SEARCHES:
         search = SEARCHES[algorithm]
         if search.continuous and isinstance(space, spaces.Discrete):
@@ -195,83 +199,131 @@ def _chosen(name: str, config: WarmStartConfig) -> str:
     return "ppo" if has_values_for("ppo", name) else "evolution"
 
 
-def find_expert(
-    name: str,
-    env: environment.Environment[Any, Any],
-    env_params: Any,
+def warm_start(
+    bandit: SyntheticBandit,
+    specs: Mapping[str, AgentSpec],
+    place: Place,
     key: jax.Array,
     config: WarmStartConfig,
-) -> Expert:
-    """An expert for an environment, by name as `scb.make` takes it."""
-    spec = expert_agent(name, env.action_space(env_params), config)
+) -> tuple[Weights, dict[str, float]]:
+    """A bandit's weights fitted to an expert of an environment, and how the fit came about.
+
+    Args:
+      bandit: whose weights.
+      specs: of the agents that train in the bandit, for rounds of aggregation.
+      place: the environment.
+      key: decides everything.
+
+    Raises:
+      UserError: the expert earns less than random actions.
+    """
+    watch = Stopwatch()
+    key_expert, key_data, key_fit = split_key(key, 3)
+    expert = find_expert(place, key_expert, config)
+    random = environment_spec(place.name).random_return(place.backend)
+    if expert.mean_return < random:
+        raise UserError(
+            f"the expert of {place.name} earns {expert.mean_return:.4g} and random actions {random:.4g}: give it more "
+            "steps or generations, or choose another expert."
+        )
+    dataset, steps = expert_dataset(expert, place, key_data, config)
+    fit = partial(fit_bandit, bandit, construction=config.construction, steps=config.fit_steps)
+    weights, report = fit(dataset, key_fit)
+    if config.aggregation_rounds:
+        learners = Learners(bandit, specs, place, config.aggregation_agents)
+        latest, found, best, last = weights, report, -np.inf, config.aggregation_rounds
+        for number, key_round in enumerate(split_key(named_key(key, "rounds"), last + 1)):
+            key_agents, key_pick, key_label, key_fit = split_key(key_round, 4)
+            earned, visited = learners(latest, key_agents)
+            steps += learners.steps
+            if number == 0 or earned > best:
+                weights, best = latest, earned
+                report = {**found, "round": number, "agents_return": earned}
+            if number < last:
+                more, taken = labelled(expert, place, visited, key_pick, key_label, config)
+                dataset = jax.tree.map(lambda *x: jnp.concatenate(x), dataset, more)
+                latest, found = fit(dataset, key_fit)
+                steps += taken
+    return weights, {
+        "expert_return": expert.mean_return,
+        "environment_steps": expert.environment_steps + steps,
+        "seconds": round(watch.lap(), 1),
+        **report,
+    }
+
+
+def find_expert(place: Place, key: jax.Array, config: WarmStartConfig) -> Expert:
+    """An expert for an environment of the registry."""
+    spec = expert_agent(place.name, place.env.action_space(place.params), config)
     if spec is None:
-        search = SEARCHES[_chosen(name, config)]
-        return search.find(name, env, env_params, key, config)
-    return train_expert(env, env_params, spec, key, config.num_experts)
+        return SEARCHES[_chosen(place.name, config)].find(place, key, config)
+    return train_expert(place.env, place.params, spec, key, config.num_experts)
 
 
 def expert_dataset(
-    expert: Expert,
-    env: environment.Environment[Any, Any],
-    env_params: Any,
-    key: jax.Array,
-    config: WarmStartConfig,
+    expert: Expert, place: Place, key: jax.Array, config: WarmStartConfig
 ) -> tuple[ExpertDataset, int]:
-    """Q-values by simulation: from a stored state take an action once, then follow the expert.
+    """What an expert does, and what actions are worth, in states of trajectories that it takes part in.
 
-    States come from trajectories that mix expert and random actions, each with its own proportion,
-    so that they cover what an agent meets on its way to becoming an expert, or from the expert's with
-    `expert_noise`. All actions of a state
-    share one key: their differences are exact where the environment is deterministic.
+    They mix expert and random actions, each with its own proportion, so that they cover what an agent
+    meets on its way to becoming an expert, or are the expert's with `expert_noise`.
 
     Returns:
       (the dataset, environment steps it took).
     """
-    space, noise = env.action_space(env_params), config.expert_noise
-    key_roll, key_pick, _, key_q = split_key(key, 4)
+    space, noise = place.env.action_space(place.params), config.expert_noise
+    key_roll, key_pick, _, key_label = split_key(key, 4)
+
+    def roll(key: jax.Array) -> Visited:
+        key_reset, key_skill, key_steps = split_key(key, 3)
+        skill = jax.random.uniform(key_skill)
+
+        def act(observation: jax.Array, keys: jax.Array) -> jax.Array:
+            if noise:
+                assert not isinstance(space, spaces.Discrete)
+                return noisy(expert.policy, space, noise)(observation, keys[0])
+            return jnp.where(
+                jax.random.uniform(keys[1]) < skill,
+                expert.policy(jnp.ravel(observation)),
+                space.sample(keys[0]),
+            )
+
+        return trajectory(place, act, key_reset, key_steps)
+
+    visited = jax.jit(jax.vmap(roll))(split_key(key_roll, TRAJECTORIES))
+    return labelled(expert, place, visited, key_pick, key_label, config)
+
+
+def labelled(
+    expert: Expert,
+    place: Place,
+    visited: Visited,
+    key_pick: jax.Array,
+    key_label: jax.Array,
+    config: WarmStartConfig,
+) -> tuple[ExpertDataset, int]:
+    """What the expert does, and what actions are worth, in `num_states` of [N, T, ...] states.
+
+    Q-values are by simulation: from a stored state take an action once, then follow the expert. All
+    actions of a state share one key: their differences are exact where the environment is
+    deterministic.
+
+    Returns:
+      (the dataset, environment steps that the states and the simulations took).
+    """
+    space, number = place.env.action_space(place.params), config.num_states
+    total = visited.observation.shape[0] * visited.observation.shape[1]
+    chosen = jax.random.choice(key_pick, total, (number,), replace=number > total)
+    states = jax.tree.map(lambda x: jnp.reshape(x, (-1, *x.shape[2:]))[chosen], visited)
 
     def expert_policy(observation: jax.Array) -> jax.Array:
         return expert.policy(jnp.ravel(observation))
 
-    num_envs = 256
-    num_steps = min(200, int(env_params.max_steps_in_episode))
-
-    def step(carry: Any, key: jax.Array) -> Any:
-        env_state, observation, skill = carry
-        key_random, key_mix, key_step = split_key(key, 3)
-        if noise:
-            assert not isinstance(space, spaces.Discrete)
-            action = noisy(expert.policy, space, noise)(observation, key_random)
-        else:
-            random_action = space.sample(key_random)
-            action = jnp.where(
-                jax.random.uniform(key_mix) < skill, expert_policy(observation), random_action
-            )
-        next_observation, next_state, *_ = env.step(key_step, env_state, action, env_params)
-        return (next_state, next_observation, skill), (env_state, observation)
-
-    def roll(key: jax.Array) -> Any:
-        key_reset, key_skill, key_steps = split_key(key, 3)
-        observation, env_state = env.reset(key_reset, env_params)
-        start = (env_state, observation, jax.random.uniform(key_skill))
-        return jax.lax.scan(step, start, split_key(key_steps, num_steps))[1]
-
-    visited = jax.jit(jax.vmap(roll))(split_key(key_roll, num_envs))
-    picked = jax.random.choice(
-        key_pick,
-        num_envs * num_steps,
-        (config.num_states,),
-        replace=config.num_states > num_envs * num_steps,
-    )
-    env_states, observations = jax.tree.map(
-        lambda x: jnp.reshape(x, (-1, *x.shape[2:]))[picked], visited
-    )
-
     def q_value(env_state: Any, action: jax.Array, key: jax.Array) -> jax.Array:
         def follow(carry: Any, key: jax.Array) -> Any:
             env_state, action, weight = carry
-            observation, env_state, reward, terminated, _ = env.step_env(
-                key, env_state, action, env_params
+            observation, env_state, reward, terminated, _ = place.env.step_env(
+                key, env_state, action, place.params
             )
             reward = jnp.reshape(reward, ()) * weight
             weight = weight * config.discount * (1.0 - terminated)
@@ -289,12 +341,12 @@ def expert_dataset(
         if isinstance(space, spaces.Discrete):
             actions = jnp.arange(space.n)
         else:
-            number = config.num_actions - 1
-            random = jax.vmap(space.sample)(split_key(key_random, number))
+            others = config.num_actions - 1
+            random = jax.vmap(space.sample)(split_key(key_random, others))
             if config.near_actions:
                 about = noisy(expert.policy, space, 0.3)
-                near = jax.vmap(about, in_axes=(None, 0))(observation, split_key(key_near, number))
-                which = jnp.arange(number) < config.near_actions
+                near = jax.vmap(about, in_axes=(None, 0))(observation, split_key(key_near, others))
+                which = jnp.arange(others) < config.near_actions
                 random = jnp.where(jnp.expand_dims(which, range(1, random.ndim)), near, random)
             actions = jnp.concatenate([best[None], random])
         if config.construction == "action_distance":
@@ -303,17 +355,17 @@ def expert_dataset(
             q = jax.vmap(q_value, in_axes=(None, 0, None))(env_state, actions, key_follow)
         return actions, q, best
 
-    actions, q, best = label(env_states, observations, split_key(key_q, config.num_states))
+    actions, q, best = label(*states, split_key(key_label, number))
+    observations = states.observation
     if config.min_spread > 0 or config.stretch != 1:
         observations, best = _stretched(observations, config, expert_policy)
-        best = jnp.reshape(best, (config.num_states, *space.shape))
+        best = jnp.reshape(best, (number, *space.shape))
         if not isinstance(space, spaces.Discrete):
             actions = actions.at[:, 0].set(best)
-    dataset = ExpertDataset(jnp.reshape(observations, (config.num_states, -1)), actions, q, best)
-    steps = num_envs * num_steps
+    dataset = ExpertDataset(jnp.reshape(observations, (number, -1)), actions, q, best)
     if config.construction != "action_distance":
-        steps += config.num_states * actions.shape[1] * config.horizon
-    return dataset, steps
+        total += number * actions.shape[1] * config.horizon
+    return dataset, total
 
 
 def _stretched(
@@ -325,110 +377,3 @@ def _stretched(
     factors = config.stretch * jnp.maximum(1.0, config.min_spread / (std + 1e-8))
     stretched = mean + (flat - mean) * factors
     return stretched, jax.jit(jax.vmap(policy))(stretched)
-
-
-def reward_targets(dataset: ExpertDataset, construction: str, discrete: bool) -> jax.Array:
-    """[S, K] what the bandit's reward should be, of unit standard deviation."""
-    if construction == "action_distance":
-        best = jnp.expand_dims(dataset.expert_action, 1)
-        if discrete:
-            target = (dataset.action == best).astype(jnp.float32)
-        else:
-            difference = jnp.reshape(dataset.action - best, (*dataset.q.shape, -1))
-            target = -jnp.linalg.norm(difference, axis=-1)
-    elif construction == "q":
-        target = dataset.q - dataset.q.mean()
-    else:
-        target = dataset.q - dataset.q.max(axis=1, keepdims=True)
-    return target / (target.std() + 1e-8)
-
-
-def fit_bandit(
-    bandit: SyntheticBandit, dataset: ExpertDataset, key: jax.Array, config: WarmStartConfig
-) -> tuple[Weights, dict[str, float]]:
-    """Regresses the reward network, and matches the contexts' distribution to the dataset's states.
-
-    The reward by least squares; the contexts by the energy distance between generated and stored
-    states, which is zero only where the two distributions are equal.
-
-    Returns:
-      (weights, {"reward_r2": explained variance of the reward, "energy_distance": of the
-      contexts}).
-    """
-    if bandit.linear:
-        return _fit_linear(bandit, dataset, config)
-    key_init, key_reward, key_context = split_key(key, 3)
-    weights = bandit.init_weights(key_init)
-    target = reward_targets(dataset, config.construction, bandit.discrete)
-    optimizer = optax.adam(optax.cosine_decay_schedule(5e-3, config.fit_steps))
-    num_states = dataset.observation.shape[0]
-    scale = dataset.observation.std(axis=0) + 1e-6
-
-    def reward_loss(reward_weights: Any, index: jax.Array, _: jax.Array) -> jax.Array:
-        params = BanditParams(weights={"initial_state": {}, "reward": reward_weights})
-        predict = jax.vmap(
-            jax.vmap(bandit.mean_reward, in_axes=(None, 0, None)), in_axes=(0, 0, None)
-        )
-        predicted = predict(dataset.observation[index], dataset.action[index], params)
-        return jnp.mean((predicted - target[index]) ** 2)
-
-    def context_loss(state_weights: Any, index: jax.Array, key: jax.Array) -> jax.Array:
-        params = BanditParams(weights={"initial_state": state_weights, "reward": {}})
-        generated, _ = jax.vmap(bandit.reset_env, in_axes=(0, None))(
-            split_key(key, index.shape[0]), params
-        )
-        return energy_distance(generated / scale, dataset.observation[index] / scale)
-
-    @partial(jax.jit, static_argnums=0)
-    def fit(loss: Any, start: Any, key: jax.Array) -> tuple[Any, jax.Array]:
-        def step(carry: Any, key: jax.Array) -> Any:
-            weights, state = carry
-            key_index, key_loss = split_key(key)
-            index = jax.random.randint(key_index, (256,), 0, num_states)
-            value, gradient = jax.value_and_grad(loss)(weights, index, key_loss)
-            updates, state = optimizer.update(gradient, state)
-            return (optax.apply_updates(weights, updates), state), value
-
-        carry = (start, optimizer.init(start))
-        (weights, _), losses = jax.lax.scan(step, carry, split_key(key, config.fit_steps))
-        return weights, losses[-100:].mean()
-
-    reward, error = fit(reward_loss, weights["reward"], key_reward)
-    context, distance = fit(context_loss, weights["initial_state"], key_context)
-    report = {
-        "reward_r2": float(1.0 - error / jnp.var(target)),
-        "energy_distance": float(distance),
-    }
-    return jax.tree.map(np.asarray, {"initial_state": context, "reward": reward}), report
-
-
-def _fit_linear(
-    bandit: SyntheticBandit, dataset: ExpertDataset, config: WarmStartConfig
-) -> tuple[Weights, dict[str, float]]:
-    """The closed form, and how much of the expert's actions it explains."""
-    if config.construction != "action_distance":
-        raise UserError(
-            f"the construction is {config.construction}, and a linear bandit's reward is a distance of actions: take "
-            "action_distance."
-        )
-    states = np.asarray(dataset.observation)
-    best = np.reshape(dataset.expert_action, (len(states), -1))
-    low, high = bandit.bounds
-    weights = fitted(states, best, low, high)
-    reward = weights["reward"]
-    shares = np.tanh((states - reward["center"]) @ reward["kernel"] + reward["bias"])
-    errors = (low + high) / 2 + shares * (high - low) / 2 - best
-    return weights, {"action_r2": float(1.0 - errors.var() / best.var(axis=0).mean())}
-
-
-def energy_distance(a: jax.Array, b: jax.Array) -> jax.Array:
-    """[] 2 E|a - b| - E|a - a'| - E|b - b'| of two [B, O] samples (Szekely and Rizzo, 2013)."""
-
-    def mean_distance(x: jax.Array, y: jax.Array, same: bool) -> jax.Array:
-        squared = jnp.sum((x[:, None] - y[None]) ** 2, axis=-1)
-        # The square root has no gradient at zero, which is where every point stands to itself.
-        distance = jnp.sqrt(squared + 1e-12)
-        size = x.shape[0]
-        return distance.sum() / (size * (size - 1) if same else size * size)
-
-    return 2 * mean_distance(a, b, False) - mean_distance(a, a, True) - mean_distance(b, b, True)

@@ -14,11 +14,11 @@ from scb.analysis.optimal_actions import first_action, optimal_actions, optimal_
 from scb.analysis.planes import observation_names, plane_for
 from scb.analysis.states import bandit_states, follow
 from scb.console import console
-from scb.discovery import evaluation_place
 from scb.environments.synthetic import SyntheticBandit
 from scb.environments.zoo import open_bandit
 from scb.errors import at_least
 from scb.files import make_folder, write_json
+from scb.judgement import evaluation_place
 from scb.keys import root_key, split_key
 from scb.measurement import Place
 from scb.statistics import estimate

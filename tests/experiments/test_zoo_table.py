@@ -10,11 +10,11 @@ import pytest
 import scb.agents.spec as specs
 from experiments import zoo_table, zoo_table_page
 from scb.agents.spec import bandit_agent
-from scb.discovery import judge
 from scb.environments.registry import environment_spec, make
 from scb.environments.synthetic import BanditConfig, bandit_for
 from scb.environments.zoo import load_bandit, save_bandit
 from scb.errors import UserError
+from scb.judgement import judge
 from scb.measurement import Place
 from scb.statistics import estimate, iqm
 

@@ -188,8 +188,9 @@ EVERY_FLAG = """--preset=paper --environment=MountainCar-v0 --backend=spring --m
 --mode=sequential '--hyperparameters={"ppo": {"learning_rate": [0.25]}}' --agents-per-candidate=3
 --evaluation-episodes=2 --mode-actions --curriculum=linear:2:4:0:2 --from-bandit=b.npz --reward-std=4.0
 --select=best --hidden-size=3 --activation=relu --latent=uniform --latent-size=2 --form=linear
---construction=q --expert=sac --expert-noise=0.2 --near-actions=2 --num-experts=3 --expert-steps=9
---expert-generations=8 --discount=0.5 --num-states=7 --num-actions=6 --horizon=4 --fit-steps=3
+--construction=q --expert=sac --expert-noise=0.2 --expert-episode-steps=5 --near-actions=2 --num-experts=3
+--expert-steps=9 --expert-generations=8 --discount=0.5 --num-states=7 --num-actions=6 --horizon=4 --fit-steps=3
+--aggregation-rounds=2 --aggregation-agents=3
 --strategy=Open_ES --population-size=6 --generations=9 --sigma=0.2 --sigma-decay=0.9 --sigma-limit=0.1
 --learning-rate=0.3 --learning-rate-decay=0.8 --learning-rate-limit=0.2 --combine=ranks --mean-evaluations=5
 --evaluate-mean-every=4 --checkpoint-every=3 --seed=8"""

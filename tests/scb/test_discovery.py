@@ -13,10 +13,7 @@ from scb.curriculum import CurriculumConfig, paper_curriculum
 from scb.discovery import (
     BanditDiscovery,
     DiscoveryConfig,
-    check_fits,
     discover,
-    judge,
-    standardize_reward,
 )
 from scb.environments.registry import make
 from scb.environments.synthetic import BanditConfig, SyntheticBandit, bandit_for
@@ -30,6 +27,8 @@ from scb.environments.zoo import (
 from scb.errors import UserError
 from scb.evaluation import Episodes
 from scb.evolution import EvolutionConfig, map_population
+from scb.fitting import standardize_reward
+from scb.judgement import check_fits, judge
 from scb.measurement import Place
 from scb.runs import Run, config_dict
 from scb.statistics import iqm
@@ -163,7 +162,7 @@ def test_a_discovered_bandit_is_saved_and_loaded(discovered, tmp_path):
     path = save_bandit(tmp_path / "Synthetic-CartPole-v1", problem.bandit, outcome.mean, METADATA)
     bandit = load_bandit(path)
     np.testing.assert_array_equal(flat(bandit.default_params.weights), flat(outcome.mean))
-    check_fits(bandit, problem.env, problem.env_params, "CartPole-v1")
+    check_fits(bandit, problem.place.env, problem.place.params, "CartPole-v1")
 
 
 def test_a_candidate_is_judged_by_the_return_of_every_agent(discovered):
@@ -185,7 +184,7 @@ def test_judging_is_of_the_same_agents_whatever_their_actions_and_of_others_for_
     discovered, monkeypatch
 ):
     problem, outcome = discovered
-    place = Place("CartPole-v1", problem.env, problem.env_params)
+    place = problem.place
     arguments = (problem.specs["ppo"], problem.bandit, outcome.mean, place)
     size = {"num_agents": 5, "num_episodes": 2}
     both = judge(*arguments, 1, **size)
@@ -347,7 +346,7 @@ def test_the_steps_of_several_algorithms_are_counted():
 @pytest.mark.parametrize("environment", ["CartPole-v1", "Pendulum-v1", "MountainCarContinuous-v0"])
 def test_an_empty_list_stands_for_the_papers_algorithms(environment):
     problem = BanditDiscovery(replace(CONFIG, environment=environment, algorithms=()))
-    expected = algorithms_for(problem.env.action_space(problem.env_params))
+    expected = algorithms_for(problem.place.env.action_space(problem.place.params))
     assert problem.config.algorithms == expected
     assert tuple(problem.specs) == expected
 
@@ -439,7 +438,7 @@ def test_a_synthetic_mdp_is_discovered_and_opens_as_an_environment(parameterizat
     assert env.config.parameterization == parameterization
     assert env_params.max_steps_in_episode == 5
     np.testing.assert_array_equal(flat(env_params.weights), flat(outcome.mean))
-    check_fits(env, problem.env, problem.env_params, "CartPole-v1")
+    check_fits(env, problem.place.env, problem.place.params, "CartPole-v1")
 
 
 def test_a_synthetic_mdp_lasts_as_long_as_the_environment_where_nothing_is_said():

@@ -13,9 +13,10 @@ from lpo.inner_loop import MetaTrainingConfig
 from lpo.meta_training import meta_train
 from lpo.objectives import load_objective
 from scb.agents.spec import environment_agent
-from scb.discovery import DiscoveryConfig, discover, judge
+from scb.discovery import DiscoveryConfig, discover
 from scb.environments.synthetic import BanditConfig
 from scb.evolution import EvolutionConfig
+from scb.judgement import judge
 from scb.keys import key_at, named_key, root_key, split_key
 from scb.measurement import Place
 from scb.seeds import validation

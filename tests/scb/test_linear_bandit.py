@@ -6,15 +6,17 @@ import numpy as np
 import pytest
 from gymnax.environments import spaces
 
-from scb.discovery import BanditDiscovery, DiscoveryConfig, standardize_reward
+from scb.discovery import DiscoveryConfig, discover
 from scb.environments.linear import fitted
 from scb.environments.registry import make
 from scb.environments.synthetic import BanditConfig, SyntheticBandit, bandit_for
 from scb.environments.synthetic_mdp import synthetic_for
 from scb.environments.zoo import load_bandit, save_bandit
 from scb.errors import UserError
-from scb.evolution import EvolutionConfig, evolve
-from scb.warm_start import ExpertDataset, WarmStartConfig, fit_bandit
+from scb.evolution import EvolutionConfig
+from scb.fitting import ExpertDataset, fit_bandit, standardize_reward
+from scb.runs import Run, config_dict
+from scb.warm_start import WarmStartConfig
 
 LINEAR = BanditConfig(form="linear")
 SPACE = spaces.Box(jnp.array([-1.0, 0.0]), jnp.array([1.0, 4.0]), (2,), jnp.float32)
@@ -118,8 +120,7 @@ def pendulum_config(**changes):
 
 def pendulum(**changes):
     config = pendulum_config(**changes)
-    problem = BanditDiscovery(config)
-    return problem, evolve(problem, config.evolution, quiet=True)
+    return discover(config, quiet=True)
 
 
 def test_one_is_fitted_to_an_expert_and_evolved():
@@ -134,14 +135,17 @@ def test_one_is_fitted_to_an_expert_and_evolved():
 
 
 def test_a_run_looks_for_its_expert_once(tmp_path, monkeypatch):
-    first, resumed = (BanditDiscovery(pendulum_config()) for _ in range(2))
-    first.folder = resumed.folder = tmp_path
-    start = first.initial_solution(jax.random.key(0))
-    monkeypatch.delattr("scb.discovery.find_expert")
-    again = resumed.initial_solution(jax.random.key(0))
-    jax.tree.map(np.testing.assert_array_equal, again, start)
+    config = pendulum_config()
+    run = Run.open(tmp_path / "run", config_dict(config))
+    first, outcome = discover(config, run, quiet=True)
+    monkeypatch.delattr("scb.discovery.warm_start")
+    run = Run.open(tmp_path / "run", config_dict(config), resume=True)
+    resumed, again = discover(config, run, quiet=True)
+    jax.tree.map(np.testing.assert_array_equal, again.mean, outcome.mean)
     assert resumed.warm_start_report == first.warm_start_report
-    assert load_bandit(tmp_path / "warm_start.npz").linear
+    start = first.initial_solution(jax.random.key(0))
+    kept = load_bandit(tmp_path / "run" / "warm_start.npz")
+    jax.tree.map(np.testing.assert_array_equal, kept.default_params.weights, start)
 
 
 def test_a_strategy_with_one_deviation_for_all_is_refused():
@@ -162,6 +166,4 @@ def test_what_a_linear_bandit_cannot_be_is_refused():
         BanditConfig(form="liner")
     dataset = ExpertDataset(*[jnp.zeros((4, 1))] * 4)
     with pytest.raises(UserError, match="the construction is q, and a linear bandit's reward"):
-        fit_bandit(
-            SyntheticBandit(2, SPACE, LINEAR), dataset, jax.random.key(0), WarmStartConfig("q")
-        )
+        fit_bandit(SyntheticBandit(2, SPACE, LINEAR), dataset, jax.random.key(0), "q")

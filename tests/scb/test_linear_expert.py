@@ -10,6 +10,7 @@ import pytest
 from scb.environments.registry import make
 from scb.errors import UserError
 from scb.linear_expert import LinearSearchConfig, search_linear_expert
+from scb.measurement import Place
 from scb.warm_start import WarmStartConfig, expert_agent, find_expert
 from tests.scb.probes import TWO_TARGETS, ContinuousCorridor, assert_solves_two_targets
 
@@ -85,10 +86,15 @@ def test_what_a_step_pays_without_falling_is_left_out(bonus, earned):
     assert earned[0] <= expert.mean_return <= earned[1]
 
 
+def test_a_search_cuts_its_episodes_and_judges_whole_ones():
+    config = WarmStartConfig(expert="linear", expert_generations=1, expert_episode_steps=30)
+    expert = find_expert(Place.named("Pendulum-v1"), jax.random.key(0), config)
+    assert expert.environment_steps == 64 * 30 + (20 + 20) * 200
+
+
 def test_a_warm_start_takes_a_linear_expert():
-    env, params = make("Pendulum-v1")
     config = WarmStartConfig(expert="linear", expert_generations=1)
-    expert = find_expert("Pendulum-v1", env, params, jax.random.key(0), config)
+    expert = find_expert(Place.named("Pendulum-v1"), jax.random.key(0), config)
     # A generation of 64 episodes, a judgement of 20, and 20 of the expert, of 200 steps each.
     assert expert.environment_steps == (64 + 20 + 20) * 200
 
@@ -102,12 +108,18 @@ def test_a_warm_start_takes_a_linear_expert():
             "the expert of a linear search has continuous actions and CartPole-v1 discrete ones",
         ),
         ("Pendulum-v1", {"expert_steps": 9}, "expert_steps is 9, but a linear search finds"),
+        (
+            "Pendulum-v1",
+            {"expert": "td3", "expert_episode_steps": 9},
+            "expert_episode_steps is 9, and the expert of Pendulum-v1 is found by td3",
+        ),
     ],
 )
 def test_a_linear_expert_that_cannot_be_found_is_refused(name, arguments, message):
     env, params = make(name)
     with pytest.raises(UserError, match=message):
-        expert_agent(name, env.action_space(params), WarmStartConfig(expert="linear", **arguments))
+        config = WarmStartConfig(**{"expert": "linear", **arguments})
+        expert_agent(name, env.action_space(params), config)
 
 
 def test_more_best_directions_than_there_are_are_refused():

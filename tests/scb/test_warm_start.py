@@ -15,16 +15,9 @@ from scb.environments.registry import make
 from scb.environments.synthetic import BanditConfig, BanditParams, SyntheticBandit, bandit_for
 from scb.errors import UserError
 from scb.experts import Expert, judged, train_expert
-from scb.warm_start import (
-    ExpertDataset,
-    WarmStartConfig,
-    energy_distance,
-    expert_agent,
-    expert_dataset,
-    find_expert,
-    fit_bandit,
-    reward_targets,
-)
+from scb.fitting import ExpertDataset, energy_distance, fit_bandit, reward_targets
+from scb.measurement import Place
+from scb.warm_start import WarmStartConfig, expert_agent, expert_dataset, find_expert
 from tests.scb.probes import ContinuousCorridor, Corridor, CorridorParams, context_bandit
 
 TINY = PPOConfig(
@@ -126,7 +119,7 @@ def corridor_dataset():
     config = WarmStartConfig(construction="q", discount=0.5, num_states=64, horizon=10)
     env = Corridor()
     dataset, steps = expert_dataset(
-        idle(env.action_space(params)), env, params, jax.random.key(1), config
+        idle(env.action_space(params)), Place(env.name, env, params), jax.random.key(1), config
     )
     return jax.tree.map(np.asarray, dataset), steps, params
 
@@ -154,8 +147,7 @@ def test_the_action_distance_asks_the_expert_only_and_simulates_no_q_values():
     env, params = Corridor(), CorridorParams(random_start=1)
     dataset, steps = expert_dataset(
         idle(env.action_space(params)),
-        env,
-        params,
+        Place(env.name, env, params),
         jax.random.key(1),
         WarmStartConfig(construction="action_distance", num_states=16, horizon=10),
     )
@@ -172,7 +164,7 @@ def noisy_dataset():
     env, params = make("Pendulum-v1")
     half = Expert(lambda observation: jnp.full(1, 0.5), mean_return=0.0, environment_steps=0)
     config = WarmStartConfig(expert_noise=0.1, num_states=512, num_actions=11, near_actions=6)
-    return expert_dataset(half, env, params, jax.random.key(4), config)[0]
+    return expert_dataset(half, Place(env.name, env, params), jax.random.key(4), config)[0]
 
 
 def test_tried_actions_lie_about_the_experts_and_everywhere(noisy_dataset):
@@ -204,7 +196,7 @@ def test_states_are_those_that_the_expert_visits_under_noise():
     params = env.default_params.replace(max_steps_in_episode=1000)
     config = WarmStartConfig(expert_noise=0.2, num_states=2048)
     dataset, _ = expert_dataset(
-        idle(env.action_space(params)), env, params, jax.random.key(3), config
+        idle(env.action_space(params)), Place(env.name, env, params), jax.random.key(3), config
     )
     # The expert's 0 with a deviation of 0.2 times half of a range of 3; one in 200 is a start.
     assert np.std(dataset.observation) == pytest.approx(0.3, rel=0.1)
@@ -216,7 +208,7 @@ def test_the_horizon_cuts_the_return():
     config = WarmStartConfig(construction="q", discount=0.5, num_states=16, horizon=2)
     env = Corridor()
     dataset, _ = expert_dataset(
-        idle(env.action_space(params)), env, params, jax.random.key(1), config
+        idle(env.action_space(params)), Place(env.name, env, params), jax.random.key(1), config
     )
     by_hand = np.array([[2.0, 11.0], [4.0, 22.0], [4.0, 40.0]])
     np.testing.assert_allclose(dataset.q, by_hand[np.argmax(dataset.observation, axis=1)])
@@ -228,7 +220,9 @@ def bandit_dataset():
     bandit = context_bandit()
     config = WarmStartConfig(construction="q", num_states=256, num_actions=8, horizon=3)
     expert = idle(bandit.action_space())
-    return expert_dataset(expert, bandit, bandit.default_params, jax.random.key(2), config)[0]
+    return expert_dataset(
+        expert, Place(bandit.name, bandit, bandit.default_params), jax.random.key(2), config
+    )[0]
 
 
 def test_continuous_actions_are_the_experts_and_random_ones_within_the_bounds(bandit_dataset):
@@ -258,7 +252,7 @@ def contexts(min_spread):
     config = WarmStartConfig(num_states=256, num_actions=4, horizon=1, min_spread=min_spread)
     expert = judged(follow_the_context, bandit, bandit.default_params, jax.random.key(0))
     key = jax.random.key(2)
-    return expert_dataset(expert, bandit, bandit.default_params, key, config)[0]
+    return expert_dataset(expert, Place(bandit.name, bandit, bandit.default_params), key, config)[0]
 
 
 @pytest.mark.parametrize("min_spread", [1.0, 3.0])
@@ -298,7 +292,7 @@ def test_discrete_labels_follow_the_stretched_state_too():
     env = Corridor()
     expert = Expert(lambda observation: jnp.int32(observation[0] > 0.7), 0.0, 0)
     config = WarmStartConfig(num_states=64, horizon=1, min_spread=2.0)
-    dataset, _ = expert_dataset(expert, env, params, jax.random.key(1), config)
+    dataset, _ = expert_dataset(expert, Place(env.name, env, params), jax.random.key(1), config)
     np.testing.assert_allclose(dataset.observation.std(axis=0), 2.0, rtol=1e-4)
     first = np.asarray(dataset.observation[:, 0])
     assert set(np.unique(first.round(3)).tolist()).isdisjoint({0.0, 1.0})
@@ -312,7 +306,9 @@ def test_an_entry_that_never_changes_stays_finite():
     env = Corridor(cells=1)
     config = WarmStartConfig(num_states=8, horizon=1, min_spread=1.0)
     expert = idle(env.action_space(env.default_params))
-    dataset, _ = expert_dataset(expert, env, env.default_params, jax.random.key(1), config)
+    dataset, _ = expert_dataset(
+        expert, Place(env.name, env, env.default_params), jax.random.key(1), config
+    )
     np.testing.assert_array_equal(dataset.observation, 1.0)
 
 
@@ -324,7 +320,9 @@ def test_an_entry_that_never_changes_stays_finite():
 def fitted(bandit_dataset):
     bandit = SyntheticBandit(1, context_bandit().action_space(), BanditConfig(hidden_size=8))
     config = WarmStartConfig(construction="q", fit_steps=1000)
-    return bandit, *fit_bandit(bandit, bandit_dataset, jax.random.key(3), config)
+    return bandit, *fit_bandit(
+        bandit, bandit_dataset, jax.random.key(3), config.construction, config.fit_steps
+    )
 
 
 def test_a_reward_that_the_network_can_represent_is_fitted(fitted, bandit_dataset):
@@ -368,7 +366,9 @@ def test_a_discrete_bandit_is_fitted_too(corridor_dataset):
     bandit = bandit_for(Corridor(), params, BanditConfig(hidden_size=8), "Synthetic-Corridor")
     config = WarmStartConfig(construction="action_distance", fit_steps=300)
     dataset = jax.tree.map(jnp.asarray, dataset)
-    weights, report = fit_bandit(bandit, dataset, jax.random.key(5), config)
+    weights, report = fit_bandit(
+        bandit, dataset, jax.random.key(5), config.construction, config.fit_steps
+    )
     assert report["reward_r2"] > 0.9
     # The expert's action 0 is the better one in every cell.
     params = BanditParams(weights=weights)
@@ -453,8 +453,7 @@ def test_evolution_gets_the_papers_curriculum_at_its_own_length(monkeypatch):
     seen = []
     monkeypatch.setattr("scb.warm_start.evolve_expert", lambda *arguments: seen.append(arguments))
     for name in ("MountainCar-v0", "CartPole-v1"):
-        env, env_params = make(name)
-        find_expert(name, env, env_params, jax.random.key(0), WarmStartConfig())
+        find_expert(Place.named(name), jax.random.key(0), WarmStartConfig())
     searches = [arguments[2] for arguments in seen]
     assert searches[0].curriculum == CurriculumConfig("linear", 1000, 200, begin=16, transition=48)
     assert searches[1].curriculum is None

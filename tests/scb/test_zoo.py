@@ -10,7 +10,6 @@ from gymnax.environments import spaces
 
 import scb
 from scb import artefacts
-from scb.discovery import check_fits
 from scb.environments.registry import make
 from scb.environments.synthetic import BanditConfig, BanditParams, SyntheticBandit
 from scb.environments.zoo import (
@@ -22,6 +21,7 @@ from scb.environments.zoo import (
     zoo_names,
 )
 from scb.errors import UserError
+from scb.judgement import check_fits
 from tests.scb.probes import context_bandit
 
 METADATA = {"seeds": {"discovery": 3}, "results": {}, "cost": {}, "command": "scb discover"}

@@ -1,0 +1,104 @@
+"""Dataset aggregation (Ross et al., 2011): where agents of a fitted bandit go, for the expert to say what to do there.
+
+An expert's own states do not show what to do after a mistake, and an agent that learned from a bandit
+makes mistakes.
+"""
+
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from scb.agents.spec import AgentSpec
+from scb.environments.synthetic import SyntheticBandit, Weights
+from scb.evolution import map_population
+from scb.experts import EPISODES
+from scb.keys import named_key, split_key
+from scb.measurement import Judge, Place, train_and_judge
+
+TRAJECTORIES = 256
+LENGTH = 200
+
+
+class Visited(NamedTuple):
+    """States of an environment."""
+
+    env_state: Any
+    observation: jax.Array
+
+
+def trajectory(
+    place: Place,
+    act: Callable[[jax.Array, jax.Array], jax.Array],
+    key_reset: jax.Array,
+    key_steps: jax.Array,
+) -> Visited:
+    """[T, ...] states from a start on, at most 200; `act` takes an observation and two keys."""
+
+    def step(carry: Any, key: jax.Array) -> Any:
+        env_state, observation = carry
+        keys = split_key(key, 3)
+        action = act(observation, keys[:2])
+        next_observation, next_state, *_ = place.env.step(keys[2], env_state, action, place.params)
+        return (next_state, next_observation), Visited(env_state, observation)
+
+    observation, env_state = place.env.reset(key_reset, place.params)
+    keys = split_key(key_steps, min(LENGTH, int(place.params.max_steps_in_episode)))
+    return jax.lax.scan(step, (env_state, observation), keys)[1]
+
+
+class Learners:
+    """Agents that train in a bandit: what they earn in the environment, and where they go there.
+
+    Args:
+      bandit: of these shapes.
+      specs: of the agents, by algorithm; what they have lists for is drawn.
+      place: the environment.
+      number: of agents of each algorithm.
+    """
+
+    def __init__(
+        self, bandit: SyntheticBandit, specs: Mapping[str, AgentSpec], place: Place, number: int
+    ) -> None:
+        self._bandit, self._specs, self._number = bandit, specs, number
+        judge = Judge(place.env, place.params, EPISODES, mode=True)
+        each = -(-TRAJECTORIES // (number * len(specs)))
+
+        def program(spec: AgentSpec) -> Any:
+            agent = spec.agent(bandit)
+
+            def one(hyperparameters: Any, key: jax.Array, params: Any) -> Any:
+                state, earned = train_and_judge(
+                    agent, hyperparameters, key, params, {"return": judge}
+                )
+
+                def act(observation: jax.Array, keys: jax.Array) -> jax.Array:
+                    return agent.act(state, observation, keys[0], params, mode=True)
+
+                def roll(key: jax.Array) -> Visited:
+                    return trajectory(place, act, *split_key(key))
+
+                visited = jax.vmap(roll)(split_key(named_key(key, "visits"), each))
+                return earned["return"].returns.mean(), visited
+
+            return map_population(one, number, (0, 0, None))
+
+        self._programs = {name: program(spec) for name, spec in specs.items()}
+        limit = int(place.params.max_steps_in_episode)
+        self.steps = number * len(specs) * EPISODES * limit
+
+    def __call__(self, weights: Weights, key: jax.Array) -> tuple[float, Visited]:
+        """(mean return of all agents, [N, T, ...] states that they visit); what is not finite counts as -inf."""
+        params, found = self._bandit.params(weights), []
+        for name, spec in self._specs.items():
+            key_draw, key_agents = split_key(named_key(key, name))
+            drawn = spec.sample(key_draw, self._number)
+            found.append(self._programs[name](drawn, split_key(key_agents, self._number), params))
+        returns = np.concatenate([earned for earned, _ in found])
+        visited = jax.tree.map(
+            lambda *x: jnp.concatenate([jnp.reshape(y, (-1, *y.shape[2:])) for y in x]),
+            *(visited for _, visited in found),
+        )
+        return float(np.where(np.isfinite(returns), returns, -np.inf).mean()), visited

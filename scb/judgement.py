@@ -1,0 +1,116 @@
+"""What agents of a synthetic environment are worth in the environment that it stands for."""
+
+from typing import Any
+
+import numpy as np
+from gymnax.environments import environment
+
+from scb.agents.spec import AgentSpec, algorithms_for, bandit_agent
+from scb.console import console
+from scb.environments.registry import environment_spec
+from scb.environments.synthetic import BanditConfig, SyntheticBandit, Weights, bandit_for
+from scb.environments.synthetic_mdp import SyntheticMDP
+from scb.errors import UserError
+from scb.measurement import MODE, SAMPLED, Agents, Place, measure
+from scb.rows import Rows, pivot
+from scb.seeds import VALIDATING
+from scb.statistics import estimate
+
+
+def check_fits(
+    bandit: SyntheticBandit | SyntheticMDP,
+    env: environment.Environment[Any, Any],
+    env_params: Any,
+    environment_name: str,
+) -> None:
+    """Raises a UserError where a bandit has other observation or action shapes than an environment."""
+    other = bandit_for(env, env_params, BanditConfig(), environment_name)
+    ours, theirs = (
+        f"{b.observation_size} observations and {b.num_actions} "
+        + ("discrete actions" if b.discrete else "action dimensions")
+        for b in (bandit, other)
+    )
+    if ours != theirs:
+        raise UserError(
+            f"bandit {bandit.name} has {ours}, {environment_name} has {theirs}: take the bandit of that environment."
+        )
+
+
+def evaluation_place(
+    bandit: SyntheticBandit | SyntheticMDP, name: str, environment: str | None, backend: str | None
+) -> Place:
+    """Where agents of a bandit, opened by this name, are judged: in what it stands for where no other is named.
+
+    Raises:
+      UserError: it stands for none, or does not fit the environment.
+    """
+    target = environment or environment_spec(name).evaluation_environment
+    place = Place.named(target, backend)
+    check_fits(bandit, place.env, place.params, target)
+    return place
+
+
+def judge(
+    spec: AgentSpec,
+    synthetic: SyntheticBandit | SyntheticMDP,
+    weights: Weights,
+    judge_in: Place,
+    seed: int,
+    num_agents: int = 20,
+    num_episodes: int = 50,
+    mode: bool | None = None,
+    rows: Rows | None = None,
+) -> dict[str, np.ndarray]:
+    """[num_agents] mean returns in the evaluation environment of agents trained in a synthetic one.
+
+    Args:
+      spec: the agents'; what it has lists for is drawn.
+      synthetic, weights: where they train.
+      judge_in: the evaluation environment.
+      seed: decides hyperparameters, training and evaluation.
+      rows: where agents are kept and found; None for memory.
+
+    Returns:
+      {"sampled_actions": [N], "mode_actions": [N]} of the same agents; with `mode` given, only that
+      one.
+    """
+    actions = (SAMPLED, MODE) if mode is None else (MODE if mode else SAMPLED,)
+    found = measure(
+        spec,
+        Place(synthetic.name, synthetic, synthetic.params(weights)),
+        judge_in,
+        Agents.drawn_from(spec, seed, num_agents),
+        episodes=num_episodes,
+        actions=actions,
+        rows=rows,
+    )
+    returns = pivot(found, "actions", "agent")
+    return {f"{kind}_actions": of_it for kind, of_it in zip(actions, returns, strict=True)}
+
+
+def judge_all(
+    synthetic: SyntheticBandit | SyntheticMDP,
+    weights: Weights,
+    judge_in: Place,
+    sampled: bool = True,
+    num_agents: int = 20,
+    num_episodes: int = 50,
+) -> dict[str, Any]:
+    """What agents of every fitting algorithm earn, by name of the algorithm in capitals, printed as it comes."""
+    results = {}
+    for algorithm in algorithms_for(judge_in.env.action_space(judge_in.params)):
+        spec = bandit_agent(algorithm, judge_in.name, sampled)
+        returns = judge(
+            spec, synthetic, weights, judge_in, VALIDATING.start, num_agents, num_episodes
+        )
+        results[algorithm.upper()] = {
+            "agents": num_agents,
+            "episodes": num_episodes,
+            "hyperparameters": "sampled from the paper's lists" if spec.lists else "fixed",
+            **{actions: estimate(x).as_dict() for actions, x in returns.items()},
+        }
+        line = "; ".join(
+            f"{actions.replace('_', ' ')} IQM {estimate(x)}" for actions, x in returns.items()
+        )
+        console().print(f"{algorithm.upper()} on {judge_in.name}: {line}")
+    return results

@@ -1,0 +1,123 @@
+"""A warm start goes where agents of its fit go, asks the expert what to do there, and keeps its best fit."""
+
+from itertools import pairwise
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from scb import aggregation, warm_start
+from scb.agents.ppo import PPOConfig, PPOHyperparameters
+from scb.agents.spec import AgentSpec
+from scb.aggregation import Learners, Visited
+from scb.environments.synthetic import BanditConfig, bandit_for
+from scb.errors import UserError
+from scb.experts import Expert
+from scb.measurement import Place
+from scb.warm_start import WarmStartConfig
+
+TINY = PPOConfig(
+    num_envs=2, num_steps=8, num_epochs=1, num_minibatches=1, total_steps=16, hidden_sizes=(4,)
+)
+SPECS = {"ppo": AgentSpec("ppo", TINY, PPOHyperparameters())}
+STATES = 256
+
+
+def turning(observation):
+    """A linear policy of Pendulum's observation, within the bounds of its actions."""
+    return 2 * jnp.tanh(observation[1:2] - observation[2:])
+
+
+@pytest.fixture
+def place():
+    return Place.named("Pendulum-v1")
+
+
+@pytest.fixture
+def bandit(place):
+    return bandit_for(place.env, place.params, BanditConfig(form="linear"), "Synthetic-Pendulum-v1")
+
+
+@pytest.fixture
+def expert(monkeypatch):
+    found = Expert(turning, mean_return=-1000.0, environment_steps=7)
+    monkeypatch.setattr(warm_start, "find_expert", lambda *arguments: found)
+
+
+def started(bandit, place, rounds):
+    config = WarmStartConfig(
+        num_states=STATES, num_actions=2, aggregation_rounds=rounds, aggregation_agents=2
+    )
+    return warm_start.warm_start(bandit, SPECS, place, jax.random.key(1), config)
+
+
+@pytest.fixture
+def datasets(monkeypatch):
+    """What every fit is made from."""
+    seen, fit = [], warm_start.fit_bandit
+
+    def spy(bandit, dataset, *arguments, **keywords):
+        seen.append(jax.tree.map(np.asarray, dataset))
+        return fit(bandit, dataset, *arguments, **keywords)
+
+    monkeypatch.setattr(warm_start, "fit_bandit", spy)
+    return seen
+
+
+def test_what_agents_of_a_fit_visit_joins_the_dataset_with_the_experts_actions(
+    bandit, place, expert, datasets, monkeypatch
+):
+    monkeypatch.setattr(aggregation, "TRAJECTORIES", 8)
+    _, report = started(bandit, place, rounds=2)
+    assert [len(dataset.observation) for dataset in datasets] == [STATES, 2 * STATES, 3 * STATES]
+    for before, after in pairwise(datasets):
+        np.testing.assert_array_equal(
+            after.observation[: len(before.observation)], before.observation
+        )
+    # Cosine and sine of an angle: states of the pendulum, and none of them twice as the expert's.
+    last = datasets[-1]
+    np.testing.assert_allclose((last.observation[:, :2] ** 2).sum(axis=1), 1.0, rtol=1e-4)
+    np.testing.assert_allclose(
+        last.expert_action, jax.vmap(turning)(last.observation), rtol=1e-5, atol=1e-6
+    )
+    assert report["round"] in (0, 1, 2) and report["agents_return"] < 0
+    # The expert's own; 256 trajectories of 200; and of two agents three judgements of 20 episodes
+    # and two rounds of 4 trajectories each.
+    assert report["environment_steps"] == 7 + (256 + 3 * 2 * 20 + 2 * 2 * 4) * 200
+
+
+class Fake:
+    """Agents that earn what the test says, at the top where nobody moves."""
+
+    steps = 0
+
+    def __init__(self, *arguments):
+        self.returns = iter([-5.0, -3.0, -4.0])
+
+    def __call__(self, weights, key):
+        observation = jnp.tile(jnp.array([1.0, 0.0, 0.5 * jax.random.uniform(key)]), (2, 3, 1))
+        return next(self.returns), Visited(jnp.zeros((2, 3)), observation)
+
+
+def test_the_fit_whose_agents_earn_most_is_kept(bandit, place, expert, datasets, monkeypatch):
+    monkeypatch.setattr(warm_start, "Learners", Fake)
+    weights, report = started(bandit, place, rounds=2)
+    assert (report["round"], report["agents_return"]) == (1, -3.0)
+    second, _ = warm_start.fit_bandit(bandit, datasets[1], jax.random.key(0))
+    jax.tree.map(np.testing.assert_array_equal, weights, second)
+
+
+def test_agents_whose_training_breaks_are_the_worst(bandit, place, monkeypatch):
+    monkeypatch.setattr(aggregation, "TRAJECTORIES", 2)
+    broken = jax.tree.map(lambda x: x * np.nan, bandit.init_weights(jax.random.key(0)))
+    earned, visited = Learners(bandit, SPECS, place, 2)(broken, jax.random.key(1))
+    assert earned == -np.inf and visited.observation.shape == (2, 200, 3)
+
+
+def test_an_expert_below_random_actions_is_refused(bandit, place, monkeypatch):
+    worse = Expert(turning, mean_return=-1500.0, environment_steps=7)
+    monkeypatch.setattr(warm_start, "find_expert", lambda *arguments: worse)
+    message = "the expert of Pendulum-v1 earns -1500 and random actions -1214: give it more steps"
+    with pytest.raises(UserError, match=message):
+        started(bandit, place, rounds=0)
