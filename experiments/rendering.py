@@ -5,6 +5,8 @@ from pathlib import Path
 from typing import Any
 
 import jinja2
+import numpy as np
+from numpy.typing import NDArray
 
 from experiments.claims import UNDECIDED, UNTESTED
 from scb.plotting import thousands
@@ -64,6 +66,12 @@ def span(numbers: Iterable[int]) -> str:
     return str(low) if low == high else f"{low} to {high}"
 
 
+def mean_known(values: NDArray[np.floating], places: int) -> str:
+    """The mean of those that are numbers, and nothing where none is."""
+    known = np.asarray(values)[np.isfinite(values)]
+    return number(float(known.mean()), places) if known.size else ""
+
+
 def said(outcome: str) -> str:
     """With its verb, as in "it holds", "it is not tested at this size"."""
     return f"{'is ' if outcome in (UNDECIDED, UNTESTED) else ''}*{outcome}*"
@@ -86,6 +94,7 @@ ENVIRONMENT.filters |= {
     "digits": digits,
     "iqm": lambda x: float(iqm(x)),
     "listed": listed,
+    "mean_known": mean_known,
     "millions": millions,
     "number": number,
     "percent": percent,

@@ -17,6 +17,7 @@ from lpo import drift_figures, figures, report
 from lpo.certificate import certify
 from lpo.commands import MetaTrain
 from lpo.comparison import Comparison, check_names, compare, ppo_spec
+from lpo.full_size import longer
 from lpo.inner_loop import MetaTrainingConfig
 from lpo.meta_training import (
     MetaTraining,
@@ -150,7 +151,8 @@ def run_pipeline(run: Run, config: PipelineConfig, preset: str, command: str) ->
         )
 
     console.print("[3/3] figures and report")
-    paths = _figures(run, search, objectives, comparisons, meta)
+    whole = {name: x for name, c in comparisons.items() if (x := longer(c)) is not None}
+    paths = _figures(run, search, objectives, comparisons, whole, meta)
     results = {
         "schema_version": 1,
         "preset": preset,
@@ -160,6 +162,7 @@ def run_pipeline(run: Run, config: PipelineConfig, preset: str, command: str) ->
         "objective": {"name": objective.name, "certificate": certificate.as_dict()},
         "meta_training": meta,
         "comparisons": {name: c.as_dict() for name, c in comparisons.items()},
+        "full_size": {name: c.as_dict() for name, c in whole.items()},
     }
     if not run.resumed:  # else it would be the time of the last stages alone
         results["seconds"] = round(watch.lap(), 1)
@@ -205,6 +208,7 @@ def _figures(
     config: MetaTrainingConfig,
     objectives: list[Objective],
     comparisons: Mapping[str, Comparison],
+    whole: Mapping[str, Comparison],
     meta: Mapping[str, Any],
 ) -> dict[str, Path]:
     drawn = {}
@@ -215,6 +219,8 @@ def _figures(
         )
     for name, comparison in comparisons.items():
         drawn[name] = figures.learning_curves(comparison.curves)
+    for name, comparison in whole.items():
+        drawn[f"{name}_full_size"] = figures.learning_curves(comparison.curves)
     drawn["drift_heatmaps"] = drift_figures.drift_heatmaps(objectives)
     paths = {}
     for name, figure in drawn.items():

@@ -79,9 +79,10 @@ def write_report(folder: Path, results: Mapping[str, Any], figures: Mapping[str,
           "steps": {"training", "evaluation", "total"} of all candidates, "environment_steps":
           the same for meta-training on the environment itself}; empty where nothing was learned.
         comparisons: {environment: `Comparison.as_dict()`}.
+        full_size: the same for what the library ships of longer trainings there (optional).
       figures: PNG files by the function that drew them ("meta_training" for the curve,
         "environment_steps", "drift_heatmaps"), and learning curves by their environment, as in
-        `comparisons`. Any may be missing.
+        `comparisons`, with "_full_size" behind it for those. Any may be missing.
 
     Returns:
       The path of the page.
@@ -264,6 +265,18 @@ def _comparison(name: str, comparison: Mapping[str, Any], learned: str) -> dict[
     }
 
 
+def _whole(comparison: Mapping[str, Any]) -> dict[str, Any]:
+    """What is said of trainings of full size."""
+    curves = comparison["curves"]
+    agents = ((curve["objective"], len(curve["seeds"])) for curve in curves)
+    return {
+        "steps": thousands(curves[0]["steps"][-1]),
+        "backend": curves[0]["backend"],
+        "agents": ", ".join(f"{name} {number}" for name, number in agents),
+        "few_seeds": min(len(curve["seeds"]) for curve in curves) < _FEW_SEEDS,
+    }
+
+
 def _moving(curve: Mapping[str, Any]) -> str:
     """How many of an objective's agents end above standing still, and how fast they all are."""
     agents = len(curve["seeds"])
@@ -285,6 +298,7 @@ def _context(results: Mapping[str, Any], figures: Mapping[str, Path]) -> dict[st
             _comparison(name, comparison, objective["name"])
             for name, comparison in results["comparisons"].items()
         ],
+        "full_size": {name: _whole(x) for name, x in results.get("full_size", {}).items()},
         "meta": _meta_training(meta) if meta else None,
         "certificate": Certificate(**objective["certificate"]),
         "certificate_rows": _certificate_rows(objective["certificate"]),

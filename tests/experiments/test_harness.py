@@ -231,7 +231,8 @@ PAGES = [x for x in everything.found().values() if rendering.has_template(x.name
 
 @pytest.mark.parametrize("experiment", PAGES, ids=[x.name for x in PAGES])
 def test_the_committed_page_is_that_of_the_committed_report(experiment):
-    report = harness.read(harness.DATA / f"{experiment.name}.json", keys=experiment.keys)
+    out = experiment.out or harness.DATA / f"{experiment.name}.json"
+    report = harness.read(out, keys=experiment.keys)
     if experiment.presets:
         plan = json.loads(json.dumps(experiment.presets[report["preset"]]))
         assert harness.complete(report) and report.get("plan", plan) == plan

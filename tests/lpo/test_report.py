@@ -193,6 +193,17 @@ def test_learning_curves_stand_with_their_environment(tmp_path, picture):
     assert page.source.index("<h3>hopper</h3>") < own < page.source.index("Meta-training</h2>")
 
 
+def test_trainings_of_full_size_stand_under_a_short_one(tmp_path, picture):
+    whole = comparison(seeds=2, environment="hopper", backend="generalized").as_dict()
+    page = write(tmp_path, results(full_size={"hopper": whole}), hopper_full_size=picture)
+    assert "below, of 10 000 steps under generalized physics" in page.text
+    assert "(agents: ppo 2, dpo 2, mine 2; too few to rank them)" in page.text
+    # Behind hopper's own table, not Pendulum's.
+    own = page.source.index('alt="Return on hopper over trainings of')
+    assert page.source.index("<h3>hopper</h3>") < own < page.source.index("Meta-training</h2>")
+    assert "What this can tell" not in write(tmp_path).text
+
+
 @pytest.mark.parametrize(
     ("low", "high", "verdict", "said"),
     [

@@ -1,0 +1,153 @@
+"""Does an objective carry over to locomotion? PPO's setting of the paper and its full number of steps, on Brax.
+
+    python -m experiments.locomotion --environments hopper --seeds 10
+
+Physics is `generalized`, on which agents hop: 5.24 million steps, minutes an agent. A few agents of every objective
+are trained at a time, and --out is saved after each few: the same command goes on where it was, and with more
+`--seeds` or `--objectives` adds to it.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from matplotlib.figure import Figure
+
+from experiments.claims import Claim, judge
+from experiments.harness import Experiment, Report, Save, packed
+from lpo import figures
+from lpo.comparison import LearningCurves, compare, ppo_spec
+from lpo.full_size import as_comparison
+from lpo.objectives import load_objective
+from scb.errors import at_least
+from scb.files import plain
+from scb.rows import Rows
+from scb.seeds import reporting
+from scb.statistics import Estimate, paired_difference
+
+BACKEND = "generalized"
+REFERENCE = "ppo"
+DECIDING = 10  # agents; of fewer a bootstrap's interval is too narrow to decide anything
+MARGIN = 0.05  # of what the reference earns: what is not worse by more is as good
+
+
+@dataclass(frozen=True)
+class Options:
+    """What is trained, and where."""
+
+    environments: tuple[str, ...] = ("hopper",)
+    """of Brax"""
+    objectives: tuple[str, ...] = (REFERENCE, "dpo", "lpo-pendulum", "lpo-multi")
+    """as `lpo evaluate` takes them; all are compared with PPO's clip"""
+    seeds: int = 10
+    """agents of each"""
+    together: int = 2
+    """agents that are trained side by side, and saved when all of them have ended"""
+    runs: Path = Path("runs/locomotion")
+    """for agents until they are saved"""
+
+    def __post_init__(self) -> None:
+        at_least(1, self, "seeds", "together")
+
+
+def measure(options: Options, report: dict[str, Any], save: Save) -> None:
+    """A few seeds of every objective at a time, so that all have as many wherever it ends."""
+    objectives = {name: load_objective(name) for name in options.objectives}
+    seeds = reporting(options.seeds)
+    for environment in options.environments:
+        spec = ppo_spec(environment)
+        entry = report.setdefault("environments", {}).setdefault(environment, {"backend": BACKEND})
+        for start in range(0, len(seeds), options.together):
+            for name, objective in objectives.items():
+                agents = entry.setdefault("agents", {}).setdefault(name, {})
+                missing = [
+                    s for s in seeds[start : start + options.together] if str(s) not in agents
+                ]
+                if not missing:
+                    continue
+                rows = Rows(options.runs / f"{environment}.rows.jsonl")
+                (found,) = compare(
+                    environment, [objective], missing, spec, BACKEND, rows=rows, tell=print
+                ).curves
+                entry |= {"steps": found.steps.tolist(), "episodes": found.episodes}
+                agents |= kept(found)
+                save()
+
+
+def kept(curves: LearningCurves) -> dict[str, dict[str, Any]]:
+    """{seed: what is kept of an agent}."""
+    assert curves.lengths is not None and curves.speeds is not None
+    columns = packed(curves.returns), curves.lengths[:, -1], curves.speeds[:, -1]
+    return {
+        str(seed): {"returns": line, "length": plain(length), "speed": plain(speed)}
+        for seed, line, length, speed in zip(curves.seeds, *columns, strict=True)
+    }
+
+
+def _paired(
+    curves: LearningCurves, reference: LearningCurves, of: str
+) -> Callable[..., Estimate] | Estimate | None:
+    """The difference in what agents of the same seeds earn, without an interval where they are too few."""
+    shared = [seed for seed in curves.seeds if seed in reference.seeds]
+    if not shared:
+        return None
+    ours, theirs = (
+        getattr(x, of)[[x.seeds.index(seed) for seed in shared]] for x in (curves, reference)
+    )
+    found = partial(paired_difference, ours, theirs)
+    return found if len(shared) >= DECIDING else replace(found(), low=None, high=None)
+
+
+def claims(report: Report) -> list[Claim]:
+    """Of every objective but the reference: no worse at the end, and better over the training."""
+    found = []
+    for environment, entry in report["environments"].items():
+        reference, *others = as_comparison(environment, entry).curves
+        margin = round(MARGIN * float(reference.final.mean()), 1)
+        reason = "a twentieth of what PPO's clip earns"
+        for curves in others:
+            final, area = (_paired(curves, reference, of) for of in ("final", "area"))
+            name = f"{environment}: {curves.objective}"
+            found += [
+                Claim(f"{name} ends no lower than PPO", final, 0.0, margin, reason, places=0),
+                Claim(f"{name} earns more over the training than PPO", area, places=0),
+            ]
+    return found
+
+
+def facts(report: Report) -> dict[str, Any]:
+    """The curves by environment, and the claims judged."""
+    return {
+        "comparisons": {
+            name: as_comparison(name, entry) for name, entry in report["environments"].items()
+        },
+        "judged": judge(claims(report)),
+        "deciding": DECIDING,
+    }
+
+
+def draw(report: Mapping[str, Any]) -> dict[str, Figure]:
+    """Learning curves, a figure an environment."""
+    return {
+        f"locomotion_{name}": figures.learning_curves(as_comparison(name, entry).curves)
+        for name, entry in report["environments"].items()
+    }
+
+
+EXPERIMENT = Experiment(
+    "locomotion",
+    "Do learned objectives carry over to locomotion?",
+    measure,
+    draw=draw,
+    claims=claims,
+    facts=facts,
+    options=Options,
+    keys=("environments",),
+    out=Path("lpo/measured/locomotion.json"),
+)
+
+
+if __name__ == "__main__":
+    raise SystemExit(EXPERIMENT.main())

@@ -1,0 +1,118 @@
+"""Locomotion is measured a few agents at a time, goes on where it was, and decides nothing by few agents."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from experiments import claims
+from experiments import locomotion as module
+from lpo import full_size
+from lpo.comparison import Comparison, LearningCurves
+from scb.seeds import REPORTING
+
+STEPS = [0, 50, 100]
+
+
+def curves(objective, seeds, end=100.0, steps=STEPS):
+    returns = np.array([[0.0, 50.0, end + seed % 10] for seed in seeds])
+    place = "hopper", "generalized", objective
+    ends = {"lengths": returns * 2, "speeds": returns / 100}
+    return LearningCurves(*place, np.array(steps), returns, list(seeds), 20, True, **ends)
+
+
+@pytest.fixture
+def compared(monkeypatch):
+    """Trainings that were asked for; each earns what its objective's name says, and they stop after `limit`."""
+    asked = []
+
+    def compare(environment, objectives, seeds, spec, backend, rows, tell):
+        if len(asked) == compared_limit[0]:
+            raise ConnectionError
+        (objective,) = objectives
+        asked.append((environment, objective.name, tuple(seeds)))
+        return Comparison(
+            [curves(objective.name, seeds, 500.0 if objective.name == "dpo" else 9.0)]
+        )
+
+    compared_limit = [100]
+    monkeypatch.setattr(module, "compare", compare)
+    return asked, compared_limit
+
+
+FLAGS = ["--objectives", "ppo", "dpo", "--seeds", "4"]
+
+
+def test_an_interrupted_measurement_goes_on_where_it_was(tmp_path, compared):
+    asked, limit = compared
+    out = tmp_path / "report.json"
+    limit[0] = 3
+    with pytest.raises(ConnectionError):
+        module.EXPERIMENT.main([*FLAGS, "--out", str(out)])
+    limit[0] = 100
+    assert module.EXPERIMENT.main([*FLAGS, "--out", str(out)]) == 0
+    first, second = (tuple(REPORTING[i : i + 2]) for i in (0, 2))
+    assert asked == [("hopper", x, seeds) for seeds in (first, second) for x in ("ppo", "dpo")]
+    agents = json.loads(out.read_text())["environments"]["hopper"]["agents"]
+    assert agents["dpo"][str(first[0])] == {"returns": "0 50 500", "length": 1000, "speed": 5}
+    page = (tmp_path / "locomotion.md").read_text()
+    assert "| dpo | 4 | 502 [500, 503] |" in page and "fewer than 10 agents decide nothing" in page
+
+
+def test_what_was_kept_is_read_as_it_was(tmp_path):
+    made = curves("ppo", range(3))
+    entry = {"backend": "generalized", "steps": STEPS, "episodes": 20}
+    (read,) = full_size.as_comparison(
+        "hopper", {**entry, "agents": {"ppo": module.kept(made)}}
+    ).curves
+    np.testing.assert_array_equal(read.returns, made.returns)
+    np.testing.assert_array_equal(read.speeds[:, -1], made.speeds[:, -1])
+    np.testing.assert_array_equal(read.lengths[:, -1], made.lengths[:, -1])
+    assert read.seeds == made.seeds and read.backend == made.backend
+
+
+def report(number):
+    agents = {
+        name: module.kept(curves(name, range(number), end))
+        for name, end in (("ppo", 100.0), ("dpo", 200.0), ("lpo-pendulum", 50.0))
+    }
+    return {
+        "environments": {
+            "hopper": {
+                "backend": "generalized",
+                "steps": STEPS,
+                "episodes": 20,
+                "agents": agents,
+            }
+        }
+    }
+
+
+def test_ten_agents_decide_and_fewer_do_not():
+    judged = claims.judge(module.claims(report(10)))
+    assert [x.outcome for x in judged] == [claims.HOLDS] * 2 + [claims.FAILS] * 2
+    assert "lpo-pendulum ends no lower than PPO" in judged[2].claim.text
+    assert {x.outcome for x in claims.judge(module.claims(report(9)))} == {claims.UNDECIDED}
+
+
+def test_only_agents_of_the_same_seeds_are_compared():
+    made = report(10)
+    agents = made["environments"]["hopper"]["agents"]
+    agents["dpo"] = module.kept(curves("dpo", range(100, 104)))
+    judged = claims.judge(module.claims(made))
+    assert [x.outcome for x in judged[:2]] == [claims.UNTESTED] * 2
+
+
+def test_the_shipped_curves_are_of_the_full_size_and_stand_beside_shorter_trainings():
+    whole = full_size.full_size("hopper")
+    # The paper's 5.24 million.
+    assert whole.curves[0].objective == "ppo" and whole.curves[0].steps[-1] == 5 * 2**20
+    short = Comparison([curves("ppo", range(2))])
+    assert full_size.longer(short) is not None
+    assert full_size.longer(Comparison([curves("ppo", range(2), steps=[0, 1, 2**30])])) is None
+    assert full_size.full_size("Pendulum-v1") is None
+
+
+def test_the_file_is_where_the_library_looks_for_it():
+    assert Path(full_size.PATH).samefile(module.EXPERIMENT.out)
