@@ -28,5 +28,5 @@ def test_the_best_construction_is_in_bold():
 def test_the_committed_table_is_that_of_the_committed_report():
     with open("docs/data/warm_start.json") as file:
         table = warm_start.markdown(json.load(file))
-    with open("docs/results.md") as file:
+    with open("docs/fits.md") as file:
         assert table in file.read()

@@ -1,0 +1,86 @@
+"""What the documentation says is what was measured, and its links lead somewhere."""
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+import yaml
+
+ROOT = Path(__file__).parents[1]
+DOCS = ROOT / "docs"
+PAGES = sorted([ROOT / "README.md", *DOCS.glob("*.md")])
+
+
+def anchors(page):
+    """What headings of a page are linked by."""
+    found = set()
+    for heading in re.findall(r"^#+ (.*)$", page.read_text(), re.M):
+        plain = re.sub(r"\[([^]]*)\]\([^)]*\)", r"\1", heading).lower().replace("`", "")
+        found.add(re.sub(r"[^\w\- ]", "", plain).strip().replace(" ", "-"))
+    return found
+
+
+@pytest.mark.parametrize("page", PAGES, ids=[page.stem for page in PAGES])
+def test_every_link_leads_somewhere(page):
+    text = re.sub(r"```.*?```", "", page.read_text(), flags=re.S)
+    for target in re.findall(r"\]\(([^)\s]+)\)", text):
+        if target.startswith(("http://", "https://")):
+            continue
+        name, _, anchor = target.partition("#")
+        file = page.parent / name if name else page
+        assert file.exists(), target
+        assert not anchor or anchor in anchors(file), target
+
+
+def test_every_page_of_the_documentation_is_in_its_navigation():
+    def files(nav):
+        if isinstance(nav, str):
+            return [nav]
+        return [file for x in (nav.values() if isinstance(nav, dict) else nav) for file in files(x)]
+
+    listed = files(yaml.safe_load((ROOT / "mkdocs.yml").read_text())["nav"])
+    assert sorted(listed) == sorted(page.name for page in DOCS.glob("*.md"))
+
+
+def read(name):
+    return json.loads((DOCS / "data" / f"{name}.json").read_text())
+
+
+def interval(estimate, sign=""):
+    value, low, high = (
+        f"{estimate[key]:{s}.0f}".replace("-", "\N{MINUS SIGN}")
+        for key, s in (("value", sign), ("low", ""), ("high", ""))
+    )
+    return f"{value} [{low}, {high}]"
+
+
+@pytest.mark.parametrize(
+    ("data", "page"),
+    [("pendulum", "pendulum"), ("pendulum_small_last_layer", "pendulum"), ("hopper", "suites")],
+)
+def test_a_table_of_objectives_says_what_was_measured(data, page):
+    report, text = read(data), (DOCS / f"{page}.md").read_text()
+    for curve in report["curves"]:
+        cells = [interval(curve["final_iqm"]), interval(curve["area_iqm"])]
+        if curve["objective"] != report["reference"]:
+            cells.append(interval(report["paired_differences"][curve["objective"]], "+"))
+        assert f"| {' | '.join(cells)} |" in text, curve["objective"]
+
+
+@pytest.mark.parametrize("suite", ["classic", "minatar", "brax"])
+def test_a_table_of_a_suite_says_what_was_measured(suite):
+    report, text = read(f"suite_{suite}"), (DOCS / "suites.md").read_text()
+    for aggregate in report["aggregate"]:
+        value = "{value:.2f} [{low:.2f}, {high:.2f}]".format(**aggregate)
+        assert f"| {value} |".replace("-", "\N{MINUS SIGN}") in text
+
+
+def test_what_readme_says_of_objectives_stands_in_the_results():
+    readme = (ROOT / "README.md").read_text()
+    pages = "".join((DOCS / f"{name}.md").read_text() for name in ("pendulum", "suites"))
+    rows = [line for line in readme.splitlines() if line.startswith(("| Pendulum,", "| classic"))]
+    numbers = re.findall(r"[−\d.]+ \[[^]]*\]", "".join(rows[:3]))
+    assert len(numbers) == 9
+    for number in numbers:
+        assert number in pages, number
