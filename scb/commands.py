@@ -253,10 +253,12 @@ def list_command() -> None:
 
 
 def found(metadata: Mapping[str, Any]) -> str:
-    """How a bandit was: fitted to an expert or from random weights, evolved or not."""
+    """How a bandit was: fitted to an expert, with or without aggregation, or from random weights; evolved or not."""
     discovery = metadata["config"]["discovery"]
     earlier = metadata["config"].get("started_from")
     start = "random weights" if discovery["init"] == "random" else "fitted"
+    if start == "fitted" and discovery["warm_start"].get("aggregation_rounds"):
+        start = "fitted with aggregation"
     evolved = earlier or metadata["cost"].get(
         "generation", discovery["evolution"]["num_generations"]
     )

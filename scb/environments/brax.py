@@ -23,6 +23,7 @@ import numpy as np
 from flax import struct
 from gymnax.environments import environment, spaces
 
+from scb.environments.returns import IDLE, table
 from scb.environments.spec import Family, Made, Reference
 from scb.errors import UserError, one_of
 from scb.keys import root_key, split_key
@@ -58,8 +59,8 @@ _EXPERTS: dict[str, dict[str, float]] = {
     "humanoidstandup": {"ppo": 17243.5, "sac": 23808.1, "ddpg": 24944.8, "td3": 28376.2},
 }
 # 1000 steps that each pay brax's healthy reward, whatever the physics. Zero actions come near it for hopper
-# and ant; a limp walker2d or humanoid falls.
-_STANDING = {"ant": 1000.0, "hopper": 1000.0, "humanoid": 5000.0, "walker2d": 1000.0}
+# and ant; a limp walker2d or humanoid falls. Where there is none, zero actions were measured.
+_HEALTHY = {"ant": 1000.0, "hopper": 1000.0, "humanoid": 5000.0, "walker2d": 1000.0}
 
 logger = logging.getLogger(__name__)
 
@@ -251,12 +252,14 @@ class BraxFamily(Family):
             algorithm: Reference(value, f"{algorithm.upper()}, Liesen et al. (2024)")
             for algorithm, value in _EXPERTS.get(name, {}).items()
         }
-        standing = _STANDING.get(name)
+        standing = {**table(IDLE).get(name, {})}
+        if name in _HEALTHY:
+            standing = dict.fromkeys(BACKENDS, _HEALTHY[name])
         return {
             "backends": BACKENDS,
             "default_backend": DEFAULT_BACKEND,
             "experts": {DEFAULT_BACKEND: experts},
-            "standing": {} if standing is None else dict.fromkeys(BACKENDS, standing),
+            "standing": standing,
         }
 
 

@@ -13,7 +13,7 @@ from typing import Any, TypeAlias
 
 from gymnax.environments import environment
 
-from scb.environments.returns import Returns, random_return, table
+from scb.environments.returns import RANDOM, Returns, random_return, table
 from scb.errors import UserError
 
 Made: TypeAlias = tuple[environment.Environment[Any, Any], Any]
@@ -190,6 +190,6 @@ class Family(ABC):
             "name": name,
             "family": self.name,
             "maker": partial(self.make, name),
-            "random_returns": table().get(name, {}),
+            "random_returns": table(RANDOM).get(name, {}),
         }
         return EnvironmentSpec(**fields | dict(self.facts(name)))

@@ -411,6 +411,10 @@ def test_listing_names_every_bandit_of_the_zoo():
     )
     config = {"discovery": {"init": "random", "evolution": {"num_generations": 9}}}
     assert found({"config": config, "cost": {}}) == "random weights, evolved"
+    warm_start = {"aggregation_rounds": 2}
+    evolution = {"num_generations": 3}
+    config = {"discovery": {"init": "expert", "warm_start": warm_start, "evolution": evolution}}
+    assert found({"config": config, "cost": {"generation": 0}}) == "fitted with aggregation"
 
 
 def test_a_reader_that_stops_early_is_no_error(monkeypatch):

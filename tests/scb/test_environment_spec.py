@@ -68,12 +68,25 @@ def test_the_table_of_random_returns_is_what_is_measured(name):
 
 def test_the_table_is_written_by_its_command(corridors, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(returns, "_TABLE", tmp_path / "returns.json")
-    returns._TABLE.write_text('{"hopper:spring": 128.5}')
+    returns._TABLE.write_text('{"random": {"hopper:spring": 128.5}, "idle": {}}')
     returns.main(["Corridor-v0"])
-    assert capsys.readouterr().out == "Corridor-v0: 3.0\n"
+    assert capsys.readouterr().out == "Corridor-v0: {'random': 3.0}\n"
     returns.table.cache_clear()
-    assert returns.table() == {"hopper": {"spring": 128.5}, "Corridor-v0": {None: 3.0}}
+    assert returns.table("random") == {"hopper": {"spring": 128.5}, "Corridor-v0": {None: 3.0}}
+    assert returns.table("idle") == {}
     returns.table.cache_clear()
+
+
+def test_doing_nothing_is_measured_where_nothing_is_paid_for_standing():
+    # Pendulum at rest below pays least, and hanging there with no torque no more than turning.
+    env, params = environment_spec("Pendulum-v1").make()
+    assert -2000 < returns.idle_return(env, params, 32) < -800
+    # brax pays 1 a step for a hopper that stands, whatever it does; a cheetah is paid for its way alone.
+    assert environment_spec("hopper").standing_still("positional") == 1000
+    for name in ("halfcheetah", "swimmer", "humanoidstandup"):
+        spec = environment_spec(name)
+        assert spec.standing_still() == returns.table("idle")[name]["generalized"]
+        assert spec.standing_still() < spec.reference().value
 
 
 def test_a_new_family_takes_a_class_and_a_line(corridors):
