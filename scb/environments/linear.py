@@ -12,6 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from flax import linen as nn
 
+SATURATED = 0.999  # of the end of an action's range: what lies further out is not told apart
+
 
 class PolicyDistance(nn.Module):
     """offset - scale * ||a - a*||^power for a* = tanh((s - center) kernel + bias), in halves of the actions' range.
@@ -56,9 +58,8 @@ def fitted(
     # Entries that the others determine make a covariance singular.
     root = np.linalg.cholesky(covariance + np.diag(1e-6 * spread**2))
     shares = (np.asarray(actions, np.float64) - (low + high) / 2) / ((high - low) / 2)
-    before_tanh = np.arctanh(np.clip(shares, -0.999, 0.999))
     inputs = np.column_stack([(states - center) / spread, np.ones(len(states))])
-    solution = np.linalg.lstsq(inputs, before_tanh, rcond=None)[0]
+    solution = _censored(inputs, np.arctanh(np.clip(shares, -SATURATED, SATURATED)))
     reward = {
         "center": center,
         "kernel": solution[:-1] / spread[:, None],
@@ -70,6 +71,24 @@ def fitted(
     contexts = {"Dense_0": {"kernel": root.T, "bias": center}}
     weights = {"initial_state": contexts, "reward": reward}
     return jax.tree.map(lambda x: np.asarray(x, np.float32), weights)
+
+
+def _censored(inputs: np.ndarray, targets: np.ndarray) -> np.ndarray:
+    """[I, A] least squares where a target at the end of the range says only that it is at least so far out.
+
+    A saturated action does not tell how far: taken at its word, a steep policy would be fitted by a flatter
+    one. What the last solution says beyond the end is taken there instead, until nothing moves.
+    """
+    end = np.arctanh(SATURATED)
+    beyond, wanted = np.abs(targets) >= end, targets
+    solution = np.linalg.lstsq(inputs, wanted, rcond=None)[0]
+    for _ in range(200):
+        further = np.sign(targets) * np.maximum(np.sign(targets) * (inputs @ solution), end)
+        wanted = np.where(beyond, further, targets)
+        previous, solution = solution, np.linalg.lstsq(inputs, wanted, rcond=None)[0]
+        if np.allclose(solution, previous, rtol=1e-4, atol=1e-6):
+            break
+    return solution
 
 
 def units(weights: Any) -> Any:

@@ -59,6 +59,20 @@ def test_a_fit_is_the_policy_and_its_states(bandit, states):
     np.testing.assert_allclose(best, -0.01, atol=0.01)
 
 
+def test_a_steep_policy_is_fitted_by_one_as_steep(states):
+    # Nearly half of the actions are at an end of their range, where 32 bits do not tell how far beyond.
+    inside = 12 * ((states - CENTER) @ KERNEL + BIAS)
+    actions = np.tanh(inside.astype(np.float32))
+    assert 0.3 < np.mean(np.abs(actions) > 0.999) < 0.8
+    ends = np.array([-1.0, -1.0]), np.array([1.0, 1.0])
+    reward = fitted(states, actions, *ends)["reward"]
+    np.testing.assert_allclose(reward["kernel"], 12 * KERNEL, rtol=0.02, atol=0.01)
+    # Of a policy that is a sign nothing is known but the sides.
+    sides = fitted(states, np.sign(inside), *ends)["reward"]
+    told = (states - sides["center"]) @ sides["kernel"] + sides["bias"]
+    assert np.isfinite(sides["kernel"]).all() and np.mean(np.sign(told) == np.sign(inside)) > 0.99
+
+
 def test_the_reward_is_the_distance_in_halves_of_the_range(bandit):
     best = policy(CENTER[None])[0]
     off = best + np.array([0.3, -0.8])
