@@ -49,6 +49,7 @@ REPORTERS = {
             "episode_lengths",
             "experts",
             "generality",
+            "locomotion",
             "lpo_on_bandits",
             "transfer_study",
             "zoo_table",
