@@ -44,7 +44,7 @@ from scb.environments.synthetic_mdp import PARAMETERIZATIONS, synthetic_for
 from scb.environments.zoo import bandit_metadata, load_bandit, open_bandit, save_bandit
 from scb.errors import UserError, at_least, one_of, positive
 from scb.evolution import EnvironmentSteps, EvolutionConfig, Outcome, evolve
-from scb.fitting import standardize_reward
+from scb.fitting import check_linear, standardize_reward
 from scb.judgement import check_fits
 from scb.keys import named_key, root_key, split_key
 from scb.lists import read_lists, write_lists
@@ -145,6 +145,9 @@ class DiscoveryConfig:
             )
         if self.parameterization != "I" and self.start is not None:
             raise UserError("a synthetic MDP cannot start from a bandit: leave the start out.")
+        fitted = self.init == "expert" and self.start is None
+        if fitted and self.bandit.form == "linear":
+            check_linear(self.warm_start.construction)
         if self.lists and self.fixed_hyperparameters:
             raise UserError(
                 "fixed hyperparameters are not drawn from lists: leave out the lists, or draw."

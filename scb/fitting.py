@@ -108,15 +108,20 @@ def fit_bandit(
     return jax.tree.map(np.asarray, {"initial_state": context, "reward": reward}), report
 
 
-def _fit_linear(
-    bandit: SyntheticBandit, dataset: ExpertDataset, construction: str
-) -> tuple[Weights, dict[str, float]]:
-    """The closed form, and how much of the expert's actions it explains."""
+def check_linear(construction: str) -> None:
+    """Raises a UserError where a linear bandit cannot be fitted to such a reward."""
     if construction != "action_distance":
         raise UserError(
             f"the construction is {construction}, and a linear bandit's reward is a distance of actions: take "
             "action_distance."
         )
+
+
+def _fit_linear(
+    bandit: SyntheticBandit, dataset: ExpertDataset, construction: str
+) -> tuple[Weights, dict[str, float]]:
+    """The closed form, and how much of the expert's actions it explains."""
+    check_linear(construction)
     states = np.asarray(dataset.observation)
     best = np.reshape(dataset.expert_action, (len(states), -1))
     low, high = bandit.bounds

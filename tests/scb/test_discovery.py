@@ -640,6 +640,15 @@ def test_the_inner_loop_is_the_papers_where_no_agent_is_given():
             {"lists": {"ppo": {"discount": (0.9,)}}, "fixed_hyperparameters": True},
             "fixed hyperparameters are not drawn from lists",
         ),
+        (
+            {
+                "environment": "Pendulum-v1",
+                "init": "expert",
+                "bandit": BanditConfig(form="linear"),
+                "warm_start": WarmStartConfig("q"),
+            },
+            "the construction is q, and a linear bandit's reward is a distance of actions",
+        ),
     ],
 )
 def test_impossible_discoveries_are_refused(arguments, message):
