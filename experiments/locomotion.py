@@ -15,7 +15,7 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from experiments.claims import Claim, judge
+from experiments.claims import Claim
 from experiments.harness import Experiment, Report, Save, packed
 from lpo import figures
 from lpo.comparison import LearningCurves, compare, ppo_spec
@@ -118,12 +118,11 @@ def claims(report: Report) -> list[Claim]:
 
 
 def facts(report: Report) -> dict[str, Any]:
-    """The curves by environment, and the claims judged."""
+    """The curves by environment."""
     return {
         "comparisons": {
             name: as_comparison(name, entry) for name, entry in report["environments"].items()
         },
-        "judged": judge(claims(report)),
         "deciding": DECIDING,
     }
 

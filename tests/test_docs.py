@@ -7,6 +7,8 @@ from pathlib import Path
 import pytest
 import yaml
 
+from experiments import rendering
+
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 PAGES = sorted([ROOT / "README.md", *DOCS.glob("*.md")])
@@ -47,14 +49,6 @@ def read(name):
     return json.loads((DOCS / "data" / f"{name}.json").read_text())
 
 
-def interval(estimate, sign=""):
-    value, low, high = (
-        f"{estimate[key]:{s}.0f}".replace("-", "\N{MINUS SIGN}")
-        for key, s in (("value", sign), ("low", ""), ("high", ""))
-    )
-    return f"{value} [{low}, {high}]"
-
-
 @pytest.mark.parametrize(
     ("data", "page"),
     [("pendulum", "pendulum"), ("pendulum_small_last_layer", "pendulum"), ("hopper", "suites")],
@@ -62,9 +56,10 @@ def interval(estimate, sign=""):
 def test_a_table_of_objectives_says_what_was_measured(data, page):
     report, text = read(data), (DOCS / f"{page}.md").read_text()
     for curve in report["curves"]:
-        cells = [interval(curve["final_iqm"]), interval(curve["area_iqm"])]
+        cells = [rendering.text(curve[x]) for x in ("final_iqm", "area_iqm")]
         if curve["objective"] != report["reference"]:
-            cells.append(interval(report["paired_differences"][curve["objective"]], "+"))
+            difference = report["paired_differences"][curve["objective"]]
+            cells.append(rendering.text(difference, sign=True))
         assert f"| {' | '.join(cells)} |" in text, curve["objective"]
 
 
@@ -72,8 +67,7 @@ def test_a_table_of_objectives_says_what_was_measured(data, page):
 def test_a_table_of_a_suite_says_what_was_measured(suite):
     report, text = read(f"suite_{suite}"), (DOCS / "suites.md").read_text()
     for aggregate in report["aggregate"]:
-        value = "{value:.2f} [{low:.2f}, {high:.2f}]".format(**aggregate)
-        assert f"| {value} |".replace("-", "\N{MINUS SIGN}") in text
+        assert f"| {rendering.text(aggregate, 2)} |" in text
 
 
 def test_what_readme_says_of_objectives_stands_in_the_results():
