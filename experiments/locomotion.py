@@ -69,7 +69,14 @@ def measure(options: Options, report: dict[str, Any], save: Save) -> None:
                     continue
                 rows = Rows(options.runs / f"{environment}.rows.jsonl")
                 (found,) = compare(
-                    environment, [objective], missing, spec, BACKEND, rows=rows, tell=print
+                    environment,
+                    [objective],
+                    missing,
+                    spec,
+                    BACKEND,
+                    diagnose=True,
+                    rows=rows,
+                    tell=print,
                 ).curves
                 entry |= {"steps": found.steps.tolist(), "episodes": found.episodes}
                 agents |= kept(found)
@@ -79,10 +86,16 @@ def measure(options: Options, report: dict[str, Any], save: Save) -> None:
 def kept(curves: LearningCurves) -> dict[str, dict[str, Any]]:
     """{seed: what is kept of an agent}."""
     assert curves.lengths is not None and curves.speeds is not None
-    columns = packed(curves.returns), curves.lengths[:, -1], curves.speeds[:, -1]
+    columns = {
+        "returns": packed(curves.returns),
+        "length": map(plain, curves.lengths[:, -1]),
+        "speed": map(plain, curves.speeds[:, -1]),
+        **{name: packed(values) for name, values in (curves.diagnosis or {}).items()},
+    }
+    agents = zip(*columns.values(), strict=True)
     return {
-        str(seed): {"returns": line, "length": plain(length), "speed": plain(speed)}
-        for seed, line, length, speed in zip(curves.seeds, *columns, strict=True)
+        str(seed): dict(zip(columns, agent, strict=True))
+        for seed, agent in zip(curves.seeds, agents, strict=True)
     }
 
 

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from lpo.objectives import Objective
+from scb.agents.ppo import DIAGNOSIS
 from scb.agents.spec import AgentSpec, environment_agent
 from scb.environments.registry import environment_spec
 from scb.errors import UserError
@@ -19,6 +20,8 @@ from scb.files import plain
 from scb.measurement import MODE, SAMPLED, Place, measure
 from scb.rows import Rows, pivot
 from scb.statistics import Estimate, estimate, paired_difference
+
+_ARRAYS = ("lengths", "speeds", "diagnosis")
 
 
 @dataclass(frozen=True)
@@ -34,6 +37,8 @@ class LearningCurves:
       policy_output_scale: factor on the policy's last layer at initialisation.
       lengths, speeds: [S, P] mean steps of those episodes, and their mean forward velocity, NaN where the
         environment has none; None of curves that were made elsewhere.
+      diagnosis: {name: [S, P]} of what an iteration does to the policy (`scb.agents.ppo.PPO.diagnose`); None where
+        it was not asked for.
     """
 
     environment: str
@@ -47,6 +52,7 @@ class LearningCurves:
     policy_output_scale: float = 1.0
     lengths: np.ndarray | None = None
     speeds: np.ndarray | None = None
+    diagnosis: dict[str, np.ndarray] | None = None
 
     @property
     def final(self) -> np.ndarray:
@@ -76,7 +82,7 @@ class LearningCurves:
             if values is not None
         }
         return {
-            **{k: v for k, v in vars(self).items() if k not in ("lengths", "speeds")},
+            **{k: v for k, v in vars(self).items() if k not in _ARRAYS},
             "steps": self.steps.tolist(),
             "returns": self.returns.tolist(),
             "final_iqm": estimate(self.final).as_dict(),
@@ -145,6 +151,7 @@ def compare(
     points: int = 15,
     episodes: int = 20,
     mode_actions: bool = True,
+    diagnose: bool = False,
     rows: Rows | None = None,
     tell: Callable[[str], None] = lambda line: None,
 ) -> Comparison:
@@ -159,7 +166,7 @@ def compare(
       points: about how many evaluations along the training, the untrained agent not counted.
       episodes: of each evaluation.
       mode_actions: evaluate the most likely actions rather than sampled ones.
-      rows, tell: as `scb.measurement.measure` takes them; rows that are there are not measured again.
+      diagnose, rows, tell: as `scb.measurement.measure` takes them; rows that are there are not measured again.
 
     Raises:
       UserError: two objectives bear one name, by which their results are told apart.
@@ -175,14 +182,13 @@ def compare(
         points=points,
         episodes=episodes,
         actions=(MODE if mode_actions else SAMPLED,),
+        diagnose=diagnose,
         rows=rows,
         tell=tell,
     )
     steps = np.asarray(list(dict.fromkeys(row["step"] for row in found)))
-    measured = (
-        pivot(found, "objective", "seed", "step", value=value)
-        for value in ("return", "length", "speed")
-    )
+    columns = ("return", "length", "speed", *(DIAGNOSIS if diagnose else ()))
+    measured = {value: pivot(found, "objective", "seed", "step", value=value) for value in columns}
     return Comparison(
         [
             LearningCurves(
@@ -190,15 +196,16 @@ def compare(
                 place.backend,
                 objective.name,
                 steps,
-                returns,
+                measured["return"][i],
                 list(seeds),
                 episodes,
                 mode_actions,
                 float(spec.hyperparameters.policy_output_scale),
-                lengths,
-                speeds,
+                measured["length"][i],
+                measured["speed"][i],
+                {name: measured[name][i] for name in DIAGNOSIS} if diagnose else None,
             )
-            for objective, returns, lengths, speeds in zip(objectives, *measured, strict=True)
+            for i, objective in enumerate(objectives)
         ]
     )
 

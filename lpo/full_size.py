@@ -4,7 +4,7 @@
 """
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from lpo.comparison import Comparison, LearningCurves
+from scb.agents.ppo import DIAGNOSIS
 
 PATH = Path(__file__).with_name("measured") / "locomotion.json"
 
@@ -42,8 +43,7 @@ def as_comparison(environment: str, found: Mapping[str, Any]) -> Comparison:
     """
     curves = []
     for objective, agents in found["agents"].items():
-        # Kept to four digits, in one line an agent.
-        returns = np.array([[float(x) for x in a["returns"].split()] for a in agents.values()])
+        returns = _lines("returns", agents, found["steps"])
         lengths, speeds = (
             # Of the end alone, and not known of every agent.
             np.array([[np.nan if a[of] is None else a[of]] for a in agents.values()])
@@ -61,6 +61,13 @@ def as_comparison(environment: str, found: Mapping[str, Any]) -> Comparison:
                 mode_actions=True,
                 lengths=lengths,
                 speeds=speeds,
+                diagnosis={name: _lines(name, agents, found["steps"]) for name in DIAGNOSIS},
             )
         )
     return Comparison(curves)
+
+
+def _lines(of: str, agents: Mapping[str, Any], steps: Sequence[int]) -> np.ndarray:
+    """[S, P] numbers that are kept in one line an agent; NaN where an agent has none."""
+    unknown = " ".join(["nan"] * len(steps))
+    return np.array([[float(x) for x in a.get(of, unknown).split()] for a in agents.values()])

@@ -29,6 +29,7 @@ from scb.keys import root_key, split_key
 from scb.rows import Row, Rows
 
 MODE, SAMPLED = "mode", "sampled"
+DIAGNOSIS = "diagnosis"  # a judge's name, beside the kinds of actions
 # Steps of a training from which a CPU trains only as many agents at a time as it has devices.
 LONG = 250_000
 
@@ -64,25 +65,25 @@ def train_and_judge(
     hyperparameters: Any,
     key: jax.Array,
     params: Any,
-    judges: Mapping[Any, Judge],
+    judges: Mapping[Any, Judge | Callable[..., Any]],
     every: int | None = None,
     iterations: jax.Array | None = None,
-) -> tuple[Any, dict[Any, Episodes]]:
+) -> tuple[Any, dict[Any, Any]]:
     """One agent's training, and what it earns. Traced: to be jitted and vmapped by the caller.
 
     Args:
       key: decides everything. All judges meet one key, so that they see the same start states.
       params: of the environment that the agent trains in.
-      judges: by name.
+      judges: by name, `Judge` or whatever else tells something of an agent.
       every: iterations between judgements along the training, the first of them before it; must divide
         the configuration's. None: judged at the end alone.
       iterations: a traced number of iterations instead of the configuration's; without `every`.
 
     Returns:
-      The trained agent's state, and {judge: episodes}, of shape [points, E] with `every`, else [E].
+      The trained agent's state, and {judge: what it finds}: `Episodes` of shape [points, E] with `every`, else [E].
     """
 
-    def judged(state: Any, key: jax.Array) -> dict[Any, Episodes]:
+    def judged(state: Any, key: jax.Array) -> dict[Any, Any]:
         return {name: judge(agent, state, key) for name, judge in judges.items()}
 
     if every is not None:
@@ -202,6 +203,7 @@ def measure(
     points: int | None = None,
     episodes: int = 20,
     actions: Sequence[str] = (MODE,),
+    diagnose: bool = False,
     rows: Rows | None = None,
     side_by_side: int | None = None,
     tell: Callable[[str], None] = lambda line: None,
@@ -217,6 +219,8 @@ def measure(
         the training may be rounded up (`spaced`). None: at the end alone.
       episodes: of each judgement.
       actions: "mode", the most likely ones, or "sampled", or both of the same agents.
+      diagnose: whether rows say also what an iteration does to the policy (`PPO.diagnose`); PPO only.
+        Rows that are there without it stay so.
       rows: where results are kept and found; None for memory.
       side_by_side: agents that train at a time, and are kept together. All of them where left out; on a
         CPU, with physics or `LONG` trainings, as many as devices, so that they are kept as they come.
@@ -292,9 +296,9 @@ def measure(
                 stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *drifts)
                 hyperparameters = replace(hyperparameters, drift=stacked)
             program, arrays = _program_of(
-                agent, params, judge_in.env, episodes, tuple(actions), every, size
+                agent, params, judge_in.env, episodes, tuple(actions), diagnose, every, size
             )
-            earned = program(hyperparameters, agents.keys[which], *arrays)
+            earned, diagnosis = program(hyperparameters, agents.keys[which], *arrays)
             for name, i in lacking:
                 position = batch.index((name, i))
                 drawn = {n: float(getattr(agents.hyperparameters, n)[i]) for n in agents.drawn}
@@ -307,6 +311,10 @@ def measure(
                             "return": plain(np.ravel(earned[kind][0][position])[point]),
                             "length": plain(np.ravel(earned[kind][1][position])[point]),
                             "speed": plain(np.ravel(earned[kind][2][position])[point]),
+                            **{
+                                name: plain(np.ravel(values[position])[point])
+                                for name, values in diagnosis.items()
+                            },
                             **drawn,
                         }
                         for point, step in enumerate(steps)
@@ -354,24 +362,32 @@ def _program(
     judge_env: environment.Environment[Any, Any],
     episodes: int,
     actions: tuple[str, ...],
+    diagnose: bool,
     every: int | None,
     size: int,
 ) -> Callable[..., Any]:
-    agent = kind(*made_of)
+    agent: Any = kind(*made_of)
 
-    def one(hyperparameters: Any, key: jax.Array, *arrays: Any) -> dict[str, Any]:
+    def one(hyperparameters: Any, key: jax.Array, *arrays: Any) -> tuple[dict[str, Any], Any]:
         given = iter(arrays)
         leaves = [next(given) if x is None else x for x in numbers]
         training_params, judge_params = jax.tree.unflatten(structure, leaves)
-        judges = {name: Judge(judge_env, judge_params, episodes, name == MODE) for name in actions}
-        _, earned = train_and_judge(agent, hyperparameters, key, training_params, judges, every)
+        judges: dict[str, Any] = {
+            name: Judge(judge_env, judge_params, episodes, name == MODE) for name in actions
+        }
+        if diagnose:
+            judges[DIAGNOSIS] = lambda agent, state, key: agent.diagnose(
+                state, hyperparameters, training_params
+            )
+        _, found = train_and_judge(agent, hyperparameters, key, training_params, judges, every)
+        diagnosis = found.pop(DIAGNOSIS, {})
         return {
             k: (
                 x.returns.mean(-1),
                 x.lengths.mean(-1),
                 jnp.full(x.returns.shape[:-1], jnp.nan) if x.speeds is None else x.speeds.mean(-1),
             )
-            for k, x in earned.items()
-        }
+            for k, x in found.items()
+        }, diagnosis
 
     return map_population(one, size, (0, 0, *(None for x in numbers if x is None)))

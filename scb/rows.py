@@ -77,6 +77,7 @@ class Rows:
                 )
         if self.path is not None and digest not in self._configurations:
             self._configurations[digest] = described
+            self._described.parent.mkdir(parents=True, exist_ok=True)
             write_json(self._described, self._configurations)
         done: dict[tuple[int, int], list[Row]] = {}
         for row in there:

@@ -32,6 +32,11 @@ DriftFunction: TypeAlias = Callable[[Any, jax.Array, jax.Array, jax.Array], jax.
 # exp(20) squared still fits into float32; beyond it a learned drift would meet infinities that
 # PPO's never does.
 MAX_LOG_RATIO = 20.0
+USUAL_CLIP = 0.2
+DIAGNOSED = (
+    4  # iterations: enough that single batches don't show, few beside a training's thousands
+)
+DIAGNOSIS = ("kl", "outside", "gain", "value_error", "entropy")
 
 
 def relu(x: Any, xp: Any = jnp) -> Any:
@@ -115,7 +120,7 @@ class PPOHyperparameters:
     entropy_coefficient: ArrayLike = 0.01
     value_coefficient: ArrayLike = 0.5
     max_grad_norm: ArrayLike = 10.0
-    drift: Any = 0.2
+    drift: Any = USUAL_CLIP
     horizon: ArrayLike | None = None
     policy_output_scale: ArrayLike = 1.0
 
@@ -252,6 +257,11 @@ class PPO(Agent):
     def iterate(
         self, state: PPOState, hyperparameters: PPOHyperparameters, env_params: Any
     ) -> PPOState:
+        return self._iterate(state, hyperparameters, env_params)[0]
+
+    def _iterate(
+        self, state: PPOState, hyperparameters: PPOHyperparameters, env_params: Any
+    ) -> tuple[PPOState, Batch]:
         key, key_collect, key_update = split_key(state.key, 3)
         state = replace(state, key=key)
         if self.one_step:
@@ -263,7 +273,40 @@ class PPO(Agent):
             # After the update: the old log-probabilities were taken under the old statistics.
             statistics = update_statistics(state.statistics, batch.observation)
             state = replace(state, statistics=statistics)
-        return replace(state, iteration=state.iteration + 1)
+        return replace(state, iteration=state.iteration + 1), batch
+
+    def diagnose(
+        self, state: PPOState, hyperparameters: PPOHyperparameters, env_params: Any
+    ) -> dict[str, jax.Array]:
+        """What an iteration does to the policy, as the mean of the next `DIAGNOSED`; the agent stays as it is.
+
+        Returns:
+          kl: mean KL(old || new) over the batch's observations, in nats.
+          outside: share of the batch's actions whose ratio has left [0.8, 1.2], PPO's usual interval.
+          gain: mean of ratio times normalised advantage over the batch, 0 for no change.
+          value_error: variance of target less value, as a share of the target's.
+          entropy: of the old policy, in nats.
+        """
+
+        def one(state: PPOState, _: None) -> tuple[PPOState, dict[str, jax.Array]]:
+            after, batch = self._iterate(state, hyperparameters, env_params)
+            old = self._policy(state, batch.observation, env_params)
+            # Under the statistics that the update was made with.
+            updated = replace(after, statistics=state.statistics)
+            new = self._policy(updated, batch.observation, env_params)
+            log_ratio = new.log_prob(batch.action) - batch.log_prob
+            ratio = jnp.exp(jnp.clip(log_ratio, -MAX_LOG_RATIO, MAX_LOG_RATIO))
+            advantage = batch.advantage - batch.advantage.mean()
+            return after, {
+                "kl": jnp.mean(old.kl_divergence(new)),
+                "outside": jnp.mean(jnp.abs(ratio - 1.0) > USUAL_CLIP),
+                "gain": jnp.mean(ratio * advantage) / (advantage.std() + 1e-8),
+                "value_error": batch.advantage.var() / (batch.target.var() + 1e-8),
+                "entropy": jnp.mean(old.entropy()),
+            }
+
+        _, found = jax.lax.scan(one, state, None, DIAGNOSED)
+        return {name: values.mean() for name, values in found.items()}
 
     def _collect_contexts(self, state: PPOState, key: jax.Array, env_params: Any) -> Batch:
         """One batch of independent one-step episodes: nothing to bootstrap, A = r - V(s)."""

@@ -1,6 +1,7 @@
 """Locomotion is measured a few agents at a time, goes on where it was, and decides nothing by few agents."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ from experiments import claims
 from experiments import locomotion as module
 from lpo import full_size
 from lpo.comparison import Comparison, LearningCurves
+from scb.agents.ppo import DIAGNOSIS
 from scb.seeds import REPORTING
 
 STEPS = [0, 50, 100]
@@ -18,8 +20,12 @@ STEPS = [0, 50, 100]
 def curves(objective, seeds, end=100.0, steps=STEPS):
     returns = np.array([[0.0, 50.0, end + seed % 10] for seed in seeds])
     place = "hopper", "generalized", objective
-    ends = {"lengths": returns * 2, "speeds": returns / 100}
-    return LearningCurves(*place, np.array(steps), returns, list(seeds), 20, True, **ends)
+    further = {
+        "lengths": returns * 2,
+        "speeds": returns / 100,
+        "diagnosis": {name: returns / (10 * i + 10) for i, name in enumerate(DIAGNOSIS)},
+    }
+    return LearningCurves(*place, np.array(steps), returns, list(seeds), 20, True, **further)
 
 
 @pytest.fixture
@@ -27,7 +33,7 @@ def compared(monkeypatch):
     """Trainings that were asked for; each earns what its objective's name says, and they stop after `limit`."""
     asked = []
 
-    def compare(environment, objectives, seeds, spec, backend, rows, tell):
+    def compare(environment, objectives, seeds, spec, backend, diagnose, rows, tell):
         if len(asked) == compared_limit[0]:
             raise ConnectionError
         (objective,) = objectives
@@ -55,7 +61,9 @@ def test_an_interrupted_measurement_goes_on_where_it_was(tmp_path, compared):
     first, second = (tuple(REPORTING[i : i + 2]) for i in (0, 2))
     assert asked == [("hopper", x, seeds) for seeds in (first, second) for x in ("ppo", "dpo")]
     agents = json.loads(out.read_text())["environments"]["hopper"]["agents"]
-    assert agents["dpo"][str(first[0])] == {"returns": "0 50 500", "length": 1000, "speed": 5}
+    agent = agents["dpo"][str(first[0])]
+    assert agent["returns"] == "0 50 500" and (agent["length"], agent["speed"]) == (1000, 5)
+    assert agent["kl"] == "0 5 50" and agent["outside"] == "0 2.5 25"
     page = (tmp_path / "locomotion.md").read_text()
     assert "| dpo | 4 | 502 [500, 503] |" in page and "fewer than 10 agents decide nothing" in page
 
@@ -70,6 +78,15 @@ def test_what_was_kept_is_read_as_it_was(tmp_path):
     np.testing.assert_array_equal(read.speeds[:, -1], made.speeds[:, -1])
     np.testing.assert_array_equal(read.lengths[:, -1], made.lengths[:, -1])
     assert read.seeds == made.seeds and read.backend == made.backend
+    for name in DIAGNOSIS:
+        np.testing.assert_allclose(read.diagnosis[name], made.diagnosis[name], rtol=1e-3)
+
+
+def test_agents_that_were_not_diagnosed_have_no_numbers_for_it():
+    kept = module.kept(replace(curves("ppo", range(3)), diagnosis=None))
+    entry = {"backend": "generalized", "steps": STEPS, "episodes": 20, "agents": {"ppo": kept}}
+    (read,) = full_size.as_comparison("hopper", entry).curves
+    assert all(np.isnan(read.diagnosis[name]).all() for name in DIAGNOSIS)
 
 
 def report(number):

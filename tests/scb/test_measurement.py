@@ -2,6 +2,7 @@
 
 import json
 import random
+from dataclasses import replace
 from typing import NamedTuple
 
 import jax
@@ -11,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from scb import measurement
-from scb.agents.ppo import PPOConfig, PPOHyperparameters, clipped_surrogate_drift
+from scb.agents.ppo import DIAGNOSIS, PPOConfig, PPOHyperparameters, clipped_surrogate_drift
 from scb.agents.spec import AgentSpec
 from scb.errors import UserError
 from scb.measurement import Agents, Judge, Place, measure, spaced, train_and_judge
@@ -214,6 +215,18 @@ def test_rows_without_their_configurations_are_refused(copy, content):
 
 
 # -- agents -----------------------------------------------------------------------------------------
+
+
+def test_a_diagnosed_training_is_the_same_and_its_rows_say_what_an_iteration_does(file, measured):
+    still = replace(SPEC, hyperparameters=replace(SPEC.hyperparameters, learning_rate=0.0))
+    for spec, quiet in (SPEC, False), (still, True):
+        rows = measured(None, spec=spec, diagnose=True)
+        for row in rows:
+            assert (row["kl"] < 1e-6) == (row["outside"] == 0) == (abs(row["gain"]) < 1e-5) == quiet
+            assert row["value_error"] > 0
+        if not quiet:
+            without = [{k: x for k, x in row.items() if k not in DIAGNOSIS} for row in rows]
+            assert without == file[1]
 
 
 def test_agents_of_one_seed_share_out_what_is_drawn_and_their_rows_say_it(bandit):
