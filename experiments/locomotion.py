@@ -137,15 +137,23 @@ def facts(report: Report) -> dict[str, Any]:
             name: as_comparison(name, entry) for name, entry in report["environments"].items()
         },
         "deciding": DECIDING,
+        "diagnosed": [name for name in report["environments"] if _diagnosed(report, name)],
     }
 
 
 def draw(report: Mapping[str, Any]) -> dict[str, Figure]:
-    """Learning curves, a figure an environment."""
-    return {
-        f"locomotion_{name}": figures.learning_curves(as_comparison(name, entry).curves)
-        for name, entry in report["environments"].items()
-    }
+    """Learning curves of each environment, and what an iteration does to the policy where that is known."""
+    drawn = {}
+    for name, entry in report["environments"].items():
+        drawn[f"locomotion_{name}"] = figures.learning_curves(as_comparison(name, entry).curves)
+        if curves := _diagnosed(report, name):
+            drawn[f"locomotion_{name}_updates"] = figures.diagnosis(curves)
+    return drawn
+
+
+def _diagnosed(report: Mapping[str, Any], environment: str) -> list[LearningCurves]:
+    curves = as_comparison(environment, report["environments"][environment]).curves
+    return [curve for curve in curves if curve.diagnosed]
 
 
 EXPERIMENT = Experiment(

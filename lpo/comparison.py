@@ -65,6 +65,13 @@ class LearningCurves:
         return self.returns[:, 1:].mean(axis=1)
 
     @property
+    def diagnosed(self) -> int:
+        """How many agents say what an iteration does to them."""
+        if self.diagnosis is None:
+            return 0
+        return int((~np.isnan(self.diagnosis["kl"]).any(axis=1)).sum())
+
+    @property
     def standing_still(self) -> float | None:
         """What an episode without a fall and without moving earns here; None where that means nothing."""
         return environment_spec(self.environment).standing_still(self.backend)

@@ -47,6 +47,13 @@ _LOOKS: dict[str, Look] = {
     "dpo": Look(GREEN, "-.", "^"),
     "none": Look(GREY, ":", "X"),
 }
+# Of `PPO.diagnose`, in the order of the panels.
+_DIAGNOSES = {
+    "kl": "KL from the old policy to the new (nats)",
+    "outside": "share of ratios outside [0.8, 1.2]",
+    "value_error": "value error, as a share of the targets' variance",
+    "entropy": "entropy of the policy (nats)",
+}
 # The learned objective, the reason for the figure, has the one solid line.
 _LEARNED = Look(VERMILLION, "-", "o")
 _FURTHER = (
@@ -266,6 +273,47 @@ def learning_curves(curves: "Sequence[LearningCurves]") -> Figure:
     return figure
 
 
+def diagnosis(curves: "Sequence[LearningCurves]") -> Figure:
+    """What an iteration does to the policy along the training: mean over agents, with 95 % intervals.
+
+    Args:
+      curves: of one environment, one an objective; agents that were not diagnosed are left out.
+
+    Raises:
+      UserError: an objective has no diagnosed agent.
+    """
+    style = looks([curve.objective for curve in curves])
+    with figure_style():
+        figure = Figure(figsize=(WIDTH, 6.0))
+        panels = figure.subplots(2, 2, sharex=True)
+        for axes, (name, label) in zip(panels.flat, _DIAGNOSES.items(), strict=True):
+            for curve in curves:
+                if not curve.diagnosed:
+                    raise UserError(
+                        f"no agent of {curve.objective} was diagnosed: measure with `diagnose`."
+                    )
+                values = curve.diagnosis[name] if curve.diagnosis else np.empty((0, 0))
+                known = values[~np.isnan(values).any(axis=1)]
+                look = style[curve.objective]
+                points = [estimate(column, np.mean) for column in known.T]
+                drawn = (look.color, look.linestyle, curve.objective, look.marker)
+                estimate_curve(axes, curve.steps, points, *drawn)
+            axes.set_title(label, fontsize=10, weight="normal")
+            axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+            axes.margins(x=0.02)
+        panels[0, 0].set_yscale("log")
+        for axes in panels[1]:
+            axes.set_xlabel("environment steps")
+        counts = sorted({curve.diagnosed for curve in curves})
+        number = " and ".join(map(str, counts))
+        figure_title(
+            figure,
+            f"What an iteration does to the policy: {_place(curves[0])}, n = {number} agents",
+        )
+        legend_below(figure, panels[0, 0].get_legend_handles_labels(), columns=4)
+    return figure
+
+
 def suite_scores(scores: "SuiteScores") -> Figure:
     """Aggregate scores with intervals, and performance profiles, of objectives over a suite.
 
@@ -371,12 +419,16 @@ def _final(axes: Axes, position: int, curve: "LearningCurves", look: Look) -> No
     axes.plot(position, end.value, color=look.color, marker=look.marker, markersize=6, linestyle="")
 
 
-def _protocol(curve: "LearningCurves") -> str:
+def _place(curve: "LearningCurves") -> str:
     physics = "" if curve.backend is None else f" ({curve.backend} physics)"
+    return f"{curve.environment}{physics}"
+
+
+def _protocol(curve: "LearningCurves") -> str:
     actions = "mode" if curve.mode_actions else "sampled"
     scale = curve.policy_output_scale
     start = "" if scale == 1.0 else f", policy's last layer x {scale:g}"
-    return f"{curve.environment}{physics}{start}: {actions} actions, {curve.episodes} episodes"
+    return f"{_place(curve)}{start}: {actions} actions, {curve.episodes} episodes"
 
 
 def _count(steps: float) -> str:

@@ -18,6 +18,7 @@ from lpo.inner_loop import MetaTrainingConfig
 from lpo.objectives import Objective, load_objective
 from lpo.update_regions import surface
 from scb import plotting
+from scb.agents.ppo import DIAGNOSIS
 from scb.errors import UserError
 from scb.statistics import estimate, iqm
 
@@ -112,6 +113,19 @@ def test_the_figure_says_under_which_protocol_it_was_measured():
     title = figures.learning_curves([made]).get_suptitle()
     for said in ("hopper", "spring physics", "sampled actions", "20 episodes", "n = 4 seeds"):
         assert said in title
+
+
+def test_only_diagnosed_agents_are_drawn_and_an_objective_without_any_is_refused():
+    values = np.array([[0.1, 0.2, 0.4], [0.3, 0.4, 0.8], [np.nan] * 3])
+    returns = np.zeros((3, 3))
+    made = curve(returns=returns, diagnosis=dict.fromkeys(DIAGNOSIS, values))
+    kl, outside, value_error, entropy = figures.diagnosis([made]).axes
+    for axes in (kl, outside, value_error, entropy):
+        np.testing.assert_allclose(line(axes, "ppo").get_ydata(), [0.2, 0.3, 0.6])
+        assert len(bands(axes)) == 1
+    assert kl.get_yscale() == "log" and made.diagnosed == 2
+    with pytest.raises(UserError, match="no agent of dpo was diagnosed"):
+        figures.diagnosis([made, curve("dpo", returns)])
 
 
 @pytest.mark.parametrize(
