@@ -4,6 +4,9 @@ Importing the package registers the bandits that ship with it:
 
     import gymnax, scb
     env, params = gymnax.make("Synthetic-Pendulum-v1")
+
+    import gymnasium, scb
+    env = gymnasium.make("scb/Synthetic-Pendulum-v1")
 """
 
 from scb import start as start  # before what imports gymnax
@@ -18,8 +21,10 @@ from scb.environments.synthetic import BanditConfig, BanditParams, SyntheticBand
 from scb.environments.synthetic_mdp import MDPConfig, SyntheticMDP
 from scb.environments.zoo import load_bandit, register_zoo, save_bandit
 from scb.errors import UserError
+from scb.gymnasium import register as register_with_gymnasium
 
 register_zoo()
+register_with_gymnasium()
 
 __all__ = [
     "DQN",

@@ -5,7 +5,7 @@ distance to the action of a linear policy, and a context is a linear function of
 in so few dimensions where it hardly moves in a thousand, and the bandit can be read off its weights.
 """
 
-from typing import Any
+from typing import Any, NamedTuple, Self
 
 import jax
 import jax.numpy as jnp
@@ -27,19 +27,54 @@ class PolicyDistance(nn.Module):
     @nn.compact
     def __call__(self, inputs: jax.Array) -> jax.Array:
         """[O + A] observation and action -> [1]."""
-        low, high = np.asarray(self.low), np.asarray(self.high)
-        observation, action = jnp.split(inputs, [inputs.shape[-1] - low.size])
+        observation, action = jnp.split(inputs, [inputs.shape[-1] - len(self.low)])
         zeros = nn.initializers.zeros
-        center = self.param("center", zeros, observation.shape)
-        kernel = self.param(
-            "kernel", nn.initializers.lecun_normal(), (observation.size, action.size)
+        start = nn.initializers.lecun_normal()
+        weights = {
+            "center": self.param("center", zeros, observation.shape),
+            "kernel": self.param("kernel", start, (observation.size, action.size)),
+            "bias": self.param("bias", zeros, action.shape),
+            **{x: self.param(x, zeros, ()) for x in ("log_scale", "log_power", "offset")},
+        }
+        distance = PolicyDistanceParts.of(weights, np.asarray(self.low), np.asarray(self.high))
+        return jnp.reshape(distance(observation, action), (1,))
+
+
+class PolicyDistanceParts(NamedTuple):
+    """What `PolicyDistance` computes with, as arrays of `xp`, `jax.numpy` or `numpy`."""
+
+    center: Any  # [O]
+    kernel: Any  # [O, A]
+    bias: Any  # [A]
+    offset: Any
+    scale: Any
+    half_power: Any
+    middle: np.ndarray  # [A] of the actions' range
+    half_width: np.ndarray  # [A]
+    xp: Any
+
+    @classmethod
+    def of(cls, weights: Any, low: np.ndarray, high: np.ndarray, xp: Any = jnp) -> Self:
+        """Of the weights, and of the [A] actions' bounds."""
+        return cls(
+            center=weights["center"],
+            kernel=weights["kernel"],
+            bias=weights["bias"],
+            offset=weights["offset"],
+            scale=xp.exp(weights["log_scale"]),
+            half_power=xp.exp(weights["log_power"]) / 2,
+            middle=(low + high) / 2,
+            half_width=(high - low) / 2,
+            xp=xp,
         )
-        best = jnp.tanh((observation - center) @ kernel + self.param("bias", zeros, action.shape))
-        difference = (action - (low + high) / 2) / ((high - low) / 2) - best
-        scale, power = (jnp.exp(self.param(x, zeros, ())) for x in ("log_scale", "log_power"))
+
+    def __call__(self, observation: Any, action: Any) -> Any:
+        """[..., O] observations and [..., A] actions -> [...]."""
+        best = self.xp.tanh((observation - self.center).dot(self.kernel) + self.bias)
+        difference = (action - self.middle) / self.half_width - best
         # A power below 2 has no gradient at zero distance.
-        distance = (jnp.sum(difference**2) + 1e-4) ** (power / 2)
-        return jnp.reshape(self.param("offset", zeros, ()) - scale * distance, (1,))
+        distance = ((difference**2).sum(-1) + 1e-4) ** self.half_power
+        return self.offset - self.scale * distance
 
 
 def fitted(

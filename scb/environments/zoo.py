@@ -196,5 +196,11 @@ def space_description(space: spaces.Box | spaces.Discrete) -> dict[str, Any]:
 def _space(description: Mapping[str, Any]) -> spaces.Box | spaces.Discrete:
     if description["type"] == "discrete":
         return spaces.Discrete(description["n"])
-    low, high = (jnp.asarray(description[x], jnp.float32) for x in ("low", "high"))
+    low, high = (_bound(np.asarray(description[x], np.float32)) for x in ("low", "high"))
     return spaces.Box(low, high, tuple(description["shape"]), jnp.float32)
+
+
+def _bound(values: np.ndarray) -> float | jax.Array:
+    """One number where all are alike, as gymnax's own environments have it and its wrappers need it."""
+    alike = values.size > 0 and (values == values.flat[0]).all()
+    return float(values.flat[0]) if alike else jnp.asarray(values)

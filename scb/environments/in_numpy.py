@@ -1,0 +1,114 @@
+"""A synthetic environment's functions in NumPy, for loops outside JAX, where a JAX call a step would cost the most."""
+
+from collections.abc import Callable, Mapping
+from typing import Any, TypeAlias
+
+import jax
+import numpy as np
+from gymnax.environments import spaces
+
+from scb.environments.linear import PolicyDistanceParts
+from scb.environments.synthetic import SyntheticBandit
+from scb.environments.synthetic_mdp import SyntheticMDP
+from scb.keys import root_key, split_key
+
+Array: TypeAlias = np.ndarray
+Generator: TypeAlias = np.random.Generator
+
+_ACTIVATIONS: dict[str, Callable[[Array], Array]] = {
+    "tanh": np.tanh,
+    "relu": lambda x: np.maximum(x, 0.0),
+    "swish": lambda x: x / (1.0 + np.exp(-x)),
+}
+
+
+def _one_hot_latents(logits: Array, rng: Generator, number: int) -> Array:
+    shares = np.exp(logits - logits.max())
+    chosen = rng.choice(logits.size, number, p=shares / shares.sum())
+    return np.eye(logits.size, dtype=np.float32)[chosen]
+
+
+_LATENTS: dict[str, Callable[[Generator, int, int], Array]] = {
+    "normal": lambda rng, number, size: rng.standard_normal((number, size), np.float32),
+    "uniform": lambda rng, number, size: rng.random((number, size), np.float32),
+    "categorical": lambda rng, number, size: _one_hot_latents(np.zeros(size), rng, number),
+    "softmax_categorical": lambda rng, number, size: _one_hot_latents(
+        np.arange(1.0, size + 1.0), rng, number
+    ),
+}
+
+
+def _network(weights: Mapping[str, Any], activation: str) -> Callable[[Array], Array]:
+    """[B, I] -> [B, O] of an `MLP` with these weights."""
+    *hidden, last = (weights[f"Dense_{i}"] for i in range(len(weights)))
+
+    def network(inputs: Array) -> Array:
+        for layer in hidden:
+            # `dot` takes half as long as @ where matrices are this small.
+            inputs = _ACTIVATIONS[activation](inputs.dot(layer["kernel"]) + layer["bias"])
+        return np.asarray(inputs.dot(last["kernel"]) + last["bias"])
+
+    return network
+
+
+class InNumpy:
+    """What a bandit or a synthetic MDP does, [B] at a time; but for rounding the same numbers as in JAX.
+
+    Args:
+      synthetic: with weights of its own.
+
+    Attributes:
+      one_step: whether every step ends its episode.
+      max_steps: of an episode.
+    """
+
+    def __init__(self, synthetic: SyntheticBandit | SyntheticMDP) -> None:
+        params: Any = synthetic.default_params
+        self.one_step, self.max_steps = synthetic.one_step, int(params.max_steps_in_episode)
+        self._encode = _encoding(synthetic.action_space())
+        self._draw, self._latent_size = _LATENTS[synthetic.config.latent], synthetic.latent_size
+        weights = jax.tree.map(np.asarray, params.weights)
+        self._networks = {
+            name: _network(of_it, synthetic.config.activation)
+            for name, of_it in weights.items()
+            if "Dense_0" in of_it
+        }
+        self._distance = None
+        if isinstance(synthetic, SyntheticBandit) and synthetic.linear:
+            self._distance = PolicyDistanceParts.of(weights["reward"], *synthetic.bounds, np)
+        self._starts = None
+        if isinstance(synthetic, SyntheticMDP) and synthetic.env is not None:
+            reset = jax.vmap(synthetic.reset, (0, None))
+            self._starts = jax.jit(lambda keys: reset(keys, params)[0])
+
+    def start(self, rng: Generator, number: int) -> Array:
+        """[number, O] first observations of episodes."""
+        if self._starts is None:
+            return self._networks["initial_state"](self._draw(rng, number, self._latent_size))
+        # Of the environment that it stands for, which is JAX's.
+        return np.array(self._starts(split_key(root_key(int(rng.integers(2**32))), number)))
+
+    def step(self, observation: Array, action: Array) -> tuple[Array, Array, Array]:
+        """[B, O] observations and [B, ...] actions -> [B, O] next ones, [B] rewards, [B] whether episodes terminate."""
+        encoded = self._encode(action)
+        inputs = np.concatenate([observation, encoded], axis=1)
+        if self._distance is None:
+            reward = self._networks["reward"](inputs)[:, 0]
+        else:
+            reward = self._distance(observation, encoded)
+        if self.one_step:
+            return observation, reward, np.ones(len(reward), bool)
+        terminated = self._networks["termination"](inputs)[:, 0] > 0.0
+        return self._networks["transition"](inputs), reward, terminated
+
+
+def _encoding(space: spaces.Box | spaces.Discrete) -> Callable[[Array], Array]:
+    """[B, ...] actions -> [B, A] as networks take them, see `scb.environments.synthetic.encode_action`."""
+    if isinstance(space, spaces.Discrete):
+        choices = np.eye(space.n, dtype=np.float32)
+        return lambda action: choices[action]
+    low, high = (
+        np.broadcast_to(np.asarray(x, np.float32), space.shape) for x in (space.low, space.high)
+    )
+    # minimum and maximum are quicker than clip, of which there is one a step.
+    return lambda action: np.minimum(np.maximum(action, low), high).reshape(len(action), -1)

@@ -1,0 +1,170 @@
+"""Bandits and synthetic MDPs as Gymnasium's environments, in NumPy: no step calls JAX.
+
+import gymnasium, scb
+env = gymnasium.make("scb/Synthetic-Pendulum-v1")  # or "scb:scb/Synthetic-Pendulum-v1", which imports scb
+envs = gymnasium.make_vec("scb/Synthetic-Pendulum-v1", num_envs=1024)
+env = gymnasium.make("scb/Synthetic", file="path/to/bandit.npz")
+"""
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+
+from scb.environments.in_numpy import InNumpy
+from scb.environments.zoo import open_synthetic, space_description, zoo_names
+from scb.errors import UserError, at_least, one_of
+
+NAMESPACE = "scb"
+_BLOCK = 256  # first observations that are drawn together, which costs hardly more than one
+
+
+def register() -> None:
+    """Registers every bandit of the zoo with Gymnasium, and `scb/Synthetic` for files."""
+    names = {f"{NAMESPACE}/{name}": {"file": name} for name in zoo_names()}
+    for identifier, arguments in {**names, f"{NAMESPACE}/Synthetic": {}}.items():
+        if identifier not in gymnasium.registry:
+            gymnasium.register(
+                identifier,
+                entry_point=f"{__name__}:SyntheticEnv",
+                vector_entry_point=f"{__name__}:SyntheticVectorEnv",
+                kwargs=arguments,
+            )
+
+
+def _opened(file: str) -> tuple[InNumpy, spaces.Box, spaces.Space[Any]]:
+    """(its functions, observation space, action space) of a bandit of the zoo or a file."""
+    synthetic = open_synthetic(str(file))
+    observations = spaces.Box(-np.inf, np.inf, (synthetic.observation_size,), np.float32)
+    described = space_description(synthetic.action_space())
+    actions: spaces.Space[Any]
+    if described["type"] == "discrete":
+        actions = spaces.Discrete(described["n"])
+    else:
+        low, high = (np.array(described[x], np.float32) for x in ("low", "high"))
+        actions = spaces.Box(low, high, tuple(described["shape"]), np.float32)
+    return InNumpy(synthetic), observations, actions
+
+
+class SyntheticEnv(gymnasium.Env[np.ndarray, Any]):
+    """One bandit or synthetic MDP.
+
+    A bandit's episode is one step: it terminates, and its last observation is its first. Continuous actions are
+    clipped to their bounds.
+
+    Args:
+      file: NAME.npz, or the name of a bandit of the zoo.
+
+    Raises:
+      UserError: the file cannot be read, or is none of them.
+    """
+
+    def __init__(self, file: str) -> None:
+        self._functions, self.observation_space, self.action_space = _opened(file)
+        self._observation: np.ndarray | None = None
+        self._starts = np.empty((0, 0), np.float32)
+        self._drawn_by: np.random.Generator | None = None
+        self._next = self._time = 0
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        super().reset(seed=seed)
+        rng = self.np_random
+        # Another generator came with a seed, and what the last one drew is not of it.
+        if self._drawn_by is not rng or self._next == len(self._starts):
+            self._starts, self._drawn_by, self._next = (
+                self._functions.start(rng, _BLOCK),
+                rng,
+                0,
+            )
+        self._observation = self._starts[self._next : self._next + 1]
+        self._next, self._time = self._next + 1, 0
+        return self._observation[0].copy(), {}
+
+    def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        if self._observation is None:
+            raise UserError("the episode has not begun, or is over: call reset first.")
+        after, reward, terminations = self._functions.step(
+            self._observation, np.asarray(action)[None]
+        )
+        self._time += 1
+        terminated = bool(terminations[0])
+        truncated = not terminated and self._time >= self._functions.max_steps
+        self._observation = None if terminated or truncated else after
+        return after[0].copy(), float(reward[0]), terminated, truncated, {}
+
+
+class SyntheticVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
+    """Many of one bandit or synthetic MDP, stepped together.
+
+    Args:
+      file: NAME.npz, or the name of a bandit of the zoo.
+      num_envs: how many.
+      autoreset_mode: SameStep, NextStep or Disabled, see `gymnasium.vector.AutoresetMode`. With NextStep,
+        Gymnasium's usual one, every other step of a bandit is a reset, which pays nothing.
+
+    Raises:
+      UserError: the file cannot be read, or is none of them; an unknown mode.
+    """
+
+    def __init__(
+        self,
+        file: str,
+        num_envs: int = 1,
+        autoreset_mode: str | AutoresetMode = AutoresetMode.SAME_STEP,
+    ) -> None:
+        at_least(1, num_envs=num_envs)
+        mode = autoreset_mode.value if isinstance(autoreset_mode, AutoresetMode) else autoreset_mode
+        one_of("autoreset mode", mode, [x.value for x in AutoresetMode])
+        self._mode, self.num_envs = AutoresetMode(mode), num_envs
+        self.metadata = {"autoreset_mode": self._mode}
+        self._functions, self.single_observation_space, self.single_action_space = _opened(file)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self._observations = np.zeros(self.observation_space.shape or (), np.float32)
+        self._times = np.zeros(num_envs, int)
+        self._over = np.ones(num_envs, bool)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """Begins new episodes; of `options`, "reset_mask" [num_envs] says where, all being left out."""
+        super().reset(seed=seed)
+        mask = (options or {}).get("reset_mask")
+        self._begin(np.ones(self.num_envs, bool) if mask is None else np.asarray(mask, bool))
+        return self._observations.copy(), {}
+
+    def step(
+        self, actions: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        waiting = self._over.copy()
+        if waiting.any() and self._mode is not AutoresetMode.NEXT_STEP:
+            raise UserError(
+                f"{waiting.sum()} of {self.num_envs} episodes have not begun, or are over: call reset first."
+            )
+        after, rewards, terminated = self._functions.step(self._observations, np.asarray(actions))
+        self._times += 1
+        truncated = ~terminated & (self._times >= self._functions.max_steps)
+        rewards = rewards.astype(np.float64)
+        if waiting.any():  # the step that only begins an episode
+            rewards[waiting], terminated[waiting], truncated[waiting] = 0.0, False, False
+        self._observations, self._over = np.array(after), terminated | truncated
+        infos: dict[str, Any] = {}
+        if self._mode is AutoresetMode.SAME_STEP and self._over.any():
+            final = np.full(self.num_envs, None, object)
+            for i in np.flatnonzero(self._over):
+                final[i] = after[i]
+            infos = {"final_obs": final, "_final_obs": self._over.copy()}
+            infos |= {"final_info": {}, "_final_info": self._over.copy()}
+            self._begin(self._over)
+        elif waiting.any():
+            self._begin(waiting)
+        return self._observations.copy(), rewards, terminated, truncated, infos
+
+    def _begin(self, where: np.ndarray) -> None:
+        self._observations[where] = self._functions.start(self.np_random, int(where.sum()))
+        self._times[where], self._over = 0, self._over & ~where
