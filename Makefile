@@ -10,7 +10,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 PYTEST := $(BIN)/python -m pytest -q -n auto --dist loadfile
 
 .DEFAULT_GOAL := help
-.PHONY: help run test test-all lint format bench experiments clean
+.PHONY: help run test test-all lint format bench sb3 experiments clean
 
 help: ## list the commands
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-11s %s\n", $$1, $$2 }' Makefile
@@ -37,6 +37,9 @@ format: $(INSTALLED) ## put every file into the project's format
 bench: $(INSTALLED) .venv-rejax/.installed ## train agents in the bandits beside rejax's: time and return
 	@$(BIN)/python -m experiments.benchmark --rejax-python .venv-rejax/bin/python
 
+sb3: $(INSTALLED) .venv-sb3/.installed ## train Stable-Baselines3's agents in the bandits and in Gymnasium: docs/sb3.md
+	@$(BIN)/python -m experiments.sb3 --python .venv-sb3/bin/python
+
 experiments: $(INSTALLED) ## the paper's experiments: measure what is missing (quick presets), write docs/experiments.md
 	@$(BIN)/python -m experiments --preset quick
 
@@ -45,6 +48,13 @@ experiments: $(INSTALLED) ## the paper's experiments: measure what is missing (q
 	@echo "Installing rejax into .venv-rejax ..."
 	@$(PYTHON) -m venv --clear .venv-rejax
 	@.venv-rejax/bin/python -m pip --disable-pip-version-check --quiet install rejax==0.1.3 gymnax==0.0.9
+	@touch $@
+
+# PyTorch is large, and nothing else here needs it.
+.venv-sb3/.installed: $(INSTALLED)
+	@echo "Installing Stable-Baselines3 and PyTorch into .venv-sb3 ..."
+	@$(PYTHON) -m venv --clear .venv-sb3
+	@.venv-sb3/bin/python -m pip --disable-pip-version-check --quiet install -c constraints.txt -e . stable-baselines3==2.9.2 torch==2.15.0
 	@touch $@
 
 clean: ## remove caches and build outputs; .venv and runs stay

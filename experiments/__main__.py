@@ -46,8 +46,7 @@ def found() -> dict[str, Experiment]:
     """{name: experiment} of all modules that have one."""
     folder = Path(__file__).parent
     names = [m.name for m in pkgutil.iter_modules([str(folder)])]
-    # The one is this module, the other runs under another Python.
-    others = [x for x in names if x not in ("__main__", "rejax_peer")]
+    others = [x for x in names if x != "__main__"]
     modules = (importlib.import_module(f"experiments.{name}") for name in others)
     return {m.EXPERIMENT.name: m.EXPERIMENT for m in modules if hasattr(m, "EXPERIMENT")}
 

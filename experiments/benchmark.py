@@ -47,7 +47,7 @@ from scb.statistics import Estimate, estimate
 EPISODES = 20
 STEPS = 10_000
 THIS, PEER = "this project", "rejax 0.1.3"
-PEER_SCRIPT = Path(__file__).with_name("rejax_peer.py")
+PEER_SCRIPT = Path(__file__).with_name("peers") / "rejax_peer.py"
 
 
 @dataclass(frozen=True)

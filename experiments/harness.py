@@ -151,10 +151,14 @@ class Experiment:
         Returns:
           The exit status: 2 where the user asked for what cannot be, with one sentence on stderr.
         """
+        return exit_status(self.name, lambda: self._command(argv))
+
+    def _command(self, argv: Sequence[str] | None) -> int:
         parts: list[tuple[str, Any] | tuple[str, Any, Any]] = [
             ("options", self.options),
             ("files", Files, field(default=Files())),
         ]
+        # Options that cannot be are refused as they are made.
         arguments: Any = tyro.cli(
             make_dataclass("Flags", parts),
             config=(tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff),
@@ -162,7 +166,7 @@ class Experiment:
             prog=f"python -m experiments.{self.name}",
             description=self.description(),
         )
-        return exit_status(self.name, lambda: self.run(arguments.options, arguments.files))
+        return self.run(arguments.options, arguments.files)
 
     def description(self) -> str:
         """What --help says: of the paper's claim, or the module's docstring."""

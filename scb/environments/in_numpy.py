@@ -75,7 +75,13 @@ class InNumpy:
         }
         self._distance = None
         if isinstance(synthetic, SyntheticBandit) and synthetic.linear:
-            self._distance = PolicyDistanceParts.of(weights["reward"], *synthetic.bounds, np)
+            parts = PolicyDistanceParts.of(weights["reward"], *synthetic.bounds, np)
+            # Arrays of no axis are slow.
+            self._distance = parts._replace(
+                offset=float(parts.offset),
+                scale=float(parts.scale),
+                half_power=float(parts.half_power),
+            )
         self._starts = None
         if isinstance(synthetic, SyntheticMDP) and synthetic.env is not None:
             reset = jax.vmap(synthetic.reset, (0, None))
@@ -91,11 +97,10 @@ class InNumpy:
     def step(self, observation: Array, action: Array) -> tuple[Array, Array, Array]:
         """[B, O] observations and [B, ...] actions -> [B, O] next ones, [B] rewards, [B] whether episodes terminate."""
         encoded = self._encode(action)
+        if self._distance is not None:
+            return observation, self._distance(observation, encoded), np.ones(len(encoded), bool)
         inputs = np.concatenate([observation, encoded], axis=1)
-        if self._distance is None:
-            reward = self._networks["reward"](inputs)[:, 0]
-        else:
-            reward = self._distance(observation, encoded)
+        reward = self._networks["reward"](inputs)[:, 0]
         if self.one_step:
             return observation, reward, np.ones(len(reward), bool)
         terminated = self._networks["termination"](inputs)[:, 0] > 0.0

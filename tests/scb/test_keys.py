@@ -26,7 +26,7 @@ from tests.scb.test_discovery import TINY, TINY_DQN
 from tests.scb.test_imports import MODULES, ROOT
 
 # rejax's side of the benchmark runs where this project is not installed.
-ELSEWHERE = {"scb/keys.py", "experiments/rejax_peer.py"}
+ELSEWHERE = {"scb/keys.py", "experiments/peers/rejax_peer.py"}
 
 
 def data(key):

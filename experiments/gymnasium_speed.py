@@ -1,0 +1,135 @@
+"""How fast bandits step for Gymnasium: this library's own environments beside gymnax's wrappers of the same bandits.
+
+    python -m experiments.gymnasium_speed
+
+One environment alone, an episode (a reset and a step) at a time, and many together. Both ways are timed in turn
+in one process, several times over; compare the ratios, for the seconds are the machine's.
+"""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import gymnax
+import numpy as np
+from gymnax.wrappers.gym import GymnaxToGymWrapper, GymnaxToVectorGymWrapper
+
+from experiments.harness import Experiment, Report, Save
+from scb.errors import at_least
+from scb.gymnasium import NAMESPACE
+
+OWN, PEER = "scb", "gymnax's wrapper"
+
+
+@dataclass(frozen=True)
+class Options:
+    """What is timed."""
+
+    bandits: tuple[str, ...] = (
+        "Synthetic-Pendulum-v1",
+        "Synthetic-CartPole-v1",
+        "Synthetic-hopper",
+    )
+    """of the zoo"""
+    num_envs: int = 1024
+    """of the many"""
+    repeats: int = 5
+    """of each; the median counts"""
+    seconds: float = 1.0
+    """that a repeat takes, about"""
+
+    def __post_init__(self) -> None:
+        at_least(1, self, "num_envs", "repeats")
+
+
+def steps_a_second(step: Callable[[], Any], steps: int, seconds: float) -> float:
+    """Environment steps a second of a call that takes so many."""
+    step()  # compiles, where there is something to compile
+    calls, start = 0, time.perf_counter()
+    while time.perf_counter() - start < seconds:
+        step()
+        calls += 1
+    return calls * steps / (time.perf_counter() - start)
+
+
+def stepping(name: str, num_envs: int | None) -> dict[str, Callable[[], Any]]:
+    """{who: an episode in one environment, or in all of many}."""
+    env, params = gymnax.make(name)
+    calls: dict[str, Callable[[], Any]] = {}
+    made: Any
+    for who in (OWN, PEER):
+        if num_envs is None:
+            made = (
+                gymnasium.make(f"{NAMESPACE}/{name}")
+                if who == OWN
+                else GymnaxToGymWrapper(env, params)
+            )
+        elif who == OWN:
+            made = gymnasium.make_vec(f"{NAMESPACE}/{name}", num_envs=num_envs)
+        else:
+            made = GymnaxToVectorGymWrapper(env, num_envs, params)
+        made.reset(seed=0)
+        calls[who] = _episode(made, made.action_space.sample(), alone=num_envs is None)
+    return calls
+
+
+def _episode(env: Any, action: Any, alone: bool) -> Callable[[], Any]:
+    def alone_() -> None:
+        env.reset()
+        env.step(action)
+
+    # As a caller needs them, not as a promise of them.
+    return alone_ if alone else lambda: np.asarray(env.step(action)[1])
+
+
+def measure(options: Options, report: dict[str, Any], save: Save) -> None:
+    """In turn, so that what else the machine does meets both."""
+    found: dict[str, Any] = {}
+    for name in options.bandits:
+        found[name] = {}
+        for kind, num_envs in (("one", None), ("many", options.num_envs)):
+            calls = stepping(name, num_envs)
+            rates: dict[str, list[float]] = {who: [] for who in calls}
+            for _ in range(options.repeats):
+                for who, call in calls.items():
+                    rates[who].append(steps_a_second(call, num_envs or 1, options.seconds))
+            found[name][kind] = {
+                **{who: round(float(np.median(x))) for who, x in rates.items()},
+                "ratios": [round(a / b, 2) for a, b in zip(rates[OWN], rates[PEER], strict=True)],
+            }
+            print(name, kind, found[name][kind], flush=True)
+    report |= {"bandits": found, "num_envs": options.num_envs}
+    save()
+
+
+def facts(report: Report) -> dict[str, Any]:
+    """The medians of the ratios, and the smallest of all."""
+    cells = [cell for kinds in report["bandits"].values() for cell in kinds.values()]
+    return {
+        "own": OWN,
+        "peer": PEER,
+        "ratio": lambda cell: float(np.median(cell["ratios"])),
+        "least": {
+            kind: min(min(kinds[kind]["ratios"]) for kinds in report["bandits"].values())
+            for kind in ("one", "many")
+        },
+        "slowest": min(cell[OWN] for cell in cells),
+    }
+
+
+EXPERIMENT = Experiment(
+    "gymnasium_speed",
+    "How fast do bandits step for Gymnasium?",
+    measure,
+    facts=facts,
+    options=Options,
+    keys=("bandits",),
+    out=Path("docs/data/gymnasium_speed.json"),
+)
+
+
+if __name__ == "__main__":
+    raise SystemExit(EXPERIMENT.main())

@@ -1,0 +1,220 @@
+"""Stable-Baselines3 as it comes, trained in bandits, and for as many steps in the environments themselves.
+
+    make sb3
+
+Its algorithms with their default hyperparameters train in a bandit of the zoo or in Gymnasium's environment, and
+are judged in the environment after several numbers of steps. It has an environment of its own (`make sb3` makes
+it), in which every agent is a process. What --out holds already is not trained again.
+"""
+
+import json
+import subprocess
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter
+
+from experiments.claims import Claim
+from experiments.harness import Experiment, Report, Save, packed, unpacked
+from scb import plotting
+from scb.environments.registry import environment_spec
+from scb.errors import UserError, at_least, one_of
+from scb.gymnasium import NAMESPACE
+from scb.seeds import REPORTING, reporting
+from scb.statistics import Estimate, estimate, paired_difference
+
+PEER_SCRIPT = Path(__file__).with_name("peers") / "sb3_peer.py"
+BANDIT, ENVIRONMENT = PLACES = ("bandit", "environment")
+# SAC, TD3 and DDPG update after every step, and take minutes where PPO takes seconds.
+LONG, SHORT = (10_000, 20_000, 50_000, 100_000, 150_000), (10_000,)
+STEPS = {"ppo": LONG, "dqn": LONG, "sac": SHORT, "td3": SHORT, "ddpg": SHORT}
+CONTINUOUS, DISCRETE = ("ppo", "sac", "td3", "ddpg"), ("ppo", "dqn")
+ALGORITHMS = {
+    "Pendulum-v1": CONTINUOUS,
+    "MountainCarContinuous-v0": CONTINUOUS,
+    "CartPole-v1": DISCRETE,
+    "Acrobot-v1": DISCRETE,
+    "MountainCar-v0": DISCRETE,
+}
+EPISODES = 20
+COLORS = {
+    "ppo": plotting.BLUE,
+    "dqn": plotting.BLACK,
+    "sac": plotting.VERMILLION,
+    "td3": plotting.GREEN,
+    "ddpg": plotting.ORANGE,
+}
+LINES = {BANDIT: "-", ENVIRONMENT: ":"}
+
+
+@dataclass(frozen=True)
+class Options:
+    """Who is trained, and where."""
+
+    python: Path = Path(".venv-sb3/bin/python")
+    """of an environment with stable-baselines3 and this library"""
+    environments: tuple[str, ...] = tuple(ALGORITHMS)
+    """of Gymnasium, for which the zoo has bandits"""
+    algorithms: tuple[str, ...] = tuple(STEPS)
+    """those of them that an environment's actions allow"""
+    seeds: int = 10
+    """agents of each"""
+    together: int = 2
+    """that are trained side by side"""
+
+    def __post_init__(self) -> None:
+        at_least(1, self, "seeds", "together")
+        for name in self.environments:
+            one_of("environment", name, ALGORITHMS)
+        for name in self.algorithms:
+            one_of("algorithm", name, STEPS)
+
+
+def measure(options: Options, report: dict[str, Any], save: Save) -> None:
+    """A seed of everything at a time, so that all have as many wherever it ends."""
+    if not options.python.exists():
+        raise UserError(f"{options.python} is not there: run `make sb3`, or give another --python.")
+    agents = report.setdefault("agents", {})
+    report |= {"steps": STEPS, "episodes": EPISODES}
+
+    def trained(job: Mapping[str, Any]) -> dict[str, Any]:
+        command = [str(options.python), str(PEER_SCRIPT), json.dumps(job)]
+        done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=False)
+        if done.returncode:
+            raise UserError(f"an agent could not be trained: {' '.join(command)} says why.")
+        return dict(json.loads(done.stdout.strip().splitlines()[-1]))
+
+    missing = []
+    for seed in reporting(options.seeds):
+        for name, algorithm, place in cells(options):
+            cell = agents.setdefault(name, {}).setdefault(algorithm, {}).setdefault(place, {})
+            if str(seed) not in cell:
+                job = {
+                    "algorithm": algorithm,
+                    "train_in": trained_in(name, place),
+                    "judge_in": name,
+                    "steps": STEPS[algorithm],
+                    "episodes": EPISODES,
+                    "seed": seed,
+                }
+                missing.append((cell, job))
+    with ThreadPoolExecutor(options.together) as pool:
+        results = pool.map(trained, [job for _, job in missing])
+        for (cell, job), found in zip(missing, results, strict=True):
+            cell[str(job["seed"])] = {x: packed([found[x]])[0] for x in ("returns", "seconds")}
+            report["peer_versions"] = found["versions"]
+            print(job["train_in"], job["algorithm"], job["seed"], found["returns"], flush=True)
+            save()
+
+
+def cells(options: Options) -> Iterator[tuple[str, str, str]]:
+    """(environment, algorithm, place) of all that is asked for."""
+    for name in options.environments:
+        for algorithm in ALGORITHMS[name]:
+            if algorithm in options.algorithms:
+                yield from ((name, algorithm, place) for place in PLACES)
+
+
+def trained_in(environment: str, place: str) -> str:
+    """Gymnasium's name of where agents train."""
+    if place == ENVIRONMENT:
+        return environment
+    return f"{NAMESPACE}/{environment_spec(environment).bandit}"
+
+
+def returns_of(agents: Mapping[str, Any], seeds: Sequence[str]) -> np.ndarray:
+    """[S, P] what agents of these seeds earn after each number of steps."""
+    return unpacked([agents[seed]["returns"] for seed in seeds])
+
+
+def claims(report: Report) -> list[Claim]:
+    """Of every algorithm: after the fewest steps, more in the bandit than in the environment itself."""
+    found = []
+    for name, algorithms in report["agents"].items():
+        for algorithm, places in algorithms.items():
+            both = [places[place] for place in PLACES]
+            evidence = None
+            if shared := sorted(set.intersection(*map(set, both))):
+                here, there = (returns_of(cell, shared)[:, 0] for cell in both)
+                evidence = partial(paired_difference, here, there)
+            found.append(Claim(f"{name}, {algorithm.upper()}", evidence, places=0))
+    return found
+
+
+def facts(report: Report) -> dict[str, Any]:
+    """Estimates of every cell, and seconds of training per thousand steps."""
+    tables: dict[str, dict[str, dict[str, list[Estimate]]]] = {}
+    counts = set()
+    for name, algorithms in report["agents"].items():
+        for algorithm, places in algorithms.items():
+            for place, agents in places.items():
+                if not agents:
+                    continue
+                counts.add(len(agents))
+                returns = returns_of(agents, sorted(agents))
+                row = [estimate(column) for column in returns.T]
+                tables.setdefault(name, {}).setdefault(algorithm, {})[place] = row
+    return {
+        "tables": tables,
+        "every": sorted({n for x in report["steps"].values() for n in x}),
+        "counts": sorted(counts),
+        "expert": {name: environment_spec(name).reference() for name in tables},
+        "random": {name: environment_spec(name).random_return() for name in tables},
+        "seed": REPORTING.start,
+    }
+
+
+def draw(report: Mapping[str, Any]) -> Figure:
+    """A panel an environment: return after each number of steps, trained here and there."""
+    shown = facts(report)
+    tables = shown["tables"]
+    rows = -(-len(tables) // 2)
+    figure = Figure(figsize=(plotting.WIDTH, 2.9 * rows))
+    panels = figure.subplots(rows, 2, squeeze=False).ravel()
+    for axes, (name, algorithms) in zip(panels, tables.items(), strict=False):
+        for algorithm, places in algorithms.items():
+            for place, found in places.items():
+                steps, color = report["steps"][algorithm], COLORS[algorithm]
+                plotting.estimate_curve(axes, steps, found, color, LINES[place], marker="o")
+        for label, level in (
+            ("expert", shown["expert"][name].value),
+            ("random", shown["random"][name]),
+        ):
+            axes.axhline(level, color=plotting.GREY, linewidth=0.8, linestyle="--")
+            axes.annotate(label, (1.0, level), xycoords=("axes fraction", "data"), fontsize=7)
+        axes.set(title=name, xlabel="training steps", ylabel="return", xscale="log")
+        axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+    for axes in panels[len(tables) :]:
+        axes.set_visible(False)
+    used = {algorithm for algorithms in tables.values() for algorithm in algorithms}
+    looks: dict[str, Mapping[str, Any]] = {
+        algorithm.upper(): {"color": color, "marker": "o"}
+        for algorithm, color in COLORS.items()
+        if algorithm in used
+    }
+    for place, line in LINES.items():
+        looks[f"trained in the {place}"] = {"color": plotting.GREY, "linestyle": line}
+    plotting.legend_of(figure, looks, columns=4)
+    return figure
+
+
+EXPERIMENT = Experiment(
+    "sb3",
+    "What do Stable-Baselines3's agents earn after training in a bandit?",
+    measure,
+    draw=draw,
+    claims=claims,
+    facts=facts,
+    options=Options,
+    keys=("agents", "steps"),
+)
+
+
+if __name__ == "__main__":
+    raise SystemExit(EXPERIMENT.main())
