@@ -39,7 +39,7 @@ class Options:
 
     environments: tuple[str, ...] = ("hopper",)
     """of Brax"""
-    objectives: tuple[str, ...] = (REFERENCE, "dpo", "lpo-pendulum", "lpo-multi")
+    objectives: tuple[str, ...] = (REFERENCE, "dpo", "lpo-pendulum", "lpo-multi", "lpo-pendulum-ee")
     """as `lpo evaluate` takes them; all are compared with PPO's clip"""
     seeds: int = 10
     """agents of each"""
@@ -99,10 +99,10 @@ def kept(curves: LearningCurves) -> dict[str, dict[str, Any]]:
     }
 
 
-def _paired(
+def paired(
     curves: LearningCurves, reference: LearningCurves, of: str
 ) -> Callable[..., Estimate] | Estimate | None:
-    """The difference in what agents of the same seeds earn, without an interval where they are too few."""
+    """How much more agents of the same seeds earn ("final", "area"), without an interval where they are too few."""
     shared = [seed for seed in curves.seeds if seed in reference.seeds]
     if not shared:
         return None
@@ -121,7 +121,7 @@ def claims(report: Report) -> list[Claim]:
         margin = round(MARGIN * float(reference.final.mean()), 1)
         reason = "a twentieth of what PPO's clip earns"
         for curves in others:
-            final, area = (_paired(curves, reference, of) for of in ("final", "area"))
+            final, area = (paired(curves, reference, of) for of in ("final", "area"))
             name = f"{environment}: {curves.objective}"
             found += [
                 Claim(f"{name} ends no lower than PPO", final, 0.0, margin, reason, places=0),

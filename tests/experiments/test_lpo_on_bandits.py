@@ -77,7 +77,6 @@ def report():
                 "tuned": "ppo-0.5",
                 "sweep": {"ppo": -900.0, "ppo-0.5": -400.0},
             },
-            "Hopper, spring physics": table,
         },
     }
 
@@ -92,6 +91,7 @@ def test_the_page_says_costs_returns_and_differences(report):
     assert "The tuned clip is ppo-0.5: on other agents ppo −900, ppo-0.5 −400." in page
     (figure,) = module.EXPERIMENT.figures(report).values()
     assert len(figure.axes) == 3 + 2
+    assert "| LPO (bandit), `lpo-pendulum` | " in page
 
 
 def test_one_search_decides_nothing_and_searches_of_other_sizes_are_not_compared(report):
@@ -128,7 +128,7 @@ def tiny(monkeypatch):
             load_objective("dpo"), metadata={"cost": {"environment_steps_validation": 7}}
         )
 
-    def compare(environment, objectives, seeds, spec, rows, backend=None, points=15):
+    def compare(environment, objectives, seeds, spec, rows, points=15):
         kept.append(rows.path)
         scale = spec.hyperparameters.policy_output_scale
         asked.append((environment, scale, *(o.name for o in objectives)))
@@ -136,7 +136,7 @@ def tiny(monkeypatch):
             [
                 LearningCurves(
                     environment,
-                    backend,
+                    None,
                     o.name,
                     np.array([0, 100]),
                     np.array([[-9.0, worth.get(o.name, -14.0) - i] for i in range(len(seeds))]),
@@ -154,7 +154,6 @@ def tiny(monkeypatch):
         "searches": {source: {"seeds": 1, "settings": {"of": source}} for source in module.SOURCES},
         "agents": 2,
         "tuning_agents": 2,
-        "hopper": {"backend": "spring", "steps": 100, "agents": 2, "searches": 1},
     }
     return plan, asked, kept
 
@@ -166,12 +165,12 @@ def test_what_a_report_has_is_not_measured_again(tiny, tmp_path):
     both = ("LPO (bandit) 0", "LPO (environment) 0")
     compared = ("ppo", "ppo-0.5", "dpo", *both)
     judged = [("Pendulum-v1", scale, *x) for scale in (1.0, 0.01) for x in (module.CLIPS, compared)]
-    assert asked == ["bandit-0", "environment-0", *judged, ("hopper", 1.0, *compared)]
+    assert asked == ["bandit-0", "environment-0", *judged]
     table = report["evaluations"]["Pendulum, small last layer"]
     assert table["finals"]["ppo-0.5"] == [[-3.0, -4.0]]
     assert table["finals"]["LPO (bandit)"] == [[-14.0, -15.0]]
     # Every table keeps its agents in a file of its own: two of them train under one name with other settings.
-    assert len(set(kept)) == len(kept) == 5 and {path.parent for path in kept} == {
+    assert len(set(kept)) == len(kept) == 4 and {path.parent for path in kept} == {
         tmp_path / "runs" / "tiny"
     }
 
@@ -204,4 +203,3 @@ def test_the_settings_of_every_preset_are_those_of_the_command():
             config = meta_training(search["settings"]).config
             assert config.validation
             assert config.evolution.num_generations == search["settings"]["generations"]
-    assert module.EXPERIMENT.presets["paper"]["hopper"]["steps"] == 5_242_880
