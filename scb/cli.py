@@ -6,11 +6,14 @@ costs more than a quick run.
 """
 
 import contextlib
+import errno
 import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
+
+_NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
 
 
 def configure_jax() -> None:
@@ -45,9 +48,13 @@ def run_program(
       arguments: those of the process where None.
     """
     configure_jax()
+    from scb import termination
     from scb.command_line import call
     from scb.errors import UserError
 
+    # A caller's process is the caller's.
+    if arguments is None:
+        termination.watch(program)
     try:
         call(program, description, commands(), sys.argv[1:] if arguments is None else arguments)
         sys.stdout.flush()
@@ -58,6 +65,15 @@ def run_program(
     except UserError as error:
         print(f"{program}: {error}", file=sys.stderr)
         return 2
+    except OSError as error:
+        if error.errno not in _NO_ROOM:
+            raise
+        print(
+            f"{program}: cannot write {error.filename or 'what was done'} ({error.strerror}): make room; a run with "
+            "checkpoints continues with --resume.",
+            file=sys.stderr,
+        )
+        return 1
     except KeyboardInterrupt:
         print(
             f"{program}: interrupted; a run with checkpoints continues with --resume.",

@@ -8,6 +8,7 @@ distribution's mean, checkpoints, resume, and logs.
 
 import sys
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import dataclass
 from typing import Annotated, Any, Protocol, runtime_checkable
 
@@ -19,6 +20,7 @@ from jax.sharding import NamedSharding, PartitionSpec
 from rich.console import Console
 from scipy.stats import rankdata
 
+from scb import termination
 from scb.artefacts import machine_description
 from scb.console import Progress
 from scb.errors import UserError, at_least, one_of, positive
@@ -279,7 +281,7 @@ def evolve(
     }
     console = Console(file=sys.stderr, quiet=quiet)
     checkpoints = Checkpoints(run.folder) if run else None
-    first = 0
+    first = saved = 0
     if run and checkpoints and run.resumed:
         first, state, damaged = checkpoints.restore(state)
         if not first:
@@ -289,6 +291,20 @@ def evolve(
                 f"checkpoint {step} is damaged: resuming from checkpoint {first} before it."
             )
         run.rewind(first)
+        saved = first
+    # What is complete at any moment: steps into the next generation are not part of it.
+    latest = first, dict(state)
+
+    def save() -> str:
+        """Writes a checkpoint after the latest generation, unless it is there."""
+        nonlocal saved
+        assert run is not None and checkpoints is not None
+        with termination.writing:
+            generation, kept = latest
+            if generation > saved:
+                checkpoints.save(generation, kept)
+                saved = generation
+        return f"{run.folder} is saved after {generation} generations, and continues with --resume."
 
     evaluate = map_population(problem.evaluate, config.population_size, (0, None, None))
     evaluate_mean = map_population(problem.evaluate_mean, config.mean_evaluations, (None, 0))
@@ -316,7 +332,10 @@ def evolve(
             state["best_mean_generation"] = jnp.int32(generation)
         return {f"mean/{name}": value for name, value in {**outcome, **middles}.items()}
 
-    with Progress(console, config.num_generations, first) as advance:
+    with (
+        termination.saving(save) if run else nullcontext(),
+        Progress(console, config.num_generations, first) as advance,
+    ):
         for generation in range(first, config.num_generations):
             key_ask, key_evaluate, key_tell = split_key(key_at(key_generations, generation), 3)
             metrics: dict[str, Any] = {}
@@ -364,8 +383,9 @@ def evolve(
             if run:
                 run.log(generation, metrics, seconds)
             history.append({"generation": generation, **{k: plain(v) for k, v in metrics.items()}})
-            if checkpoints and (last or (generation + 1) % config.checkpoint_every == 0):
-                checkpoints.save(generation + 1, state)
+            latest = generation + 1, dict(state)
+            if run and (last or (generation + 1) % config.checkpoint_every == 0):
+                save()
             advance(metrics, seconds)
     if checkpoints:
         checkpoints.close()

@@ -6,24 +6,37 @@ bytes
 runs/NAME/timing.jsonl      seconds per generation
 runs/NAME/tensorboard/      the same numbers for TensorBoard
 runs/NAME/checkpoints/      orbax
+runs/NAME/.lock             held by the process that writes here
 """
 
 import hashlib
 import json
+import os
 import shutil
+import socket
 import time
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
+
+try:
+    import fcntl
+except ImportError:  # Windows has none, and there nobody is kept out of a run
+    fcntl = None  # type: ignore[assignment]
 
 import jax
 import numpy as np
 import orbax.checkpoint as ocp
-from tensorboardX import SummaryWriter
+from tensorboardX.event_file_writer import EventsWriter
+from tensorboardX.proto.event_pb2 import Event, SessionLog
+from tensorboardX.summary import scalar
 
 from scb.errors import UserError
-from scb.files import cannot_write, make_folder, plain, write_text
+from scb.files import cannot_write, make_folder, plain, write_json, write_text
+
+_LOCK = ".lock"
+_held: dict[Path, IO[str]] = {}  # open as long as the process holds them
 
 
 class Run:
@@ -32,7 +45,7 @@ class Run:
     def __init__(self, folder: Path, resumed: bool, wandb_project: str | None = None) -> None:
         self.folder = folder
         self.resumed = resumed
-        self._writer: SummaryWriter | None = None
+        self._events: EventsWriter | None = None
         self._wandb = _start_wandb(folder, wandb_project) if wandb_project else None
 
     @classmethod
@@ -53,12 +66,11 @@ class Run:
           wandb_project: also log to this Weights & Biases project (extra `wandb`).
 
         Raises:
-          UserError: the folder can't be written, holds something already, isn't a run, or its
-            config differs.
+          UserError: the folder can't be written, holds something already, isn't a run, is another
+            process's, or its config differs.
         """
         folder = Path(folder)
         config = json.loads(json.dumps(config))
-        stored_config = folder / "config.json"
         if resume:
             stored = read_config(folder)
             stored, asked = ({**c, "command": None} for c in (stored, config))
@@ -68,14 +80,19 @@ class Run:
                     f"cannot resume {folder}: its config differs at {difference}; resume with the config it was "
                     "started with, or start a new folder."
                 )
+            make_folder(folder)
+            _lock(folder)
             return cls(folder, resumed=True, wandb_project=wandb_project)
-        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        if folder.exists() and (
+            not folder.is_dir() or any(path.name != _LOCK for path in folder.iterdir())
+        ):
             raise UserError(
                 f"{folder} already exists and is not empty: choose another --out, or continue it with --resume."
             )
         make_folder(folder)
+        _lock(folder)
         try:
-            stored_config.write_text(json.dumps(config, indent=2) + "\n")
+            write_json(folder / "config.json", config)
         except OSError as error:
             raise cannot_write(folder, reason=error.strerror) from error
         return cls(folder, resumed=False, wandb_project=wandb_project)
@@ -103,15 +120,24 @@ class Run:
             file.write(json.dumps(line) + "\n")
         with (self.folder / "timing.jsonl").open("a") as file:
             file.write(json.dumps({"generation": generation, "seconds": round(seconds, 4)}) + "\n")
-        if self._writer is None:
-            self._writer = SummaryWriter(
-                str(self.folder / "tensorboard"),
-                purge_step=generation if self.resumed else None,
-            )
-        for name, value in metrics.items():
-            self._writer.add_scalar(name, float(value), generation)
+        self._log_to_tensorboard(generation, metrics)
         if self._wandb is not None:
             self._wandb.log(dict(metrics), step=generation)
+
+    def _log_to_tensorboard(self, generation: int, metrics: Mapping[str, float]) -> None:
+        # Not by a SummaryWriter, whose thread dies of a full disk, upon which its queue waits for ever.
+        if self._events is None:
+            folder = self.folder / "tensorboard"
+            folder.mkdir(exist_ok=True)
+            self._events = EventsWriter(str(folder / "events"))
+            if self.resumed:  # hides what a killed run wrote from here on
+                start = SessionLog(status=SessionLog.START)
+                self._events.write_event(Event(step=generation, session_log=start))
+        for name, value in metrics.items():
+            summary = scalar(name, float(value))
+            event = Event(wall_time=time.time(), step=generation, summary=summary)
+            self._events.write_event(event)
+        self._events.flush()
 
     def metrics(self) -> list[dict[str, Any]]:
         """All logged generations, oldest first."""
@@ -125,10 +151,35 @@ class Run:
         return float(sum(json.loads(line)["seconds"] for line in lines))
 
     def close(self) -> None:
-        if self._writer is not None:
-            self._writer.close()
+        if self._events is not None:
+            self._events.close()
+            self._events = None
         if self._wandb is not None:
             self._wandb.finish()
+        if held := _held.pop(self.folder.resolve(), None):
+            held.close()
+
+
+def _lock(folder: Path) -> None:
+    """Holds a run folder for this process; the system lets go of it, however the process ends."""
+    if fcntl is None or folder.resolve() in _held:
+        return
+    file = (folder / _LOCK).open("a+")
+    try:
+        fcntl.lockf(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except (BlockingIOError, PermissionError) as error:
+        file.seek(0)
+        holder = file.read().strip() or "which has just begun"
+        file.close()
+        raise UserError(
+            f"{folder} is in use by another command ({holder}): wait until it has ended, or choose another folder."
+        ) from error
+    except OSError:
+        pass  # a file system without locks
+    file.truncate(0)
+    file.write(f"process {os.getpid()} on {socket.gethostname()}\n")
+    file.flush()
+    _held[folder.resolve()] = file
 
 
 def read_config(folder: str | Path) -> dict[str, Any]:
@@ -164,16 +215,22 @@ class Checkpoints:
         )
 
     def save(self, step: int, state: Any) -> None:
-        """Writes `state` and waits until it is on disk."""
+        """Writes `state` and waits until it is on disk; a UserError where it cannot be written."""
         leaves = _leaves(state)
-        self._manager.save(
-            step,
-            args=ocp.args.Composite(
-                state=ocp.args.StandardSave(leaves),
-                digest=ocp.args.JsonSave({"sha256": _digest(leaves)}),
-            ),
+        items = ocp.args.Composite(
+            state=ocp.args.StandardSave(leaves),
+            digest=ocp.args.JsonSave({"sha256": _digest(leaves)}),
         )
-        self._manager.wait_until_finished()
+        try:
+            self._manager.save(step, args=items)
+            self._manager.wait_until_finished()
+        # Orbax and tensorstore raise many kinds where a disk is full or a folder is gone.
+        except Exception as error:
+            raise UserError(
+                f"checkpoint {step} could not be written to {self.folder} "
+                f"({(str(error).splitlines() or [type(error).__name__])[0][:200]}): the one before it is there; make "
+                "room, and go on with --resume."
+            ) from error
 
     def restore(self, template: Any) -> tuple[int, Any, list[int]]:
         """(step, state, steps of unreadable newer checkpoints); step 0 and the template where none can be read."""

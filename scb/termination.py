@@ -1,0 +1,56 @@
+"""A process that is told to end (SIGTERM, as schedulers do before they kill) saves what it has, and ends with 143."""
+
+import contextlib
+import os
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator
+
+STATUS = 128 + signal.SIGTERM
+
+# Held while a checkpoint is written, so that no other thread ends the process or writes the same one meanwhile.
+writing = threading.RLock()
+_savers: list[Callable[[], str]] = []
+
+
+@contextlib.contextmanager
+def saving(save: Callable[[], str]) -> Iterator[None]:
+    """Within it a process that `watch` watches calls `save` before it ends, and says the sentence that it returns.
+
+    It is called from another thread, for the main one may be inside a computation of minutes.
+    """
+    with writing:
+        _savers.append(save)
+    try:
+        yield
+    finally:
+        with writing:
+            _savers.remove(save)
+
+
+def watch(program: str) -> None:
+    """From now on SIGTERM ends this process so. Of a main thread; once is enough."""
+    read, write = os.pipe()
+    os.set_blocking(write, False)
+    # Python would call a handler when the computation at hand is over. What is written for the signal's number
+    # to the file descriptor is there at once.
+    signal.set_wakeup_fd(write, warn_on_full_buffer=False)
+    signal.signal(signal.SIGTERM, lambda *_: None)
+    threading.Thread(target=_wait, args=(program, read), daemon=True).start()
+
+
+def _wait(program: str, read: int) -> None:
+    while os.read(read, 1) != bytes([signal.SIGTERM]):
+        pass
+    with writing:
+        said = []
+        for save in _savers:
+            try:
+                said.append(save())
+            # Whatever it is, what was saved before is there, and the time that is left is short.
+            except Exception as error:
+                said.append(f"what was done since the last checkpoint is lost ({error}).")
+        end = " ".join(said) or "a run with --out continues with --resume."
+        print(f"{program}: told to end; {end}", file=sys.stderr, flush=True)
+        os._exit(STATUS)
