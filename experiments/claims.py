@@ -8,7 +8,7 @@ or one search, nothing is decided.
 
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from scb.environments.registry import environment_spec
 from scb.statistics import Estimate
@@ -21,6 +21,7 @@ HOLDS, IN_PART, FAILS, UNDECIDED, UNTESTED = OUTCOMES = (
     "not tested at this size",
 )
 CONFIDENCE = 0.95  # of all intervals of a page together
+DECIDING = 10  # agents; of fewer a bootstrap's interval is too narrow to decide anything
 
 
 @dataclass(frozen=True)
@@ -67,6 +68,11 @@ class Judged:
     def stored(self) -> bool:
         """Whether its interval is a report's, which can't be corrected."""
         return isinstance(self.claim.evidence, Estimate) and self.claim.evidence.low is not None
+
+
+def of_agents(evidence: Callable[..., Estimate], number: int) -> Callable[..., Estimate] | Estimate:
+    """What so many agents say: without an interval where they are too few."""
+    return evidence if number >= DECIDING else replace(evidence(), low=None, high=None)
 
 
 def judge(claims: Sequence[Claim]) -> list[Judged]:

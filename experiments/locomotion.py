@@ -8,14 +8,14 @@ are trained at a time, and --out is saved after each few: the same command goes 
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from matplotlib.figure import Figure
 
-from experiments.claims import Claim
+from experiments.claims import DECIDING, Claim, of_agents
 from experiments.harness import Experiment, Report, Save, packed
 from lpo import figures
 from lpo.comparison import LearningCurves, compare, ppo_spec
@@ -29,7 +29,6 @@ from scb.statistics import Estimate, paired_difference
 
 BACKEND = "generalized"
 REFERENCE = "ppo"
-DECIDING = 10  # agents; of fewer a bootstrap's interval is too narrow to decide anything
 MARGIN = 0.05  # of what the reference earns: what is not worse by more is as good
 
 
@@ -109,8 +108,7 @@ def paired(
     ours, theirs = (
         getattr(x, of)[[x.seeds.index(seed) for seed in shared]] for x in (curves, reference)
     )
-    found = partial(paired_difference, ours, theirs)
-    return found if len(shared) >= DECIDING else replace(found(), low=None, high=None)
+    return of_agents(partial(paired_difference, ours, theirs), len(shared))
 
 
 def claims(report: Report) -> list[Claim]:

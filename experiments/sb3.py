@@ -20,12 +20,13 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
-from experiments.claims import Claim
+from experiments.claims import DECIDING, Claim, of_agents
 from experiments.harness import Experiment, Report, Save, packed, unpacked
 from scb import plotting
 from scb.environments.registry import environment_spec
 from scb.errors import UserError, at_least, one_of
 from scb.gymnasium import NAMESPACE
+from scb.plotting import thousands
 from scb.seeds import REPORTING, reporting
 from scb.statistics import Estimate, estimate, paired_difference
 
@@ -134,16 +135,20 @@ def returns_of(agents: Mapping[str, Any], seeds: Sequence[str]) -> np.ndarray:
 
 
 def claims(report: Report) -> list[Claim]:
-    """Of every algorithm: after the fewest steps, more in the bandit than in the environment itself."""
+    """Of every algorithm: after the fewest and the most steps, more in the bandit than in the environment itself."""
     found = []
     for name, algorithms in report["agents"].items():
         for algorithm, places in algorithms.items():
             both = [places[place] for place in PLACES]
-            evidence = None
-            if shared := sorted(set.intersection(*map(set, both))):
-                here, there = (returns_of(cell, shared)[:, 0] for cell in both)
-                evidence = partial(paired_difference, here, there)
-            found.append(Claim(f"{name}, {algorithm.upper()}", evidence, places=0))
+            shared = sorted(set.intersection(*map(set, both)))
+            steps = report["steps"][algorithm]
+            for point in sorted({0, len(steps) - 1}):
+                evidence: Any = None
+                if shared:
+                    here, there = (returns_of(cell, shared)[:, point] for cell in both)
+                    evidence = of_agents(partial(paired_difference, here, there), len(shared))
+                text = f"{name}, {algorithm.upper()} after {thousands(steps[point])} steps"
+                found.append(Claim(text, evidence, places=0))
     return found
 
 
@@ -164,6 +169,7 @@ def facts(report: Report) -> dict[str, Any]:
         "tables": tables,
         "every": sorted({n for x in report["steps"].values() for n in x}),
         "counts": sorted(counts),
+        "deciding": DECIDING,
         "expert": {name: environment_spec(name).reference() for name in tables},
         "random": {name: environment_spec(name).random_return() for name in tables},
         "seed": REPORTING.start,

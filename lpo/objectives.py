@@ -76,17 +76,10 @@ def closed_form(name: str, drift: Drift) -> Objective:
 
 def _from_file(path: Path) -> Objective:
     artefact = artefacts.load(path, KIND)
-    try:
+    with artefacts.described(path, "drift", "config entry 'drift'"):
         drift = drift_from_config(artefact.metadata["config"]["drift"])
-    except (KeyError, TypeError) as error:
-        lacks = isinstance(error, KeyError)
-        wrong = (
-            f"lacks config entry {error}" if lacks else f"garbles config entry 'drift' ({error})"
-        )
-        raise UserError(f"{path} does not describe a drift: its .json {wrong}.") from error
-    except UserError as error:
-        raise UserError(f"{path}: {error}") from error
-    artefacts.expect_shapes(artefact, drift.shapes())
+        shapes = drift.shapes()
+    artefacts.expect_shapes(artefact, shapes)
     parameters = jax.tree.map(jnp.asarray, dict(artefact.arrays))
     # Where settings say the parameters, a reader trusts those.
     if drift.with_parameters(parameters) != drift:

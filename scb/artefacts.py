@@ -6,6 +6,7 @@ package versions, measured results, cost, the command, and the SHA-256 of the .n
 gives equal bytes.
 """
 
+import contextlib
 import dataclasses
 import hashlib
 import io
@@ -15,7 +16,7 @@ import platform
 import subprocess
 import sys
 import zipfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from importlib import metadata as distributions
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -144,6 +145,28 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
       UserError: the file cannot be read, is damaged, or holds something other than finite numbers.
     """
     return _parse_npz(path, _read(path))
+
+
+@contextlib.contextmanager
+def described(path: str | Path, what: str, entry: str = "a config entry") -> Iterator[None]:
+    """Within it something is made as the .json of an artefact describes it, by which it may be misled to anything.
+
+    Raises:
+      UserError: the description is not one of `what`, such as "bandit"; also in the place of what it led to.
+    """
+    try:
+        yield
+    except UserError as error:
+        raise UserError(f"{path}: {error}") from error
+    except KeyError as error:
+        raise UserError(
+            f"{path} does not describe a {what}: its .json lacks config entry {error}."
+        ) from error
+    except Exception as error:
+        reason = (str(error).splitlines() or [type(error).__name__])[0].rstrip(".")
+        raise UserError(
+            f"{path} does not describe a {what}: its .json garbles {entry} ({reason})."
+        ) from error
 
 
 def expect_shapes(artefact: Artefact, shapes: Mapping[str, Sequence[int]]) -> None:

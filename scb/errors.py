@@ -41,7 +41,7 @@ def _check(
 
 def one_of(kind: str, name: str, known: Iterable[str]) -> None:
     """Raises `unknown_name` where a name is none of those."""
-    if name not in known:
+    if not isinstance(name, str) or name not in known:
         raise unknown_name(kind, name, known)
 
 
@@ -49,6 +49,7 @@ def unknown_name(kind: str, name: str, known: Iterable[str]) -> UserError:
     """The error for a name that nobody registered; near matches first, else all known names."""
     names = sorted(known)
     lowered = {candidate.lower(): candidate for candidate in names}
-    near = [lowered[match] for match in get_close_matches(name.lower(), lowered, n=3, cutoff=0.5)]
+    given = str(name).lower()  # a file may hold anything in the place of a name
+    near = [lowered[match] for match in get_close_matches(given, lowered, n=3, cutoff=0.5)]
     hint = f"did you mean {' or '.join(near)}?" if near else f"known are {', '.join(names)}."
     return UserError(f"unknown {kind} {name!r}: {hint}")

@@ -60,6 +60,10 @@ def _evaluation_environment(metadata: Mapping[str, Any]) -> str | None:
     named = str(metadata["name"]).removeprefix(PREFIX)
     if stated is None and named in environment_names():
         return named
+    if not isinstance(stated, str | None):
+        raise UserError(
+            f'{metadata["name"]} stands for {stated!r}, which is no name: mend "evaluation_environment" in its .json.'
+        )
     return stated
 
 
@@ -96,7 +100,7 @@ def _load(path: str | Path, *kinds: str) -> SyntheticBandit | SyntheticMDP:
     config, kind = artefact.metadata["config"], artefact.metadata["kind"]
     weights = jax.tree.map(jnp.asarray, dict(artefact.arrays))
     made: SyntheticBandit | SyntheticMDP
-    try:
+    with artefacts.described(path, _KINDS[kind]):
         shape = config["observation_size"], _space(config["action_space"])
         if kind == BANDIT:
             made = SyntheticBandit(*shape, BanditConfig(**config["bandit"]), weights, artefact.name)
@@ -105,10 +109,6 @@ def _load(path: str | Path, *kinds: str) -> SyntheticBandit | SyntheticMDP:
             start = _start(config["start"]) if mdp_config.parameterization == "T" else (None, None)
             made = SyntheticMDP(*shape, mdp_config, weights, artefact.name, *start)
         shapes = made.weight_shapes()
-    except (KeyError, TypeError) as error:
-        raise UserError(
-            f"{path} does not describe a {_KINDS[kind]}: its .json lacks or garbles a config entry ({error})."
-        ) from error
     artefacts.expect_shapes(artefact, shapes)
     return made
 
@@ -194,10 +194,20 @@ def space_description(space: spaces.Box | spaces.Discrete) -> dict[str, Any]:
 
 
 def _space(description: Mapping[str, Any]) -> spaces.Box | spaces.Discrete:
+    """What was described; a ValueError where that is no space."""
     if description["type"] == "discrete":
-        return spaces.Discrete(description["n"])
-    low, high = (_bound(np.asarray(description[x], np.float32)) for x in ("low", "high"))
-    return spaces.Box(low, high, tuple(description["shape"]), jnp.float32)
+        number = description["n"]
+        if type(number) is not int or number < 1:
+            raise ValueError(f"{number!r} is no number of actions")
+        return spaces.Discrete(number)
+    shape = tuple(description["shape"])
+    low, high = (np.asarray(description[x], np.float32) for x in ("low", "high"))
+    # As it was written: a shape that the bounds don't have might be of any size.
+    if not all(type(x) is int for x in shape) or not low.shape == high.shape == shape:
+        raise ValueError(f"bounds of actions are not of shape {shape}")
+    if not (low <= high).all():
+        raise ValueError("an action's lower bound is above its upper one")
+    return spaces.Box(_bound(low), _bound(high), shape, jnp.float32)
 
 
 def _bound(values: np.ndarray) -> float | jax.Array:

@@ -1,0 +1,36 @@
+"""Stable-Baselines3 trains in a synthetic bandit and acts in Gymnasium's environment.
+
+python examples/sb3_in_a_bandit.py --algorithm sac --steps 10000
+
+It needs stable-baselines3 beside this library. Hyperparameters are the defaults of SB3.
+"""
+
+import gymnasium
+import stable_baselines3
+import tyro
+from stable_baselines3.common.evaluation import evaluate_policy
+
+import scb  # noqa: F401, which registers the bandits with Gymnasium
+
+
+def main(
+    algorithm: str = "sac", environment: str = "Pendulum-v1", steps: int = 10_000, seed: int = 1
+) -> float:
+    """Train an agent in a bandit, then evaluate it.
+
+    Args:
+      algorithm: ppo, sac, td3, ddpg or dqn.
+      environment: for which the zoo has a bandit.
+      steps: of the bandit.
+      seed: of the agent.
+    """
+    bandit = gymnasium.make(f"scb/Synthetic-{environment}")
+    learner = getattr(stable_baselines3, algorithm.upper())
+    agent = learner("MlpPolicy", bandit, seed=seed, device="cpu").learn(steps)
+    mean, deviation = evaluate_policy(agent, gymnasium.make(environment), 20, warn=False)
+    print(f"{algorithm} after {steps} steps of the bandit: {mean:.0f} ± {deviation:.0f}")
+    return mean
+
+
+if __name__ == "__main__":
+    tyro.cli(main)
