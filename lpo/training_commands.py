@@ -41,8 +41,8 @@ class Agents:
     """Which agents are trained, and how.
 
     Attributes:
-      environment: Pendulum-v1, CartPole-v1, hopper, Synthetic-Pendulum-v1, ...; Pendulum-v1 where
-        nothing says another.
+      environment: Pendulum-v1, CartPole-v1, hopper, Synthetic-Pendulum-v1, ..., or one's own as
+        package.module:factory; Pendulum-v1 where nothing says another.
       steps: environment steps; the environment's own setting where left out.
       policy_output_scale: factor on the policy's last layer at initialisation; many public PPOs take
         0.01.

@@ -130,6 +130,8 @@ class Discover(LongRun):
                 self.judgement.judge_agents,
                 self.judgement.judge_episodes,
             )
+            told = scale(config.environment, config.backend, problem.warm_start_report)
+            console().print(told, soft_wrap=True)
         metadata = {
             "config": {
                 "evaluation_environment": config.environment,
@@ -147,6 +149,20 @@ class Discover(LongRun):
         }
         path = save_bandit(folder.folder / f"{spec.bandit}.npz", problem.bandit, weights, metadata)
         console().print(f"bandit: {path}", soft_wrap=True)
+
+
+def scale(environment: str, backend: str | None, warm_start: Mapping[str, float]) -> str:
+    """What returns of an environment are to be compared with, in a sentence."""
+    spec = environment_spec(environment)
+    known = {"random actions": spec.random_return(backend)}
+    if "expert_return" in warm_start:
+        known["the expert that the bandit was fitted to"] = warm_start["expert_return"]
+    if (reference := spec.reference(backend)) is not None:
+        known[reference.source] = reference.value
+    if (standing := spec.standing_still(backend)) is not None:
+        known["standing still"] = standing
+    told = "; ".join(f"{who}: {value:.4g}" for who, value in known.items())
+    return f"to compare with, on {environment}: {told}"
 
 
 def _origin(bandit: str) -> dict[str, Any]:

@@ -72,7 +72,8 @@ class DiscoveryConfig:
     """What to discover, and how.
 
     Attributes:
-      environment: the evaluation environment (Pendulum-v1, CartPole-v1, hopper, ...).
+      environment: the evaluation environment (Pendulum-v1, CartPole-v1, hopper, ..., or one's own as
+        package.module:factory, which returns a gymnax environment).
       backend: Brax's physics: generalized, positional or spring.
       parameterization: I (the bandit), TI or T (fully synthetic MDPs: learned transition, reward and
         termination, with or without a learned initial state).

@@ -32,8 +32,8 @@ def environment_spec(name: str) -> EnvironmentSpec:
     """What is known of an environment.
 
     Args:
-      name: "Synthetic-Pendulum-v1", "CartPole-v1", "hopper", ..., or the file.npz of a bandit or of a
-        synthetic MDP.
+      name: "Synthetic-Pendulum-v1", "CartPole-v1", "hopper", ..., the file.npz of a bandit or of a synthetic
+        MDP, or "package.module:factory" (see `scb.environments.custom`).
 
     Raises:
       UserError: unknown name (with near matches), or a file that is none of these.

@@ -88,8 +88,8 @@ class EnvironmentSpec:
 
     @property
     def bandit(self) -> str:
-        """What a bandit for this environment is called."""
-        return f"Synthetic-{self.name}"
+        """What a bandit for this environment is called; a file may have this name."""
+        return f"Synthetic-{self.name.replace(':', '-')}"
 
     @property
     def synthetic(self) -> bool:

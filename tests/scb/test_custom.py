@@ -1,0 +1,84 @@
+"""Environments that nobody registered, by the name of what makes them."""
+
+import sys
+
+import pytest
+
+from scb.cli import main
+from scb.environments.registry import environment_spec, make
+from scb.environments.zoo import bandit_metadata
+from scb.errors import UserError
+
+MODULE = """
+import gymnax
+from gymnax.environments.classic_control.pendulum import Pendulum
+
+def alone():
+    return Pendulum()
+
+def with_parameters(length=7):
+    env, params = gymnax.make("Pendulum-v1")
+    return env, params.replace(max_steps_in_episode=length)
+
+def wrong():
+    return "a pendulum"
+
+number = 3
+"""
+
+
+@pytest.fixture
+def module(tmp_path, monkeypatch):
+    """A module in the working directory, where a program finds it that was not started there."""
+    name = f"made_here_{tmp_path.name}".replace("-", "_")
+    (tmp_path / f"{name}.py").write_text(MODULE)
+    (tmp_path / f"{name}_broken.py").write_text("import nothing_of_this_name")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [x for x in sys.path if x not in ("", str(tmp_path))])
+    return name
+
+
+def test_an_environment_is_what_the_factory_returns(module):
+    env, params = make(f"{module}:alone")
+    assert env.name == "Pendulum-v1" and params.max_steps_in_episode == 200
+    env, params = make(f"{module}:with_parameters")
+    assert params.max_steps_in_episode == 7
+    _, params = make(f"{module}:with_parameters", length=9)
+    assert params.max_steps_in_episode == 9
+    spec = environment_spec(f"{module}:with_parameters")
+    assert spec.episode_limit == 7 and spec.bandit == f"Synthetic-{module}-with_parameters"
+    assert spec.random_return() < -5
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("nowhere.at_all:make", "cannot be imported .No module named 'nowhere'"),
+        ("{}:other", "cannot be imported .*has no attribute 'other'"),
+        ("{}_broken:make", "cannot be imported .No module named 'nothing_of_this_name'"),
+        ("{}:wrong", "returned a str: it must return a gymnax"),
+        ("{}:number", "does not take"),
+    ],
+)
+def test_what_is_no_factory_is_refused(module, name, message):
+    with pytest.raises(UserError, match=message):
+        make(name.format(module))
+
+
+def test_a_bandit_is_discovered_for_it_and_says_what_its_returns_are_to_be_compared_with(
+    module, tmp_path, capsys, monkeypatch
+):
+    monkeypatch.setattr("scb.commands.judge_all", lambda *_: {})  # it takes the longest
+    name = f"{module}:with_parameters"
+    flags = ["--population-size=2", "--generations=1", "--mean-evaluations=2", "--judge-agents=2"]
+    flags += ["--agents-per-candidate=1", "--evaluation-episodes=1", "--judge-episodes=1"]
+    flags += ["--expert-steps=500", "--fit-steps=10", "--algorithms=ppo", "--expert=ppo"]
+    out = tmp_path / "run"
+    status = main(["discover", f"--environment={name}", *flags, f"--out={out}"])
+    said = capsys.readouterr()
+    assert status == 0, said.err
+    assert f"to compare with, on {name}: random actions: -" in said.out
+    assert "the expert that the bandit was fitted to: -" in said.out
+    path = out / f"Synthetic-{module}-with_parameters.npz"
+    assert bandit_metadata(str(path))["config"]["evaluation_environment"] == name
+    assert environment_spec(str(path)).evaluation_environment == name
