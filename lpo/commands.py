@@ -23,7 +23,7 @@ from lpo.meta_training import (
     learn_objective,
 )
 from lpo.objectives import Objective, load_objective, save_objective
-from scb import plotting
+from scb import plotting, processes
 from scb.artefacts import machine_description
 from scb.command_line import LongRun, Output, flags, listed
 from scb.console import console
@@ -77,6 +77,7 @@ class MetaTrain(LongRun):
         {"quick": partial(_meta_training, 32, 30), "paper": partial(_meta_training, 64, 512)}
     )
     deciding = ("tasks", "environment", "drift", "temporal", "validate")
+    together = True
 
     config: Annotated[MetaTrainingConfig, tyro.conf.arg(name="inner loop")] = field(
         default_factory=MetaTrainingConfig
@@ -92,6 +93,8 @@ class MetaTrain(LongRun):
 
     def run(self) -> None:
         objective = self.objective()
+        if not processes.first():
+            return
         folder = self.output.resume or self.output.out
         console().print(f"objective: {folder / 'objective.npz'}", soft_wrap=True)
         console().print(f"it {certify(objective.drift, objective.parameters)}")
@@ -103,8 +106,9 @@ class MetaTrain(LongRun):
         )  # before the folder, which a mistake must not leave behind
         run = self.open()
         objective = learn_objective(problem, run, self.command)
-        curve = figures.meta_training_curve(run.metrics(), self.config)
-        plotting.save(curve, run.folder / "figures" / "meta_training.png")
+        if processes.first():
+            curve = figures.meta_training_curve(run.metrics(), self.config)
+            plotting.save(curve, run.folder / "figures" / "meta_training.png")
         return objective
 
 

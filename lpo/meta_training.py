@@ -19,6 +19,7 @@ import numpy as np
 
 from lpo.inner_loop import MetaTrainingConfig, TaskTraining
 from lpo.objectives import Objective, load_objective, save_objective
+from scb import processes
 from scb.environments.registry import environment_spec
 from scb.environments.zoo import bandit_metadata
 from scb.evolution import EnvironmentSteps, EvolutionConfig, Outcome, evolve
@@ -123,11 +124,16 @@ def learn_objective(
       file: of the objective in the folder.
     """
     path, config = run.folder / file, problem.config
-    if not path.with_suffix(".json").exists():  # it is written last
+    mean = None
+    if not processes.told(path.with_suffix(".json").exists()):  # it is written last
         outcome = evolve(problem, config.evolution, run)
         run.close()
         mean = outcome.best_mean if config.validation else outcome.mean
-        save_objective(path, config.drift, mean, _story(problem, outcome, mean, command))
+        story = _story(problem, outcome, mean, command)
+        if processes.first():
+            save_objective(path, config.drift, mean, story)
+    if not processes.first():  # which has the folder
+        return Objective(path.stem, config.drift, mean)
     return load_objective(path)
 
 

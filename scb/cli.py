@@ -51,6 +51,7 @@ def run_program(
     from scb import termination
     from scb.command_line import call
     from scb.errors import UserError
+    from scb.processes import LostProcess
 
     # A caller's process is the caller's.
     if arguments is None:
@@ -63,7 +64,9 @@ def run_program(
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except UserError as error:
-        print(f"{program}: {error}", file=sys.stderr)
+        print(f"{program}: {error}", file=sys.stderr, flush=True)
+        if isinstance(error, LostProcess):
+            os._exit(2)  # an orderly end would wait for the lost one
         return 2
     except OSError as error:
         if error.errno not in _NO_ROOM:

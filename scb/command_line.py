@@ -15,6 +15,7 @@ from typing import Any, ClassVar, Self, TypeVar, get_type_hints
 import tyro
 from tyro.constructors import PrimitiveConstructorSpec
 
+from scb import processes
 from scb.errors import UserError, one_of
 from scb.rows import Rows
 from scb.runs import Run, config_dict, read_config
@@ -84,11 +85,18 @@ class Output:
       resume: a run folder to continue; its configuration applies, and a flag that contradicts it is
         an error.
       wandb: project to log to, with the extra `wandb`.
+      coordinator: HOST:PORT of the first of several processes that compute the run together. Started by
+        SLURM's srun or Open MPI's mpirun they find each other without these flags.
+      processes: how many there are.
+      process: which one this is, from 0.
     """
 
     out: Path
     resume: Path | None = None
     wandb: str | None = None
+    coordinator: str | None = None
+    processes: int | None = None
+    process: int | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -101,6 +109,7 @@ class LongRun(ABC):
       program: the names of program and command.
       presets: {name: (deciding flags that were given, by name) -> configuration}.
       deciding: flags that other settings' defaults depend on. A flag without a value is "".
+      together: whether several processes may compute a run together.
     """
 
     config: Any
@@ -110,6 +119,7 @@ class LongRun(ABC):
     program: ClassVar[str]
     presets: ClassVar[Mapping[str, Callable[[Mapping[str, str]], Any]]]
     deciding: ClassVar[tuple[str, ...]] = ()
+    together: ClassVar[bool] = False
 
     @classmethod
     def decided(cls, config: Any) -> dict[str, str]:
@@ -165,7 +175,21 @@ class LongRun(ABC):
         """The run folder, new or resumed."""
         output, wandb = self.output, getattr(self.output, "wandb", None)
         stored = {"command": self.command, "config": config_dict(self.config)}
-        return Run.open(output.resume or output.out, stored, output.resume is not None, wandb)
+        folder, resumed, refused, run = (
+            output.resume or output.out,
+            output.resume is not None,
+            "",
+            None,
+        )
+        # Of several processes the first has the folder, and what it is refused the others are told.
+        if processes.first():
+            try:
+                run = Run.open(folder, stored, resumed, wandb)
+            except UserError as error:
+                refused = str(error)
+        if refused := processes.told(refused):
+            raise UserError(refused)
+        return run or Run(folder, resumed)
 
 
 @dataclass(frozen=True)
@@ -212,6 +236,9 @@ def call(
             sort_subcommands=False,
         )
     elif isinstance(command, type) and issubclass(command, LongRun):
+        others = flags_given(arguments[1:], "coordinator", "processes", "process")
+        if command.together and "--help" not in arguments:
+            processes.start(others)
         command.parse(arguments[1:]).run()
     else:
         tyro.cli(command, prog=f"{program} {name}", args=arguments[1:], config=_STYLE)

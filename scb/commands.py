@@ -10,6 +10,7 @@ import numpy as np
 import tyro
 from rich.table import Column, Table
 
+from scb import processes
 from scb.agents.spec import algorithms_for, bandit_agent
 from scb.command_line import LongRun, Measuring, Output
 from scb.console import console
@@ -100,6 +101,7 @@ class Discover(LongRun):
     program = "scb discover"
     presets = MappingProxyType({"quick": _quick, "paper": _paper})
     deciding = ("environment",)
+    together = True
 
     config: Annotated[DiscoveryConfig, tyro.conf.arg(name="")] = field(
         default_factory=lambda: _quick({})
@@ -132,6 +134,8 @@ class Discover(LongRun):
             )
             told = scale(config.environment, config.backend, problem.warm_start_report)
             console().print(told, soft_wrap=True)
+        if not processes.first():
+            return
         metadata = {
             "config": {
                 "evaluation_environment": config.environment,

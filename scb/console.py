@@ -8,13 +8,18 @@ import numpy as np
 from rich import progress
 from rich.console import Console
 
+from scb import processes
+
 PIPE_WIDTH = 120
 
 
 def console() -> Console:
-    """Standard output, as wide as the terminal; in a file or a pipe wide enough for whole tables."""
-    made = Console()
-    return made if sys.stdout.isatty() else Console(width=max(PIPE_WIDTH, made.width))
+    """Standard output, as wide as the terminal; in a file or a pipe wide enough for whole tables.
+
+    Of several processes the first alone says something.
+    """
+    made = Console(quiet=not processes.first())
+    return made if made.quiet or sys.stdout.isatty() else Console(width=max(PIPE_WIDTH, made.width))
 
 
 class Progress:

@@ -9,13 +9,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, cast
 
 import jax
 import jax.numpy as jnp
 import tyro
 from jax.typing import ArrayLike
 
+from scb import processes
 from scb.agents.spec import (
     ALGORITHMS,
     AgentSpec,
@@ -250,9 +251,14 @@ class BanditDiscovery:
     def _expert_fit(self) -> Weights:
         assert isinstance(self.bandit, SyntheticBandit)
         path = None if self._folder is None else self._folder / "warm_start.npz"
-        if path is not None and path.with_suffix(".json").exists():  # it is written last
-            self.warm_start_report = dict(bandit_metadata(str(path))["cost"])
-            return load_bandit(path).default_params.weights
+        found: Any = None
+        weights: Weights = self.bandit.init_weights(root_key(0))
+        if processes.first() and path is not None and path.with_suffix(".json").exists():
+            found = dict(bandit_metadata(str(path))["cost"])  # it is written last
+            weights = load_bandit(path).default_params.weights
+        if (found := processes.told(found)) is not None:
+            self.warm_start_report = found
+            return cast(Weights, processes.agreed(weights))
         weights, self.warm_start_report = warm_start(
             self.bandit,
             self.specs,
@@ -260,7 +266,7 @@ class BanditDiscovery:
             named_key(root_key(self.config.evolution.seed), "expert"),  # of the seed alone
             self.config.warm_start,
         )
-        if path is not None:
+        if path is not None and processes.first():
             metadata = {
                 "config": {
                     "evaluation_environment": self.config.environment,

@@ -20,7 +20,7 @@ from jax.sharding import NamedSharding, PartitionSpec
 from rich.console import Console
 from scipy.stats import rankdata
 
-from scb import termination
+from scb import processes, termination
 from scb.artefacts import machine_description
 from scb.console import Progress
 from scb.errors import UserError, at_least, one_of, positive
@@ -204,7 +204,7 @@ def rank_failed_last(fitness: np.ndarray) -> np.ndarray:
 def map_population(
     function: Callable[..., Any], size: int, in_axes: tuple[int | None, ...]
 ) -> Callable[..., Any]:
-    """`jit(vmap(function))` whose mapped axis is spread over all devices, with results as numpy arrays.
+    """`jit(vmap(function))` whose mapped axis is spread over the devices of all processes; results are numpy arrays.
 
     Each device runs its part alone: no collective inside, so a device that is late holds nobody up,
     and a vmapped `while_loop` ends when the device's own part has ended. A size that the devices
@@ -215,9 +215,8 @@ def map_population(
       size: length of the mapped axes, which are all first axes.
       in_axes: 0 for arguments with one entry a member, None for those that all share.
     """
-    devices = jax.devices()[:size]
+    mine, devices = processes.part(size)
     mesh = jax.sharding.Mesh(np.array(devices), ("population",))
-    padded = np.arange(-(-size // len(devices)) * len(devices)) % size
     specs = tuple(
         PartitionSpec() if axis is None else PartitionSpec("population") for axis in in_axes
     )
@@ -232,13 +231,13 @@ def map_population(
     )
 
     def place(argument: Any, axis: int | None, spec: PartitionSpec) -> Any:
-        if axis is not None and len(padded) != size:
-            argument = jax.tree.map(lambda x: x[padded], argument)
+        if axis is not None and not np.array_equal(mine, np.arange(size)):
+            argument = jax.tree.map(lambda x: x[mine], argument)
         return jax.device_put(argument, NamedSharding(mesh, spec))
 
     def call(*arguments: Any) -> Any:
         results = jax.device_get(mapped(*map(place, arguments, in_axes, specs)))
-        return jax.tree.map(lambda x: x[:size], results)
+        return jax.tree.map(lambda x: x[:size], processes.gathered(results))
 
     return call
 
@@ -279,18 +278,22 @@ def evolve(
         "best_mean_fitness": jnp.float32(-jnp.inf),
         "best_mean_generation": jnp.int32(-1),
     }
-    console = Console(file=sys.stderr, quiet=quiet)
-    checkpoints = Checkpoints(run.folder) if run else None
+    console = Console(file=sys.stderr, quiet=quiet or not processes.first())
+    checkpoints = Checkpoints(run.folder) if run and processes.first() else None
     first = saved = 0
-    if run and checkpoints and run.resumed:
-        first, state, damaged = checkpoints.restore(state)
+    if run and run.resumed:
+        damaged: list[int] = []
+        if checkpoints:
+            first, state, damaged = checkpoints.restore(state)
+        first, state = processes.told(first), processes.agreed(state)
         if not first:
             console.print("no checkpoint could be read: starting again at generation 0.")
         for step in damaged if first else ():
             console.print(
                 f"checkpoint {step} is damaged: resuming from checkpoint {first} before it."
             )
-        run.rewind(first)
+        if checkpoints:
+            run.rewind(first)
         saved = first
     # What is complete at any moment: steps into the next generation are not part of it.
     latest = first, dict(state)
@@ -333,7 +336,7 @@ def evolve(
         return {f"mean/{name}": value for name, value in {**outcome, **middles}.items()}
 
     with (
-        termination.saving(save) if run else nullcontext(),
+        termination.saving(save) if checkpoints else nullcontext(),
         Progress(console, config.num_generations, first) as advance,
     ):
         for generation in range(first, config.num_generations):
@@ -380,11 +383,11 @@ def evolve(
                 metrics |= {f"final_{k}": v for k, v in judge_mean(generation + 1).items()}
             seconds = watch.lap()
             total_seconds += seconds
-            if run:
+            if run and checkpoints:
                 run.log(generation, metrics, seconds)
             history.append({"generation": generation, **{k: plain(v) for k, v in metrics.items()}})
             latest = generation + 1, dict(state)
-            if run and (last or (generation + 1) % config.checkpoint_every == 0):
+            if checkpoints and (last or (generation + 1) % config.checkpoint_every == 0):
                 save()
             advance(metrics, seconds)
     if checkpoints:

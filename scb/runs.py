@@ -210,9 +210,14 @@ class Checkpoints:
         self._manager = self._open()
 
     def _open(self) -> ocp.CheckpointManager:
-        return ocp.CheckpointManager(
-            self.folder, options=ocp.CheckpointManagerOptions(max_to_keep=3)
+        # Of several processes one writes, and need not wait for the others.
+        here = jax.process_index()
+        alone = ocp.options.MultiprocessingOptions(primary_host=here, active_processes={here})
+        options = ocp.CheckpointManagerOptions(
+            max_to_keep=3, create=False, multiprocessing_options=alone
         )
+        self.folder.mkdir(parents=True, exist_ok=True)
+        return ocp.CheckpointManager(self.folder, options=options)
 
     def save(self, step: int, state: Any) -> None:
         """Writes `state` and waits until it is on disk; a UserError where it cannot be written."""

@@ -4,7 +4,6 @@ from dataclasses import replace
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
-import evosax.algorithms
 import jax
 import jax.flatten_util
 import jax.numpy as jnp
@@ -13,6 +12,10 @@ import optax
 
 from scb.errors import UserError
 from scb.keys import split_key
+from scb.start import unstarted
+
+with unstarted():
+    import evosax.algorithms
 
 if TYPE_CHECKING:
     from scb.evolution import EvolutionConfig

@@ -12,6 +12,7 @@ STATUS = 128 + signal.SIGTERM
 # Held while a checkpoint is written, so that no other thread ends the process or writes the same one meanwhile.
 writing = threading.RLock()
 _savers: list[Callable[[], str]] = []
+_pipe: int | None = None
 
 
 @contextlib.contextmanager
@@ -31,13 +32,21 @@ def saving(save: Callable[[], str]) -> Iterator[None]:
 
 def watch(program: str) -> None:
     """From now on SIGTERM ends this process so. Of a main thread; once is enough."""
-    read, write = os.pipe()
-    os.set_blocking(write, False)
+    global _pipe
+    read, _pipe = os.pipe()
+    os.set_blocking(_pipe, False)
+    arm()
+    threading.Thread(target=_wait, args=(program, read), daemon=True).start()
+
+
+def arm() -> None:
+    """Takes the signal back from what has taken it since `watch`; nothing where nobody watches."""
+    if _pipe is None:
+        return
     # Python would call a handler when the computation at hand is over. What is written for the signal's number
     # to the file descriptor is there at once.
-    signal.set_wakeup_fd(write, warn_on_full_buffer=False)
+    signal.set_wakeup_fd(_pipe, warn_on_full_buffer=False)
     signal.signal(signal.SIGTERM, lambda *_: None)
-    threading.Thread(target=_wait, args=(program, read), daemon=True).start()
 
 
 def _wait(program: str, read: int) -> None:
