@@ -41,6 +41,8 @@ def run_program(
 ) -> int:
     """Runs one command of a program and returns its exit code; a user's mistake is one sentence and 2.
 
+    One of several processes ends in it.
+
     Args:
       program: its name.
       description: one sentence of it, for the help.
@@ -48,16 +50,26 @@ def run_program(
       arguments: those of the process where None.
     """
     configure_jax()
-    from scb import termination
+    from scb import processes, termination
+
+    # A caller's process is the caller's.
+    if arguments is not None:
+        return _run(program, description, commands(), arguments)
+    termination.watch(program)
+    status = _run(program, description, commands(), sys.argv[1:])
+    processes.end(status)
+    return status
+
+
+def _run(
+    program: str, description: str, commands: Mapping[str, Any], arguments: Sequence[str]
+) -> int:
     from scb.command_line import call
     from scb.errors import UserError
     from scb.processes import LostProcess
 
-    # A caller's process is the caller's.
-    if arguments is None:
-        termination.watch(program)
     try:
-        call(program, description, commands(), sys.argv[1:] if arguments is None else arguments)
+        call(program, description, commands, arguments)
         sys.stdout.flush()
     except BrokenPipeError:
         # Whoever read the output, such as `head`, has enough; Python would complain at its exit.

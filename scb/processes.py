@@ -4,13 +4,16 @@ All of them run the same program on the same numbers; each evaluates its part of
 parts are worth is gathered. The first process alone writes.
 """
 
+import contextlib
 import json
 import os
+import sys
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax
 import numpy as np
+from jax._src.distributed import global_state
 from jax.experimental import multihost_utils
 
 from scb import termination
@@ -29,6 +32,7 @@ _LAUNCHERS = {
 }
 _NUMBERS = {"SLURM": "SLURM_NTASKS", "Open MPI": "OMPI_COMM_WORLD_SIZE"}
 _HEARTBEAT = 30  # seconds without a sign of life, after which a process counts as lost
+_GOODBYE = 10  # seconds in which the others end, once one has
 
 
 class LostProcess(UserError):
@@ -77,6 +81,25 @@ def start(given: Mapping[str, str], environment: Mapping[str, str] = os.environ)
             f"process {jax.process_index()} has {jax.local_device_count()} devices of {jax.device_count()} in "
             f"{jax.process_count()} processes: give each as many, such as by JAX_NUM_CPU_DEVICES."
         )
+
+
+def end(status: int) -> None:
+    """Ends this process with an exit code where others are, and waits for them where it is the first.
+
+    JAX would let them end in any order, and abort one that says goodbye when the first, which listens, has ended.
+    """
+    if global_state.client is None:
+        return
+    if first():
+        for i in range(1, jax.process_count()):
+            # One that doesn't end has lost its way, and says so itself.
+            with contextlib.suppress(jax.errors.JaxRuntimeError):
+                global_state.client.blocking_key_value_get(f"ended/{i}", _GOODBYE * 1000)
+        return
+    sys.stdout.flush()
+    sys.stderr.flush()
+    global_state.client.key_value_set(f"ended/{jax.process_index()}", "")
+    os._exit(status)
 
 
 def _number(given: Mapping[str, str], name: str, low: int, high: int) -> int:
