@@ -10,7 +10,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 PYTEST := $(BIN)/python -m pytest -q -n auto --dist loadfile
 
 .DEFAULT_GOAL := help
-.PHONY: help run test test-all lint format bench sb3 experiments clean
+.PHONY: help run test test-all lint format bench sb3 torture experiments clean
 
 help: ## list the commands
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-11s %s\n", $$1, $$2 }' Makefile
@@ -39,6 +39,9 @@ bench: $(INSTALLED) .venv-rejax/.installed ## train agents in the bandits beside
 
 sb3: $(INSTALLED) .venv-sb3/.installed ## train Stable-Baselines3's agents in the bandits and in Gymnasium: docs/sb3.md
 	@$(BIN)/python -m experiments.sb3 --python .venv-sb3/bin/python
+
+torture: $(INSTALLED) ## kill runs at random moments, damage files at random: docs/reliability.md
+	@$(BIN)/python -m experiments.reliability
 
 experiments: $(INSTALLED) ## the paper's experiments: measure what is missing (quick presets), write docs/experiments.md
 	@$(BIN)/python -m experiments --preset quick
