@@ -60,6 +60,11 @@ class LearningCurves:
         return self.returns[:, -1]
 
     @property
+    def late(self) -> np.ndarray:
+        """[S] mean return over the last quarter of the training: a level, where a single evaluation is a moment."""
+        return self.returns[:, self.steps > 0.75 * self.steps[-1]].mean(axis=1)
+
+    @property
     def area(self) -> np.ndarray:
         """[S] mean return over the training, the untrained agent left out."""
         return self.returns[:, 1:].mean(axis=1)
