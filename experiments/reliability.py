@@ -102,13 +102,18 @@ def torment(
 ) -> None:
     """Ends runs of one command until `killed` has as many entries as are wanted, and says of each what came of it."""
     whole = folder / f"{name}-whole"
-    started = time.monotonic()
     ended(command, whole)
-    seconds, wanted = time.monotonic() - started, fingerprint(whole)
+    wanted = fingerprint(whole)
+    shutil.rmtree(whole)
+    started = time.monotonic()
+    ended(command, whole)  # the second is not compiled again, as those that are killed are not
+    seconds = time.monotonic() - started
+    attempt = 0
     while len(killed) < options.kills:
         number = len(killed)
-        rng = random.Random(f"{options.seed} {name} {number}")
-        run, deaths = folder / f"{name}-{number}", []
+        rng = random.Random(f"{options.seed} {name} {number} {attempt}")
+        run, deaths = folder / f"{name}-{number}-{attempt}", []
+        attempt += 1
         # Several ends of one run, so that a resumed one is ended too.
         for _ in range(rng.randint(1, 3)):
             how = rng.choice(SIGNALS)
@@ -116,6 +121,8 @@ def torment(
             deaths.append([how.name, status])
             if status == 0:
                 break
+        if not any(status for _, status in deaths):
+            continue  # it had ended before its moment came
         status = ended(command, run)
         same = fingerprint(run) == wanted
         killed.append({"ends": deaths, "status": status, "same": same})
