@@ -7,7 +7,8 @@ learned (T the transition, I the initial state, C with a curriculum), the latent
 curriculum's shape. Run folders are under runs/ablations and are resumed.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,8 @@ from matplotlib.figure import Figure
 
 from experiments import searches
 from experiments.claims import OF_THE_WAY, Claim, of_the_way
-from experiments.harness import Experiment, Report, Save
+from experiments.harness import Experiment, Report
+from experiments.parts import InParts, Part
 from experiments.searches import ENOUGH, NONE
 from scb import plotting
 from scb.discovery import DiscoveryConfig
@@ -72,19 +74,20 @@ def config_of(environment: str, search: str, seed: int, plan: Mapping[str, Any])
     )
 
 
-def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None:
-    """A search at a time, seeds outermost, so that an interrupted run has all lines."""
-    found = report.setdefault("environments", {name: {} for name in ENVIRONMENTS})
+def parts(plan: Mapping[str, Any], report: dict[str, Any]) -> Iterator[Part]:
+    """Searches, seeds outermost, so that an interrupted run has all lines."""
     for seed in range(max(x["seeds"] for x in plan["environments"].values())):
         for environment in ENVIRONMENTS:
             for name in searches_of(environment):
-                curves = found[environment].setdefault(name, {})
-                if str(seed) in curves or seed >= plan["environments"][environment]["seeds"]:
+                if seed >= plan["environments"][environment]["seeds"]:
                     continue
                 folder = f"{plan['runs']}/{environment}/{name.replace(' | ', '-')}-{seed}"
                 config = config_of(environment, name, seed, plan)
-                curves[str(seed)] = searches.searched_curve(config, folder)
-                save()
+                searched = partial(searches.searched_curve, config, folder)
+                yield Part(("environments", environment, name, str(seed)), searched)
+
+
+measure = InParts(parts)
 
 
 def _never_reached(report: Mapping[str, Any], environment: str, search: str) -> bool:

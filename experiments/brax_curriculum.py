@@ -7,7 +7,8 @@ runs/brax_curriculum and are resumed.
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,8 @@ from matplotlib.figure import Figure
 
 from experiments import searches
 from experiments.claims import Claim
-from experiments.harness import Experiment, Report, Save
+from experiments.harness import Experiment, Report
+from experiments.parts import InParts, Part
 from experiments.searches import NONE, curriculum_of
 from scb import plotting
 from scb.curriculum import horizon
@@ -41,17 +43,17 @@ def config_of(shape: str, seed: int, plan: Mapping[str, Any]) -> DiscoveryConfig
     )
 
 
-def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None:
-    """A search at a time, first seeds first."""
-    found = report.setdefault("curves", {shape: {} for shape in plan["seeds"]})
+def parts(plan: Mapping[str, Any], report: dict[str, Any]) -> Iterator[Part]:
+    """Searches, first seeds first."""
     for seed in range(max(plan["seeds"].values())):
         for shape, number in plan["seeds"].items():
-            if seed >= number or str(seed) in found[shape]:
-                continue
-            found[shape][str(seed)] = searches.searched_curve(
-                config_of(shape, seed, plan), f"{plan['runs']}/{shape}-{seed}"
-            )
-            save()
+            if seed < number:
+                config, folder = config_of(shape, seed, plan), f"{plan['runs']}/{shape}-{seed}"
+                searched = partial(searches.searched_curve, config, folder)
+                yield Part(("curves", shape, str(seed)), searched)
+
+
+measure = InParts(parts)
 
 
 def finals(report: Mapping[str, Any]) -> dict[str, searches.Final]:

@@ -9,7 +9,7 @@ measured alone.
 """
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -20,7 +20,8 @@ from matplotlib.figure import Figure
 
 from experiments import zoo_table, zoo_table_page
 from experiments.claims import Claim
-from experiments.harness import Experiment, Preset, Report, Save, bandit_of, fill
+from experiments.harness import Experiment, Preset, Report, bandit_of
+from experiments.parts import InParts, Part
 from scb import measurement, plotting
 from scb.agents.spec import AgentSpec, bandit_agent, environment_agent
 from scb.environments.registry import environment_spec
@@ -57,10 +58,9 @@ def task(kind: str, environment: str, backend: str | None) -> str:
     return f"{place(environment, backend)}, {kind}"
 
 
-def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None:
-    """A learning curve at a time: those in bandits, then those in environments."""
-    bandits = report.setdefault("bandits", {})
-    environments = report.setdefault("environments", {})
+def parts(plan: Mapping[str, Any], report: dict[str, Any]) -> Iterator[Part]:
+    """Learning curves: those in bandits, then those in environments."""
+    bandits, _ = (report.setdefault(kind, {}) for kind in ("bandits", "environments"))
     published = plan["published"]
 
     def there(of: list[Any]) -> bool:
@@ -74,13 +74,16 @@ def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None
         bandits.pop(name, None)  # a part of its algorithms can't be shown
     measured = [x for x in plan["bandits"] if x not in left_out]
     for kind, environment, backend in measured:
-        in_bandit = partial(_in_bandit, kind, environment, backend, plan)
-        entry = bandits.setdefault(task(kind, environment, backend), {})
-        fill(entry, plan["bandit_algorithms"], in_bandit, save)
+        for algorithm in plan["bandit_algorithms"]:
+            curve = partial(_in_bandit, kind, environment, backend, plan, algorithm)
+            yield Part(("bandits", task(kind, environment, backend), algorithm), curve)
     for _, environment, backend in measured:
-        in_environment = partial(_in_environment, environment, backend, plan)
-        entry = environments.setdefault(place(environment, backend), {})
-        fill(entry, plan["environment_algorithms"], in_environment, save)
+        for algorithm in plan["environment_algorithms"]:
+            curve = partial(_in_environment, environment, backend, plan, algorithm)
+            yield Part(("environments", place(environment, backend), algorithm), curve)
+
+
+measure = InParts(parts)
 
 
 def _in_bandit(
@@ -119,7 +122,8 @@ def _curves(
     start = time.monotonic()
     agents = measurement.Agents.drawn_from(spec, REPORTING.start, number)
     size = {"points": plan["points"], "episodes": plan["episodes"]}
-    kept = Rows(plan.get("rows"))
+    folder = plan.get("rows")
+    kept = Rows(folder and folder / f"{train_in.name}, {spec.algorithm}.jsonl")
     known = len(kept.rows)
     rows = measurement.measure(spec, train_in, judge_in, agents, **size, rows=kept)
     # Of a measurement that was killed, those agents tell the time that it did not keep.

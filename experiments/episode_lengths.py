@@ -6,7 +6,8 @@ Searches of the parameterisation TI (initial state, transition, reward and termi
 with several limits of the episode's length, in run folders under runs/episode_lengths.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,8 @@ from matplotlib.figure import Figure
 
 from experiments import searches
 from experiments.claims import OF_THE_WAY, TENTH, Claim
-from experiments.harness import CLASSIC_CONTROL, Experiment, Report, Save, finite
+from experiments.harness import CLASSIC_CONTROL, Experiment, Report, finite
+from experiments.parts import InParts, Part
 from scb import plotting
 from scb.agents.spec import AgentSpec, algorithms_for, bandit_agent
 from scb.curriculum import paper_curriculum
@@ -45,25 +47,25 @@ def config_of(environment: str, limit: str, plan: Mapping[str, Any]) -> Discover
     )
 
 
-def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None:
-    """A limit of an environment at a time."""
-    found = report.setdefault("environments", {})
+def parts(plan: Mapping[str, Any], report: dict[str, Any]) -> Iterator[Part]:
+    """Limits of environments."""
     for environment in CLASSIC_CONTROL:
-        entry = found.setdefault(environment, {"returns": {}, "failed": {}})
         for limit in plan["limits"]:
-            if limit not in entry["returns"]:
-                _measure_limit(environment, limit, plan, entry)
-                save()
+            measured = partial(_of_limit, environment, limit, plan)
+            yield Part(("environments", environment), measured, (("returns", limit),))
 
 
-def _measure_limit(
-    environment: str, limit: str, plan: Mapping[str, Any], entry: dict[str, Any]
-) -> None:
+measure = InParts(parts)
 
+
+def _of_limit(environment: str, limit: str, plan: Mapping[str, Any]) -> dict[str, Any]:
     folder = f"{plan['runs']}/{environment}-{limit}"
     problem, outcome = searches.search(config_of(environment, limit, plan), folder)
     place = environment_spec(environment)
-    entry["random"], entry["limit"] = round(place.random_return(), 2), place.episode_limit
+    entry: dict[str, Any] = {
+        "random": round(place.random_return(), 2),
+        "limit": place.episode_limit,
+    }
     space = problem.place.env.action_space(problem.place.params)
     returns: dict[str, list[float]] = {}
     failed = 0
@@ -75,7 +77,7 @@ def _measure_limit(
         failed += number
         if limit == OWN:
             entry.setdefault("lengths", {})[algorithm] = binned(lengths)
-    entry["returns"][limit], entry["failed"][limit] = returns, failed
+    return {**entry, "returns": {limit: returns}, "failed": {limit: failed}}
 
 
 def returns_and_lengths(

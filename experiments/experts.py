@@ -4,7 +4,7 @@ python -m experiments.experts
 """
 
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict
 from functools import partial
 from typing import Any
@@ -15,7 +15,8 @@ from matplotlib.figure import Figure
 
 import scb
 from experiments.claims import Claim, of_the_way
-from experiments.harness import Experiment, Report, Save, fill
+from experiments.harness import Experiment, Report
+from experiments.parts import InParts, Part
 from scb import plotting
 from scb.agents.spec import environment_agent
 from scb.analysis.components import SACExpert, train_sac_expert
@@ -38,10 +39,13 @@ def train(environment: str, number: int, episodes: int) -> tuple[SACExpert, Any,
     return train_sac_expert(environment, env, env_params, key, number, episodes), env, env_params
 
 
-def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None:
-    """An environment at a time."""
-    found = report.setdefault("environments", {})
-    fill(found, plan["environments"], lambda name: _trained(name, plan), save)
+def parts(plan: Mapping[str, Any], report: dict[str, Any]) -> Iterator[Part]:
+    """Environments."""
+    for name in plan["environments"]:
+        yield Part(("environments", name), partial(_trained, name, plan))
+
+
+measure = InParts(parts)
 
 
 def _trained(environment: str, plan: Mapping[str, Any]) -> dict[str, Any]:

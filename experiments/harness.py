@@ -8,6 +8,7 @@ measured again, so that the same command continues an interrupted one.
 
 import importlib
 import json
+import shutil
 import sys
 import time
 import tomllib
@@ -23,6 +24,7 @@ from numpy.typing import NDArray
 
 from experiments import claims, rendering
 from experiments.claims import Claim, Judged
+from experiments.parts import InParts, Jobs, elsewhere
 from scb import plotting
 from scb.artefacts import machine_description, package_versions
 from scb.environments.registry import environment_spec, families
@@ -70,7 +72,8 @@ class Experiment:
       name: of the module, of the template and of the files that it writes.
       title: of its page.
       measure: (plan, report, save) fills the report in, and saves after every part. The plan is the
-        chosen preset's; without presets the options as they were given.
+        chosen preset's; without presets the options as they were given. One of parts, `InParts`, may be made
+        by jobs elsewhere.
       draw: report -> its figure, or {file name: figure} of several; None for none.
       paper: which figure or table of Liesen et al. (2024) it is; empty for none.
       claim: what the paper says, in a sentence.
@@ -158,6 +161,8 @@ class Experiment:
             ("options", self.options),
             ("files", Files, field(default=Files())),
         ]
+        if isinstance(self.measure, InParts):
+            parts.append(("jobs", Jobs, field(default=Jobs())))
         # Options that cannot be are refused as they are made.
         arguments: Any = tyro.cli(
             make_dataclass("Flags", parts),
@@ -166,7 +171,7 @@ class Experiment:
             prog=f"python -m experiments.{self.name}",
             description=self.description(),
         )
-        return self.run(arguments.options, arguments.files)
+        return self.run(arguments.options, arguments.files, getattr(arguments, "jobs", Jobs()))
 
     def description(self) -> str:
         """What --help says: of the paper's claim, or the module's docstring."""
@@ -174,7 +179,7 @@ class Experiment:
             return f"{self.title}. The paper ({self.paper}): {self.claim}"
         return importlib.import_module(f"experiments.{self.name}").__doc__ or ""
 
-    def run(self, options: Any, files: Files) -> int:
+    def run(self, options: Any, files: Files, jobs: Jobs = Jobs()) -> int:  # noqa: B008
         """Measures what is missing, and writes page and figure."""
         if not self.reports:
             self.measure(options, {}, lambda: None)
@@ -190,11 +195,11 @@ class Experiment:
             raise UserError(f"{out} is no report of {self.name}: choose another --out.")
         if not files.only_render:
             make_folder(out.parent)
-            self._measure(options, report, out)
+            self._measure(options, report, out, jobs)
         self.render(report, docs)
         return 0
 
-    def _measure(self, options: Any, report: dict[str, Any], out: Path) -> None:
+    def _measure(self, options: Any, report: dict[str, Any], out: Path, jobs: Jobs) -> None:
         plan: dict[str, Any] = {}
         fixed: dict[str, Any] = {}
         if self.presets:
@@ -226,13 +231,18 @@ class Experiment:
 
         further = {k: v for k, v in asdict(options).items() if k != "preset"}
         # Where a measurement may keep its agents until its part of the report is saved.
-        rows = out.with_suffix(".rows.jsonl")
-        self.measure({**plan, **further, "rows": rows} if self.presets else options, report, save)
+        rows = out.with_suffix(".rows")
+        given = {**plan, **further, "rows": rows} if self.presets else options
+        if isinstance(self.measure, InParts) and jobs.executor != "here":
+            kept = out.with_suffix(".parts")
+            elsewhere(self.measure.parts(given, report), report, save, jobs, kept)
+            shutil.rmtree(kept)
+        else:
+            self.measure(given, report, save)
         if self.presets:
             report["complete"] = True
         write_json(out, report)
-        for kept in (rows, rows.with_suffix(".json")):
-            kept.unlink(missing_ok=True)
+        shutil.rmtree(rows, ignore_errors=True)
 
     def render(self, report: Report, docs: Path) -> None:
         """Writes docs/NAME.md and docs/figures/NAME.png.
@@ -285,16 +295,6 @@ def read(path: Path, missing_is_new: bool = False, keys: Iterable[str] = ()) -> 
             f"{path} is no report of this command ({error}): measure first, or choose another --out."
         ) from error
     return report
-
-
-def fill(
-    part: dict[str, Any], names: Iterable[str], measured: Callable[[str], Any], save: Save
-) -> None:
-    """Measures what a part of the report lacks, by name, and saves after each."""
-    for name in names:
-        if name not in part:
-            part[name] = measured(name)
-            save()
 
 
 def bandit_of(environment: str) -> tuple[SyntheticBandit, str]:

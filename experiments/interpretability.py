@@ -5,7 +5,8 @@
 `scb explain NAME` shows the same of any bandit.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from typing import Any
 
 import jax.numpy as jnp
@@ -18,12 +19,11 @@ from experiments.harness import (
     CLASSIC_CONTROL,
     Experiment,
     Report,
-    Save,
     bandit_of,
-    fill,
     packed,
     unpacked,
 )
+from experiments.parts import InParts, Part
 from scb import plotting
 from scb.analysis import figures
 from scb.analysis.explain import explain
@@ -47,10 +47,13 @@ POINTS = 60  # of the grid of best actions, in either direction
 HARDLY = 0.1
 
 
-def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None:
-    """Everything of an environment at a time."""
-    found = report.setdefault("environments", {})
-    fill(found, CLASSIC_CONTROL, lambda name: _examine(name, plan), save)
+def parts(plan: Mapping[str, Any], report: dict[str, Any]) -> Iterator[Part]:
+    """Environments."""
+    for name in CLASSIC_CONTROL:
+        yield Part(("environments", name), partial(_examine, name, plan))
+
+
+measure = InParts(parts)
 
 
 def _examine(name: str, plan: Mapping[str, Any]) -> dict[str, Any]:

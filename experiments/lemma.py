@@ -9,8 +9,9 @@ nothing about states that it never shows, and does not choose among actions that
 tested is drawn at random among B's optima, ties included, and acts at random where B shows nothing.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,8 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from experiments.claims import Claim
-from experiments.harness import Experiment, Report, Save, fill
+from experiments.harness import Experiment, Report
+from experiments.parts import InParts, Part
 from scb import plotting
 
 Floats = NDArray[np.floating]
@@ -139,22 +141,27 @@ def regret(
     return float(best - min(found))
 
 
-def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None:
-    """Regrets of every construction with every set of contexts, over random MDPs."""
-    cells = {f"{c} | {x}": (c, x) for c in REWARDS for x in CONTEXTS}
-
-    def measured(name: str) -> dict[str, float]:
-        # The same MDPs for each, however many numbers their policies take.
-        regrets = []
-        for number in range(plan["mdps"]):
-            rng, rng_policies = np.random.default_rng([plan["seed"], number]).spawn(2)
-            states, actions = int(rng.integers(3, 30)), int(rng.integers(2, 6))
-            mdp = random_mdp(rng, states, actions)
-            regrets.append(regret(mdp, *cells[name], rng_policies, POLICIES))
-        return {"optimal": float(np.mean(np.asarray(regrets) < 1e-6)), "largest": max(regrets)}
-
-    fill(report.setdefault("regrets", {}), cells, measured, save)
+def parts(plan: Mapping[str, Any], report: dict[str, Any]) -> Iterator[Part]:
+    """Every construction with every set of contexts."""
     report["mdps"], report["policies"] = plan["mdps"], POLICIES
+    for construction in REWARDS:
+        for contexts in CONTEXTS:
+            path = ("regrets", f"{construction} | {contexts}")
+            yield Part(path, partial(_regrets, construction, contexts, plan))
+
+
+measure = InParts(parts)
+
+
+def _regrets(construction: str, contexts: str, plan: Mapping[str, Any]) -> dict[str, float]:
+    """Over random MDPs, the same for each, however many numbers their policies take."""
+    regrets = []
+    for number in range(plan["mdps"]):
+        rng, rng_policies = np.random.default_rng([plan["seed"], number]).spawn(2)
+        states, actions = int(rng.integers(3, 30)), int(rng.integers(2, 6))
+        mdp = random_mdp(rng, states, actions)
+        regrets.append(regret(mdp, construction, contexts, rng_policies, POLICIES))
+    return {"optimal": float(np.mean(np.asarray(regrets) < 1e-6)), "largest": max(regrets)}
 
 
 def claims(report: Report) -> list[Claim]:

@@ -7,7 +7,7 @@ are trained at a time, and --out is saved after each few: the same command goes 
 `--seeds` or `--objectives` adds to it.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -16,7 +16,8 @@ from typing import Any
 from matplotlib.figure import Figure
 
 from experiments.claims import DECIDING, Claim, of_agents
-from experiments.harness import Experiment, Report, Save, packed
+from experiments.harness import Experiment, Report, packed
+from experiments.parts import InParts, Part
 from lpo import figures
 from lpo.comparison import LearningCurves, compare, ppo_spec
 from lpo.full_size import as_comparison
@@ -51,35 +52,47 @@ class Options:
         at_least(1, self, "seeds", "together")
 
 
-def measure(options: Options, report: dict[str, Any], save: Save) -> None:
+def parts(options: Options, report: dict[str, Any]) -> Iterator[Part]:
     """A few seeds of every objective at a time, so that all have as many wherever it ends."""
-    objectives = {name: load_objective(name) for name in options.objectives}
+    for name in options.objectives:
+        load_objective(name)  # that nobody waits for a name that is none
     seeds = reporting(options.seeds)
     for environment in options.environments:
-        spec = ppo_spec(environment)
-        entry = report.setdefault("environments", {}).setdefault(environment, {"backend": BACKEND})
         for start in range(0, len(seeds), options.together):
-            for name, objective in objectives.items():
-                agents = entry.setdefault("agents", {}).setdefault(name, {})
-                missing = [
-                    s for s in seeds[start : start + options.together] if str(s) not in agents
-                ]
-                if not missing:
-                    continue
-                rows = Rows(options.runs / f"{environment}.rows.jsonl")
-                (found,) = compare(
-                    environment,
-                    [objective],
-                    missing,
-                    spec,
-                    BACKEND,
-                    diagnose=True,
-                    rows=rows,
-                    tell=print,
-                ).curves
-                entry |= {"steps": found.steps.tolist(), "episodes": found.episodes}
-                agents |= kept(found)
-                save()
+            for name in options.objectives:
+                there = _agents(report, environment, name)
+                few = [s for s in seeds[start : start + options.together] if str(s) not in there]
+                trained = partial(_trained, environment, name, few, options.runs)
+                names = tuple(("agents", name, str(seed)) for seed in few)
+                yield Part(("environments", environment), trained, names)
+
+
+measure = InParts(parts)
+
+
+def _agents(report: Report, environment: str, objective: str) -> Report:
+    entry = report.get("environments", {}).get(environment, {})
+    return dict(entry.get("agents", {}).get(objective, {}))
+
+
+def _trained(environment: str, objective: str, seeds: list[int], runs: Path) -> dict[str, Any]:
+    rows = Rows(runs / environment / f"{objective}-{seeds[0]}.rows.jsonl")
+    (found,) = compare(
+        environment,
+        [load_objective(objective)],
+        seeds,
+        ppo_spec(environment),
+        BACKEND,
+        diagnose=True,
+        rows=rows,
+        tell=print,
+    ).curves
+    return {
+        "backend": BACKEND,
+        "steps": found.steps.tolist(),
+        "episodes": found.episodes,
+        "agents": {objective: kept(found)},
+    }
 
 
 def kept(curves: LearningCurves) -> dict[str, dict[str, Any]]:

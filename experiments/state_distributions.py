@@ -5,7 +5,7 @@
 The experts are those of `experiments.experts`, trained again.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -16,8 +16,9 @@ from matplotlib.figure import Figure
 
 from experiments import experts
 from experiments.claims import Claim
-from experiments.harness import Experiment, Report, Save, bandit_of, fill, packed, unpacked
+from experiments.harness import Experiment, Report, bandit_of, packed, unpacked
 from experiments.interpretability import action_bar, draw_actions
+from experiments.parts import InParts, Part
 from scb import plotting
 from scb.agents.agent import flat_bounds
 from scb.analysis.components import ReplacedBandit, q_reward
@@ -39,10 +40,13 @@ MANY = 0.5  # of the contexts, where the verdict says so
 BANDIT_ROUGHNESS, EXPERT_ROUGHNESS = "bandit's roughness", "expert's roughness"
 
 
-def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None:
-    """An environment at a time."""
-    found = report.setdefault("environments", {})
-    fill(found, plan["environments"], lambda name: _examine(name, plan), save)
+def parts(plan: Mapping[str, Any], report: dict[str, Any]) -> Iterator[Part]:
+    """Environments."""
+    for name in plan["environments"]:
+        yield Part(("environments", name), partial(_examine, name, plan))
+
+
+measure = InParts(parts)
 
 
 def _examine(environment: str, plan: Mapping[str, Any]) -> dict[str, Any]:

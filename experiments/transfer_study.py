@@ -10,7 +10,7 @@ what --out holds already is not measured again, so the same command continues an
 page and figure from --out.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -21,10 +21,11 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from experiments.claims import FAILS, HOLDS, UNDECIDED, Claim, judge
-from experiments.harness import Experiment, Report, Save, plan_of
+from experiments.harness import Experiment, Report, plan_of
+from experiments.parts import InParts, Part
 from experiments.searches import meta_training, objective_of_run
 from lpo.comparison import compare, ppo_spec
-from lpo.objectives import load_objective
+from lpo.objectives import Objective, load_objective
 from scb.errors import UserError, unknown_name
 from scb.plotting import BLUE, GREY, VERMILLION, estimate_row
 from scb.rows import Rows
@@ -178,8 +179,8 @@ class Options:
     """for the run folders"""
 
 
-def measure(options: Options, report: dict[str, Any], save: Save) -> None:
-    """An objective at a time: learned, then judged everywhere."""
+def parts(options: Options, report: dict[str, Any]) -> Iterator[Part]:
+    """Objectives: each is learned, then judged everywhere."""
     for name in options.variations:
         if name not in VARIATIONS:
             raise unknown_name("variation", name, list(VARIATIONS))
@@ -189,46 +190,51 @@ def measure(options: Options, report: dict[str, Any], save: Save) -> None:
             f"the report is of other searches ({report['searches']}): choose another --out."
         )
     report |= {"searches": searches, "evaluations": [asdict(e) for e in EVALUATIONS]}
-    entries = report.setdefault("objectives", {})
-
-    for name in (*REFERENCES, *options.variations):
-        entry = entries.setdefault(name, {})
-        if name in REFERENCES:
-            objectives = {NO_SEARCH: load_objective(name)}
-        else:
-            objectives = {
-                str(seed): _learn(options, name, seed, entry) for seed in options.meta_seeds
-            }
-        for at in EVALUATIONS:
-            returns = entry.setdefault("returns", {}).setdefault(at.name, {})
-            missing = {seed: x for seed, x in objectives.items() if seed not in returns}
-            if not missing:
-                continue
-            found = compare(
-                at.environment,
-                list(missing.values()),
-                list(range(at.first_seed, at.first_seed + at.seeds)),
-                spec=ppo_spec(at.environment, at.steps, at.policy_output_scale),
-                backend=at.backend,
-                points=1,
-                rows=Rows(options.runs / f"{at.name}.rows.jsonl"),
-            )
-            for seed, curves in zip(missing, found.curves, strict=True):
-                returns[seed] = np.round(curves.final, 2).tolist()
-                print(f"{name} | {at.name} | {seed} | {estimate(curves.final)}", flush=True)
-            save()
+    seeds = [str(seed) for seed in options.meta_seeds]
+    for name, of in (
+        *((name, [NO_SEARCH]) for name in REFERENCES),
+        *((name, seeds) for name in options.variations),
+    ):
+        for seed in of:
+            names = tuple(("returns", at.name, seed) for at in EVALUATIONS)
+            yield Part(("objectives", name), partial(_judged, name, seed, options), names)
 
 
-def _learn(options: Options, name: str, seed: int, entry: dict[str, Any]) -> Any:
-    """A variation's objective of one search, and into the entry what it took."""
+measure = InParts(parts)
+
+
+def _judged(name: str, seed: str, options: Options) -> dict[str, Any]:
+    """What an objective earns, and of one that was learned what that took."""
+    if name in REFERENCES:
+        entry: dict[str, Any] = {}
+        objective = load_objective(name)
+    else:
+        objective, entry = _learned(name, int(seed), options)
+    returns = {}
+    for at in EVALUATIONS:
+        (curves,) = compare(
+            at.environment,
+            [objective],
+            list(range(at.first_seed, at.first_seed + at.seeds)),
+            spec=ppo_spec(at.environment, at.steps, at.policy_output_scale),
+            backend=at.backend,
+            points=1,
+            rows=Rows(options.runs / at.name / f"{objective.name}.rows.jsonl"),
+        ).curves
+        returns[at.name] = {seed: np.round(curves.final, 2).tolist()}
+        print(f"{name} | {at.name} | {seed} | {estimate(curves.final)}", flush=True)
+    return {**entry, "returns": returns}
+
+
+def _learned(name: str, seed: int, options: Options) -> tuple[Objective, dict[str, Any]]:
+    """A variation's objective of one search, and what that took."""
     settings = settings_of(name, seed, options.generations, options.population_size)
     objective = objective_of_run(settings, options.runs / f"{name.replace(' ', '-')}-{seed}")
-    entry["command"] = meta_training({**settings, "seed": 0}).command
     cost = objective.metadata["cost"]
-    entry["seconds"] = cost["seconds"]
+    entry = {"command": meta_training({**settings, "seed": 0}).command, "seconds": cost["seconds"]}
     if "generation" in cost:
-        entry.setdefault("stopped_at", {})[str(seed)] = cost["generation"]
-    return replace(objective, name=f"{name}-{seed}")
+        entry["stopped_at"] = {str(seed): cost["generation"]}
+    return replace(objective, name=f"{name}-{seed}"), entry
 
 
 EXPERIMENT = Experiment(

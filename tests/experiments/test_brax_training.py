@@ -43,7 +43,7 @@ def test_agents_are_followed_in_a_bandit_and_in_an_environment(tmp_path, monkeyp
         "environment_steps": 32,
         "episodes": 2,
         "points": 2,
-        "rows": tmp_path / "kept.jsonl",
+        "rows": tmp_path / "kept",
     }
     found, saved = {}, []
     experiment.measure(plan, found, lambda: saved.append(1))

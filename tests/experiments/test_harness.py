@@ -28,7 +28,7 @@ def counting(parts=("a", "b"), fail_at=None) -> Experiment:
     """An experiment that writes down how often each of its parts was measured."""
 
     def measure(plan, report, save):
-        plan["rows"].touch()  # where it may keep what no part of the report has yet
+        plan["rows"].mkdir(exist_ok=True)  # where it may keep what no part of the report has yet
         for name in parts:
             if name in report.setdefault("parts", {}):
                 continue
@@ -56,9 +56,9 @@ def test_an_interrupted_experiment_measures_only_what_is_missing(tmp_path):
     flags = ["--out", str(tmp_path / "c.json"), "--docs", str(tmp_path / "docs")]
     with pytest.raises(KeyboardInterrupt):
         counting(fail_at="b").main(flags)
-    assert (tmp_path / "c.rows.jsonl").exists()
+    assert (tmp_path / "c.rows").exists()
     assert counting().main(flags) == 0
-    assert not (tmp_path / "c.rows.jsonl").exists()
+    assert not (tmp_path / "c.rows").exists()
     report = json.loads((tmp_path / "c.json").read_text())
     assert report["parts"] == {"a": 1, "b": 1} and report["measured"] == 2
     written = (tmp_path / "docs" / "counting.md").read_text()

@@ -1,0 +1,230 @@
+"""Measurements whose parts can be made in any order: one after the other here, or as jobs of `submitit` elsewhere.
+
+    python -m experiments locomotion --seeds 10 --executor slurm --jobs 25 --hours 4 --slurm partition=cpu
+
+What a job finds is kept in a folder beside the report until it is in the report. The same command goes on where it
+was: a part that was found is not measured again, and a part that is being measured is waited for.
+"""
+
+import fcntl
+import hashlib
+import json
+import time
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import submitit
+from submitit.helpers import Checkpointable
+
+from scb.errors import UserError, at_least
+from scb.files import make_folder, write_json
+
+Keys = tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Part:
+    """A part of a measurement.
+
+    Attributes:
+      path: where it stands in the report.
+      measured: () -> what stands there, as JSON holds it; what is there already is kept.
+      names: (below the path) where it has several places; there is nothing to measure where the report has them all.
+    """
+
+    path: Keys
+    measured: Callable[[], Any]
+    names: tuple[Keys, ...] = ((),)
+
+    @property
+    def name(self) -> str:
+        """Of the part alone, with what tells it from others at its path."""
+        return ", ".join((*self.path, *(" ".join(keys) for keys in self.names if keys)))
+
+    def there(self, report: Mapping[str, Any]) -> bool:
+        """Whether the report has it."""
+        return all(_has(report, (*self.path, *keys)) for keys in self.names)
+
+    def add(self, found: Any, report: dict[str, Any]) -> None:
+        """Puts what was measured into the report."""
+        *parents, last = self.path
+        for key in parents:
+            report = report.setdefault(key, {})
+        if isinstance(found, dict) and last in report:
+            _merge(report[last], found)
+        else:
+            report[last] = found
+
+
+def _has(tree: Any, keys: Keys) -> bool:
+    for key in keys:
+        if not isinstance(tree, dict) or key not in tree:
+            return False
+        tree = tree[key]
+    return True
+
+
+def _merge(tree: dict[str, Any], other: Mapping[str, Any]) -> None:
+    for key, value in other.items():
+        if isinstance(value, dict) and isinstance(tree.get(key), dict):
+            _merge(tree[key], value)
+        else:
+            tree[key] = value
+
+
+@dataclass(frozen=True)
+class InParts:
+    """A measurement of parts, as an `Experiment` takes it.
+
+    Attributes:
+      parts: (plan, report) -> its parts, the first to be measured first; it may begin the report.
+    """
+
+    parts: Callable[[Any, dict[str, Any]], Iterable[Part]]
+
+    def __call__(self, plan: Any, report: dict[str, Any], save: Callable[[], None]) -> None:
+        """Measures what the report lacks, here, and saves after every part."""
+        for part in self.parts(plan, report):
+            if not part.there(report):
+                part.add(part.measured(), report)
+                save()
+
+
+@dataclass(frozen=True)
+class Jobs:
+    """Where an experiment's parts are measured."""
+
+    executor: Literal["here", "local", "slurm"] = "here"
+    """here: one after the other; local: as processes of this machine; slurm: as its jobs"""
+    jobs: int = 2
+    """that are submitted at a time"""
+    hours: float = 24.0
+    """that a job may take; slurm starts it again where it was not enough"""
+    cpus: int = 2
+    """of a job"""
+    gpus: int = 0
+    """of a job"""
+    slurm: tuple[str, ...] = ()
+    """what else sbatch is told, such as partition=long account=mine"""
+
+    def __post_init__(self) -> None:
+        at_least(1, self, "jobs", "cpus")
+        at_least(0, self, "gpus")
+        if not self.hours > 0:
+            raise UserError(f"--hours is {self.hours}: it must be more than 0.")
+        for word in self.slurm:
+            if not all(word.partition("=")):
+                raise UserError(f"--slurm {word!r}: give KEY=VALUE, as sbatch's --KEY=VALUE.")
+
+    def executor_in(self, folder: Path) -> submitit.Executor:
+        """That of submitit, whose files are in a folder.
+
+        Raises:
+          UserError: SLURM is not here.
+        """
+        kinds = {"local": submitit.LocalExecutor, "slurm": submitit.SlurmExecutor}
+        try:
+            made: submitit.Executor = kinds[self.executor](folder)
+        except RuntimeError as error:
+            raise UserError(
+                f"there is no SLURM here ({error}): choose --executor local."
+            ) from error
+        minutes = max(1, round(60 * self.hours))
+        if self.executor == "local":
+            made.update_parameters(timeout_min=minutes, gpus_per_node=self.gpus)
+        else:
+            further = dict(word.split("=", 1) for word in self.slurm)
+            made.update_parameters(
+                time=minutes,
+                cpus_per_task=self.cpus,
+                additional_parameters=further,
+                **({"gpus_per_node": self.gpus} if self.gpus else {}),
+            )
+        return made
+
+
+class Measurement(Checkpointable):
+    """A job: it measures one part and keeps what it found; where SLURM ends it early, it is submitted again."""
+
+    def __init__(self, part: Part, kept: Path) -> None:
+        """Kept is the file that what it finds goes to."""
+        self.part, self.kept = part, kept
+
+    def __call__(self) -> None:
+        """Measures, unless another job has or does."""
+        with self.kept.with_suffix(".lock").open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)  # until whoever has it has ended, however it ends
+            if self.kept.exists():
+                return
+            try:
+                write_json(self.kept, {"part": self.part.name, "found": self.part.measured()})
+            except Exception as error:
+                said = (str(error).strip() or type(error).__name__).splitlines()[0]
+                self.kept.with_suffix(".error").write_text(said)
+                raise
+
+
+def elsewhere(
+    parts: Iterable[Part],
+    report: dict[str, Any],
+    save: Callable[[], None],
+    jobs: Jobs,
+    folder: Path,
+    tell: Callable[[str], None] = print,
+    every: float = 1.0,
+) -> None:
+    """Measures what the report lacks as jobs, so many at a time, and saves as they end.
+
+    Args:
+      folder: for what jobs find and say; that of another start of the same command is continued.
+      every: seconds between two looks at the jobs.
+
+    Raises:
+      UserError: some of them failed; what the others found is in the report.
+    """
+    make_folder(folder)
+    kept = {part: folder / f"{_digest(part)}.json" for part in parts if not part.there(report)}
+
+    def taken(part: Part) -> bool:
+        if kept[part].exists():
+            part.add(json.loads(kept[part].read_text())["found"], report)
+            save()
+            kept[part].unlink()
+            tell(f"{part.name}: measured")
+        return part.there(report)
+
+    waiting = [part for part in kept if not taken(part)]
+    executor = jobs.executor_in(folder / "jobs") if waiting else None
+    running: dict[Part, submitit.Job[None]] = {}
+    failed: dict[Part, str] = {}
+    try:
+        while waiting or running:
+            while executor and waiting and len(running) < jobs.jobs:
+                part = waiting.pop(0)
+                kept[part].with_suffix(".error").unlink(missing_ok=True)
+                running[part] = executor.submit(Measurement(part, kept[part]))
+                tell(f"{part.name}: job {running[part].job_id}")
+            for part in [part for part, job in running.items() if job.done()]:
+                job = running.pop(part)
+                if not taken(part):
+                    said = kept[part].with_suffix(".error")
+                    failed[part] = said.read_text() if said.exists() else "its job left nothing"
+                    tell(f"{part.name}: failed, job {job.job_id} ({failed[part]})")
+            if running:
+                time.sleep(every)
+    except BaseException:
+        for job in running.values():
+            job.cancel()
+        raise
+    if failed:
+        part, reason = next(iter(failed.items()))
+        raise UserError(
+            f"{len(failed)} of {len(kept)} parts were not measured, {part.name} among them ({reason.rstrip('.')}): "
+            f"the .err files in {folder / 'jobs'} say more, and the same command tries again."
+        )
+
+
+def _digest(part: Part) -> str:
+    return hashlib.sha256(part.name.encode()).hexdigest()[:16]
