@@ -35,7 +35,7 @@ from lpo.commands import MetaTrain
 from scb.commands import Discover
 from scb.environments import zoo
 from scb.environments.registry import environment_spec
-from scb.errors import UserError, at_least
+from scb.errors import UserError, at_least, one_of
 from scb.gymnasium import SyntheticEnv
 from scb.rows import Rows
 from scb.runs import config_dict
@@ -67,6 +67,8 @@ class Options:
 
     kills: int = 100
     """of each command"""
+    commands: tuple[str, ...] = tuple(COMMANDS)
+    """that are killed"""
     mutations: int = 10_000
     """of all kinds together"""
     seed: int = 0
@@ -74,13 +76,16 @@ class Options:
 
     def __post_init__(self) -> None:
         at_least(0, self, "kills", "mutations", "seed")
+        for name in self.commands:
+            one_of("command", name, COMMANDS)
 
 
 def measure(options: Options, report: dict[str, Any], save: Save) -> None:
     """Kills first; what a report holds already is not done again."""
     report["seed"] = options.seed
     with tempfile.TemporaryDirectory() as folder:
-        for name, command in COMMANDS.items():
+        for name in options.commands:
+            command = COMMANDS[name]
             killed = report.setdefault("kills", {}).setdefault(name, [])
             if len(killed) < options.kills:
                 torment(Path(folder), name, command, options, killed, save)
