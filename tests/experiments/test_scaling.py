@@ -1,0 +1,48 @@
+"""Several processes are started, timed and put into a table, and what fails is told."""
+
+import pytest
+
+from experiments import scaling
+from scb.errors import UserError
+
+
+def test_processes_gather_together_and_the_first_says_how_long_it_took():
+    assert 0 < scaling._gathering(2, scaling.Options(candidates=4)) < 1000
+
+
+def test_a_process_that_fails_is_told():
+    with pytest.raises(UserError, match="a process of 1 failed: ValueError: no"):
+        scaling.together(1, ["raise ValueError('no')"])
+
+
+def test_drawing_and_learning_are_timed_for_both_kinds():
+    for kind in ("objective", "bandit"):
+        found = scaling._strategy(kind, 4)
+        assert found["parameters"] > 100 and found["milliseconds"] > 0
+
+
+def report(gathering):
+    times = {str(n): {"parameters": 10, "milliseconds": n / 1000} for n in scaling.POPULATIONS}
+    return {
+        "candidates": 16,
+        "devices": 1000,
+        "machine": {"cores": 2, "processor": "one"},
+        "versions": {"jax": "1"},
+        "generations": {"1": [2.0, 2.0, 2.2], "2": [2.5, 2.5, 2.5], "4": [4.0, 4.0, 4.0]},
+        "gathering": gathering,
+        "strategy": {"objective": times, "bandit": times},
+    }
+
+
+def test_the_page_says_what_a_core_is_worth_and_from_where_gathering_costs():
+    # 1 ms for each process: a twentieth of 2 s from 100 processes on.
+    page = scaling.EXPERIMENT.page(report({"2": 2.0, "4": 4.0}))
+    assert "2 times the candidates in 1.25 times the seconds" in page
+    assert "5 % of a generation from 100 processes on, and 50 % with 1000" in page
+    assert "| 4 | 64 | 4.00 | 4.00, 4.00 | 100 % | 4.00 |" in page
+    assert "at no number of processes" in scaling.EXPERIMENT.page(report({"2": 2.0, "4": 2.0}))
+
+
+def test_processes_that_cannot_be_are_refused(capsys):
+    assert scaling.EXPERIMENT.main(["--processes", "0"]) == 2
+    assert "from 1 on" in capsys.readouterr().err
