@@ -99,7 +99,7 @@ def _run(
 
 
 def _commands() -> dict[str, Any]:
-    from scb import commands
+    from scb import commands, listing
     from scb.analysis.explain import explain_command
     from scb.importer import import_published_command
 
@@ -107,7 +107,7 @@ def _commands() -> dict[str, Any]:
         "discover": commands.Discover,
         "train": commands.Train,
         "explain": explain_command,
-        "list": commands.list_command,
+        "list": listing.list_command,
         "import-published": import_published_command,
     }
 

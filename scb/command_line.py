@@ -16,6 +16,7 @@ import tyro
 from tyro.constructors import PrimitiveConstructorSpec
 
 from scb import processes
+from scb.artefacts import package_versions
 from scb.errors import UserError, one_of
 from scb.rows import Rows
 from scb.runs import Run, config_dict, read_config
@@ -227,7 +228,11 @@ def call(
     """Runs the command that the arguments name, of functions and LongRuns by name."""
     name = arguments[0] if arguments else ""
     command = commands.get(name)
-    if command is None:
+    if name == "--version":
+        versions = package_versions()
+        beside = ", ".join(f"{k} {v}" for k, v in versions.items() if k != "lpo")
+        print(f"{program} {versions['lpo']} ({beside})")
+    elif command is None:
         tyro.extras.subcommand_cli_from_dict(
             dict(commands),
             prog=program,

@@ -8,15 +8,14 @@ from typing import Annotated, Any
 
 import numpy as np
 import tyro
-from rich.table import Column, Table
 
 from scb import processes
-from scb.agents.spec import algorithms_for, bandit_agent
+from scb.agents.spec import bandit_agent
 from scb.command_line import LongRun, Measuring, Output
 from scb.console import console
 from scb.discovery import BanditDiscovery, DiscoveryConfig
 from scb.environments.registry import environment_spec
-from scb.environments.zoo import bandit_metadata, open_synthetic, save_bandit, zoo_names
+from scb.environments.zoo import bandit_metadata, open_synthetic, save_bandit
 from scb.errors import at_least
 from scb.evolution import EvolutionConfig
 from scb.judgement import evaluation_place, judge, judge_all
@@ -245,52 +244,3 @@ class Train(Measuring):
         (returns,) = by_actions.values()
         print(f"returns on {judge_in.name}: {' '.join(f'{r:.0f}' for r in np.sort(returns))}")
         print(f"IQM: {estimate(returns)}")
-
-
-def list_command() -> None:
-    """List the bandits that ship with the library, with what they are worth and what they cost."""
-    algorithms = [name.upper() for name in algorithms_for()]
-    table = Table(
-        # In a narrow terminal names are broken, and numbers are not.
-        Column("bandit", overflow="fold"),
-        *(Column(name, min_width=8) for name in algorithms),
-        Column("minutes", min_width=7),
-        title="IQM of 20 agents with drawn hyperparameters (Brax: the paper's fixed ones) in the environment: most "
-        "likely actions (sampled)",
-    )
-    for name in zoo_names():
-        metadata = bandit_metadata(name)
-        cells = []
-        for algorithm in algorithms:
-            result = metadata["results"].get(algorithm)
-            cells.append("" if result is None else _cell(result))
-        minutes = f"{_seconds(metadata['cost'], metadata['config'].get('started_from')) / 60:.0f}"
-        table.add_row(name, *cells, minutes)
-    console().print(table)
-    for name in zoo_names():
-        metadata = bandit_metadata(name)
-        print(f"{name} ({found(metadata)}): {metadata['command']}")
-
-
-def found(metadata: Mapping[str, Any]) -> str:
-    """How a bandit was: fitted to an expert, with or without aggregation, or from random weights; evolved or not."""
-    discovery = metadata["config"]["discovery"]
-    earlier = metadata["config"].get("started_from")
-    start = "random weights" if discovery["init"] == "random" else "fitted"
-    if start == "fitted" and discovery["warm_start"].get("aggregation_rounds"):
-        start = "fitted with aggregation"
-    evolved = earlier or metadata["cost"].get(
-        "generation", discovery["evolution"]["num_generations"]
-    )
-    return f"{start}, evolved" if evolved else start
-
-
-def _seconds(cost: Mapping[str, Any], started_from: Mapping[str, Any] | None) -> float:
-    """Of a search, the warm start before it, and the searches that it goes on from."""
-    before = _seconds(started_from["cost"], started_from["started_from"]) if started_from else 0.0
-    return float(cost["seconds"] + cost.get("warm_start", {}).get("seconds", 0.0) + before)
-
-
-def _cell(result: Mapping[str, Any]) -> str:
-    mode, sampled = (result[x]["value"] for x in ("mode_actions", "sampled_actions"))
-    return f"{mode:.1f} ({sampled:.1f})" if abs(mode - sampled) > 0.05 else f"{mode:.1f}"

@@ -769,3 +769,20 @@ def test_inner_agents_hyperparameters_are_read_from_one_line(one_sentence):
         with pytest.raises(UserError) as error:
             config(text)
         assert message in one_sentence(str(error.value))
+
+
+def test_objectives_are_listed_with_what_ppo_earns_with_them(capsys):
+    assert cli.main(["list"]) == 0
+    rows = [line.strip(" │").split("│") for line in capsys.readouterr().out.splitlines()]
+    table = {row[0].strip(): [cell.strip() for cell in row[1:]] for row in rows}
+    # README's figures.
+    assert table["ppo"][:3] == ["-250", "-950", "nothing: a formula"]
+    assert table["lpo-pendulum"] == ["-177", "-231", "Synthetic-Pendulum-v1", "3"]
+    assert cli.main(["list", "--json"]) == 0
+    listed = {x["name"]: x for x in json.loads(capsys.readouterr().out)}
+    assert listed.keys() == {"ppo", "dpo", "none", *zoo_names()}
+    entry = listed["lpo-multi"]
+    metadata = load_objective("lpo-multi").metadata
+    assert entry["command"] == metadata["command"]
+    assert entry["results"]["Pendulum-v1"]["n"] == 20 and entry["certificate"]["holds"]
+    assert entry["learned_on"] == ["Synthetic-Pendulum-v1", "Synthetic-CartPole-v1"]

@@ -1,0 +1,93 @@
+"""What ships with the library, as a table or as JSON: `scb list`."""
+
+import json as json_format
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from rich.table import Column, Table
+
+from scb.agents.spec import algorithms_for
+from scb.console import console
+from scb.environments.registry import environment_spec
+from scb.environments.zoo import bandit_metadata, zoo_names
+
+
+def list_command(json: bool = False) -> None:
+    """List the bandits that ship with the library: what they are worth, how they were found, and what that cost.
+
+    Args:
+      json: print JSON, with intervals and the command that found each.
+    """
+    bandits = [entry(name) for name in zoo_names()]
+    if json:
+        print(json_format.dumps(bandits, indent=2))
+        return
+    algorithms = [name.upper() for name in algorithms_for()]
+    print_table(
+        "IQM of 20 agents with drawn hyperparameters (Brax: the paper's fixed ones) in the environment: most likely "
+        "actions (sampled). --json has intervals and commands.",
+        ("bandit", *algorithms, "found", "minutes"),
+        [
+            (
+                bandit["name"],
+                *(_cell(bandit["results"].get(name)) for name in algorithms),
+                bandit["found"],
+                f"{bandit['minutes']:.0f}",
+            )
+            for bandit in bandits
+        ],
+    )
+
+
+def entry(name: str) -> dict[str, Any]:
+    """What `scb list --json` says of a bandit."""
+    metadata = bandit_metadata(name)
+    seconds = _seconds(metadata["cost"], metadata["config"].get("started_from"))
+    return {
+        "name": name,
+        "environment": environment_spec(name).evaluation_environment,
+        "found": found(metadata),
+        "minutes": round(seconds / 60, 2),
+        "results": metadata["results"],
+        "command": metadata["command"],
+    }
+
+
+def print_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+    """A table on standard output; in a narrow terminal names are broken, and numbers are not."""
+    first, *others = columns
+    wide = [max(map(len, column)) for column in zip(*rows, strict=True)][1:]
+    table = Table(
+        Column(first, overflow="fold"),
+        *(Column(name, min_width=min(size, 9)) for name, size in zip(others, wide, strict=True)),
+        title=title,
+    )
+    for row in rows:
+        table.add_row(*row)
+    console().print(table)
+
+
+def found(metadata: Mapping[str, Any]) -> str:
+    """How a bandit was: fitted to an expert, with or without aggregation, or from random weights; evolved or not."""
+    discovery = metadata["config"]["discovery"]
+    earlier = metadata["config"].get("started_from")
+    start = "random weights" if discovery["init"] == "random" else "fitted"
+    if start == "fitted" and discovery["warm_start"].get("aggregation_rounds"):
+        start = "fitted with aggregation"
+    evolved = earlier or metadata["cost"].get(
+        "generation", discovery["evolution"]["num_generations"]
+    )
+    return f"{start}, evolved" if evolved else start
+
+
+def _seconds(cost: Mapping[str, Any], started_from: Mapping[str, Any] | None) -> float:
+    """Of a search, the warm start before it, and the searches that it goes on from."""
+    before = _seconds(started_from["cost"], started_from["started_from"]) if started_from else 0.0
+    return float(cost["seconds"] + cost.get("warm_start", {}).get("seconds", 0.0) + before)
+
+
+def _cell(result: Mapping[str, Any] | None) -> str:
+    if result is None:
+        return ""
+    mode, sampled = (result[x]["value"] for x in ("mode_actions", "sampled_actions"))
+    return f"{mode:.1f} ({sampled:.1f})" if abs(mode - sampled) > 0.05 else f"{mode:.1f}"
