@@ -239,6 +239,7 @@ def call(
             description=description,
             args=list(arguments),
             sort_subcommands=False,
+            config=_STYLE,
         )
     elif isinstance(command, type) and issubclass(command, LongRun):
         others = flags_given(arguments[1:], "coordinator", "processes", "process")
