@@ -10,7 +10,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 PYTEST := $(BIN)/python -m pytest -q -n auto --dist loadfile
 
 .DEFAULT_GOAL := help
-.PHONY: help run test test-all lint format bench sb3 torture experiments clean
+.PHONY: help run test test-all lint format bench sb3 torture experiments docs clean
 
 help: ## list the commands
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-11s %s\n", $$1, $$2 }' Makefile
@@ -46,6 +46,10 @@ torture: $(INSTALLED) ## kill runs at random moments, damage files at random: do
 experiments: $(INSTALLED) ## the paper's experiments: measure what is missing (quick presets), write docs/experiments.md
 	@$(BIN)/python -m experiments --preset quick
 
+docs: $(INSTALLED) .venv-docs/.installed ## the documentation's site, in site/; its pages as pictures in site/screenshots where Chromium is
+	@.venv-docs/bin/zensical build --strict --clean
+	@$(BIN)/python -m tests.site
+
 # rejax needs a gymnax that this project doesn't run on, so it gets an environment of its own.
 .venv-rejax/.installed: $(INSTALLED)
 	@echo "Installing rejax into .venv-rejax ..."
@@ -58,6 +62,12 @@ experiments: $(INSTALLED) ## the paper's experiments: measure what is missing (q
 	@echo "Installing Stable-Baselines3 and PyTorch into .venv-sb3 ..."
 	@$(PYTHON) -m venv --clear .venv-sb3
 	@.venv-sb3/bin/python -m pip --disable-pip-version-check --quiet install -c constraints.txt -e . stable-baselines3==2.9.2 torch==2.15.0
+	@touch $@
+
+.venv-docs/.installed: pyproject.toml
+	@echo "Installing what builds the site into .venv-docs ..."
+	@$(PYTHON) -m venv --clear .venv-docs
+	@.venv-docs/bin/python -m pip --disable-pip-version-check --quiet install zensical==0.0.73 mkdocstrings==1.0.8 mkdocstrings-python==2.0.11
 	@touch $@
 
 clean: ## remove caches and build outputs; .venv and runs stay

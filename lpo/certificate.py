@@ -27,9 +27,11 @@ class Certificate:
     Attributes:
       holds: finite and non-negative everywhere, and value and gradient zero at ratio 1.
       minimum: smallest penalty on the grid.
-      value_at_one, gradient_at_one: largest |f| and |df/dr| at ratio 1 over all advantages.
-      slope_at_0_001, slope_at_0_01: largest |df/dr| at |r - 1| = 0.001 and 0.01. Not a condition,
-        but a drift whose slope jumps just outside its dead zone is one in name only: see `stalls`.
+      value_at_one: largest |f| at ratio 1 over all advantages.
+      gradient_at_one: largest |df/dr| there.
+      slope_at_0_001: largest |df/dr| at |r - 1| = 0.001. Not a condition, but a drift whose slope jumps
+        just outside its dead zone is one in name only: see `stalls`.
+      slope_at_0_01: the same at 0.01.
       kink: how much the penalty rises per unit of |log-ratio| around ratio 1 (at |r - 1| = 0.01), the
         mean over standard normal advantages. No condition either: but where the advantages of a
         minibatch correlate less than that with every direction that the policy could take, an update

@@ -29,14 +29,15 @@ class LearningCurves:
     """Returns of agents over their training.
 
     Attributes:
-      environment, backend: where; the backend is None outside Brax.
+      environment: where.
+      backend: of Brax's physics; None outside Brax.
       objective: with which.
       steps: [P] environment steps at each evaluation, the first 0.
       returns: [S, P] mean return of `episodes` episodes, per seed.
       mode_actions: whether evaluation took the most likely actions or sampled ones.
       policy_output_scale: factor on the policy's last layer at initialisation.
-      lengths, speeds: [S, P] mean steps of those episodes, and their mean forward velocity, NaN where the
-        environment has none; None of curves that were made elsewhere.
+      lengths: [S, P] mean steps of those episodes; None of curves that were made elsewhere.
+      speeds: [S, P] their mean forward velocity, NaN where the environment has none; None likewise.
       diagnosis: {name: [S, P]} of what an iteration does to the policy (`scb.agents.ppo.PPO.diagnose`); None where
         it was not asked for.
     """
@@ -178,7 +179,9 @@ def compare(
       points: about how many evaluations along the training, the untrained agent not counted.
       episodes: of each evaluation.
       mode_actions: evaluate the most likely actions rather than sampled ones.
-      diagnose, rows, tell: as `scb.measurement.measure` takes them; rows that are there are not measured again.
+      diagnose: whether curves say also what an iteration does to the policy (`scb.PPO.diagnose`).
+      rows: where results are kept, and found, so that they are not measured again; None for memory.
+      tell: takes a line when some agents are done.
 
     Raises:
       UserError: two objectives bear one name, by which their results are told apart.

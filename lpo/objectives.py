@@ -96,7 +96,8 @@ def save_objective(
 
     Args:
       path: NAME.npz; NAME.json is written beside it.
-      drift, parameters: the drift.
+      drift: any member of the contract.
+      parameters: its own.
       metadata: config (of the meta-training), seeds, results, cost, command.
     """
     told = drift.with_parameters(parameters)

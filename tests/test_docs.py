@@ -8,6 +8,7 @@ import pytest
 import yaml
 
 from experiments import rendering
+from tests.site import public_names
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -43,6 +44,11 @@ def test_every_page_of_the_documentation_is_in_its_navigation():
 
     listed = files(yaml.safe_load((ROOT / "mkdocs.yml").read_text())["nav"])
     assert sorted(listed) == sorted(page.name for page in DOCS.glob("*.md"))
+
+
+def test_the_reference_has_every_public_name():
+    for page, name in public_names():
+        assert f"\n::: {name}\n" in (DOCS / f"{page}.md").read_text(), name
 
 
 def read(name):

@@ -31,7 +31,8 @@ class AgentConfig(ABC):
     Attributes:
       num_envs: environments that step side by side.
       total_steps: environment steps of the whole training, rounded up to whole iterations.
-      hidden_sizes, activation: of all networks, which share nothing.
+      hidden_sizes: of all networks, which share nothing.
+      activation: between their layers.
       normalize_observations: by running mean and variance, frozen with the agent for evaluation.
     """
 
@@ -183,9 +184,9 @@ class Agent(ABC):
         """Episodes of the frozen agent, in its own environment or in another of the same shapes.
 
         Args:
-          env, env_params: where the episodes are; None for the agent's environment and for the
-            environment's default parameters. In another, the agent's actions are scaled to the bounds of
-            its own environment with its default parameters.
+          env: where the episodes are; None for the agent's environment. In another, the agent's actions are
+            scaled to the bounds of its own environment with its default parameters.
+          env_params: None for the environment's default parameters.
         """
         env = self.env if env is None else env
         env_params = env.default_params if env_params is None else env_params

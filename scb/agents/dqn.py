@@ -42,8 +42,9 @@ class DQNHyperparameters:
     Attributes:
       double: 1.0 to pick the next action by the network and judge it by the target (double
         Q-learning), 0.0 to do both by the target.
-      epsilon_start, epsilon_end, epsilon_decay: probability of a random action, falling linearly
-        over that fraction of the training.
+      epsilon_start: probability of a random action at first.
+      epsilon_end: what it falls to, linearly.
+      epsilon_decay: fraction of the training in which it does.
     """
 
     learning_rate: ArrayLike = 5e-3

@@ -29,13 +29,13 @@ class OffPolicyConfig(AgentConfig):
 
     Attributes:
       num_envs: environments that step side by side between gradient steps.
-      buffer_size, prefill: transitions that the replay buffer holds, and random ones that it starts
-        with.
+      buffer_size: transitions that the replay buffer holds.
+      prefill: random ones that it starts with.
       prefill_hold: steps for which each of those random actions is held, so that they lead somewhere
         (Dabney et al., 2021, "Temporally-extended epsilon-greedy exploration"); without effect in
         one-step environments.
-      batch_size, gradient_steps: transitions of a gradient step, and gradient steps after each step
-        of the environments.
+      batch_size: transitions of a gradient step.
+      gradient_steps: after each step of the environments.
       total_steps: as for all agents, the prefill included.
     """
 

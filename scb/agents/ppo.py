@@ -72,9 +72,11 @@ class PPOConfig(AgentConfig):
     """Defaults are the paper's inner loop.
 
     Attributes:
-      num_envs, num_steps: a batch is num_envs * num_steps transitions (on a bandit: that many
-        contexts at once).
-      num_epochs, num_minibatches: passes over a batch, and equal parts that it is cut into.
+      num_envs: environments that step side by side.
+      num_steps: of each of them, between updates: a batch is num_envs * num_steps transitions (on a bandit
+        that many contexts at once).
+      num_epochs: passes over a batch.
+      num_minibatches: equal parts that it is cut into.
       anneal_learning_rate: linearly to zero over the training.
     """
 

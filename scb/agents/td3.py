@@ -51,7 +51,8 @@ class TD3Hyperparameters:
       polyak: share of the target networks that an update keeps.
       exploration_noise: standard deviation of the noise on actions that gather experience, in units
         of half the action space's width.
-      target_noise, target_noise_clip: of the noise on the next action in the target, likewise.
+      target_noise: of the noise on the next action in the target, likewise.
+      target_noise_clip: what that noise is clipped to, likewise.
     """
 
     learning_rate: ArrayLike = 5e-3

@@ -84,9 +84,9 @@ class SyntheticMDP(SyntheticEnvironment[MDPState, MDPParams]):
     termination, and the step ends where it began: such a "TI" is the bandit of the same weights.
 
     Args:
-      observation_size, action_space, weights, name: as of `SyntheticEnvironment`.
+      observation_size: as of `SyntheticEnvironment`, like the action space, the weights and the name.
       config: parameterisation and maximum episode length too.
-      env, env_params: the evaluation environment, in whose start states a "T" starts; None for a
+      env: the evaluation environment, with its parameters, in whose start states a "T" starts; None for a
         "TI", which has its own. It starts where the environment's automatic reset does: for Brax, in
         a pool of states (see `BraxEnvironment`).
 
