@@ -20,6 +20,7 @@ from scb.statistics import Estimate, iqm, normalized_score
 
 # Resampling is over seeds within environments, on [objectives, environments, seeds].
 RESAMPLES = 2000
+TOGETHER = 100  # resamples at a time, which bounds memory
 BEST_HERE = "the best objective here"
 
 
@@ -67,7 +68,7 @@ class SuiteScores:
 
     def _estimates(self, times_reference: float) -> list[Estimate]:
         def aggregate(runs: np.ndarray) -> np.ndarray:
-            return np.asarray(iqm(self._scaled(runs).reshape(len(runs), -1), axis=1))
+            return iqm(self._scaled(runs).reshape(*runs.shape[:2], -1), axis=-1)
 
         found = _with_resamples(self.scores, aggregate, RESAMPLES)
         return _intervals(found - times_reference * found[:, :1], self.scores[0])
@@ -75,9 +76,9 @@ class SuiteScores:
     def _scaled(self, runs: np.ndarray) -> np.ndarray:
         """Runs, where the best objective's are 1 by the best of these: which one that is is drawn with the seeds."""
         own = np.array([source == BEST_HERE for source in self.sources])
-        best = iqm(runs, axis=2).max(axis=0)
+        best = iqm(runs, axis=-1).max(axis=1)
         # Where none of a resample beats random actions, the scale of all runs stays.
-        return runs / np.where(own & (best > 0), best, 1.0)[:, None]
+        return runs / np.where(own & (best > 0), best, 1.0)[:, None, :, None]
 
     def profile(self, thresholds: np.ndarray) -> list[list[Estimate]]:
         """Performance profiles: the share of runs above each threshold, environments weighted alike.
@@ -90,7 +91,7 @@ class SuiteScores:
         """
 
         def share(runs: np.ndarray) -> np.ndarray:
-            return np.mean(self._scaled(runs)[..., None] > thresholds, axis=(1, 2))
+            return np.mean(self._scaled(runs)[..., None] > thresholds, axis=(2, 3))
 
         found = _with_resamples(self.scores, share, RESAMPLES // 4)
         return [_intervals(found[:, i], self.scores[0]) for i in range(len(self.objectives))]
@@ -117,12 +118,17 @@ def _with_resamples(
 ) -> np.ndarray:
     """[1 + number, ...] a statistic of the scores, and of as many with seeds drawn anew within every environment.
 
-    They are drawn alike for all objectives.
+    They are drawn alike for all objectives. The statistic takes [N, objectives, environments, seeds], several
+    at once.
     """
-    _, environments, seeds = scores.shape[:3]
+    _, environments, seeds = scores.shape
     generator, every = np.random.default_rng(0), np.arange(environments)[:, None]
-    picked = (generator.integers(0, seeds, (environments, seeds)) for _ in range(number))
-    return np.stack([statistic(scores), *(statistic(scores[:, every, p]) for p in picked)])
+    found = [statistic(scores[None])]
+    for start in range(0, number, TOGETHER):
+        shape = (min(TOGETHER, number - start), environments, seeds)
+        picked = generator.integers(0, seeds, shape)
+        found.append(statistic(np.swapaxes(scores[:, every, picked], 0, 1)))
+    return np.concatenate(found)
 
 
 def _intervals(found: np.ndarray, runs: np.ndarray) -> list[Estimate]:

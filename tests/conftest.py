@@ -14,7 +14,7 @@ os.environ.setdefault("JAX_NUM_CPU_DEVICES", "2")
 # Tests compile more than they compute. Without the compiler's optimisations, without MLIR between XLA
 # and LLVM, and with one module a program, compiling takes a quarter of the time. XLA ends a process
 # at a flag that it does not know, and only the first of these is a documented one.
-_flags = {"xla_backend_optimization_level": "0"}
+_flags = {"xla_backend_optimization_level": "0", "xla_llvm_disable_expensive_passes": "true"}
 if version("jaxlib").startswith("0.10."):
     _flags |= {"xla_cpu_use_fusion_emitters": "false", "xla_cpu_parallel_codegen_split_count": "1"}
 _given = os.environ.get("XLA_FLAGS", "")

@@ -61,6 +61,7 @@ def test_a_search_is_the_papers_recipe_with_one_thing_changed():
     )
 
 
+@pytest.mark.slow
 def test_transitions_alone_do_not_reach_the_goal_of_mountain_car(
     tmp_path, monkeypatch, small_agents
 ):

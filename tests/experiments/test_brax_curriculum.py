@@ -42,6 +42,7 @@ def test_a_curriculum_is_the_papers_in_another_shape():
     )
 
 
+@pytest.mark.slow
 def test_a_search_with_a_curriculum_is_judged_over_whole_episodes(
     tmp_path, monkeypatch, small_agents
 ):

@@ -53,6 +53,7 @@ def test_scores_are_between_the_random_policy_and_each_expert():
     )
 
 
+@pytest.mark.slow
 def test_a_run_goes_on_with_the_expert_that_it_was_at(monkeypatch, small_agents):
     chosen = ((CLONING, SYNTHETIC), (BANDIT, EXPERT))
     monkeypatch.setattr(experiment, "REPLACED", chosen)

@@ -38,6 +38,7 @@ def test_lengths_are_counted_once_each():
     assert counts == {"1": 2, "2": 1, "3 to 5": 1, "6 to 10": 0, "11 to 50": 1, "more": 1}
 
 
+@pytest.mark.slow
 def test_a_limits_search_is_judged_and_its_episodes_are_counted(
     tmp_path, monkeypatch, small_agents
 ):

@@ -102,6 +102,7 @@ def test_every_algorithm_meets_every_network():
     assert len(agents) == 4 * 3 + 2 and f"td3, {SWISH}" in agents
 
 
+@pytest.mark.slow
 def test_agents_from_a_bandit_and_from_the_environment(tmp_path, monkeypatch, small_agents):
     monkeypatch.setattr(generality, "SOURCES", (ZOO, ENVIRONMENT))
     kinds = {"ppo", f"ppo, {WIDE}", EVOLVED, OPTIMAL}

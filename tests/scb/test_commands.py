@@ -9,7 +9,7 @@ import shlex
 import shutil
 import subprocess
 import sys
-from dataclasses import fields, replace
+from dataclasses import fields
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -19,8 +19,6 @@ import pytest
 
 import scb
 from scb import artefacts, listing
-from scb.agents.ppo import PPOConfig
-from scb.agents.spec import bandit_agent
 from scb.cli import main
 from scb.command_line import Output
 from scb.commands import Discover, TrainConfig
@@ -33,11 +31,9 @@ from scb.evolution import EvolutionConfig
 from scb.runs import config_dict
 from scb.warm_start import WarmStartConfig
 from tests.recording import recorded_seeds
+from tests.scb.probes import small_agents
 
 METADATA = {"seeds": {}, "results": {}, "cost": {}, "command": "scb discover", "config": {}}
-TINY = PPOConfig(
-    num_envs=2, num_steps=8, num_epochs=1, num_minibatches=1, total_steps=16, hidden_sizes=(4,)
-)
 DISCOVER = ["discover", "--environment", "CartPole-v1", "--init", "random", "--generations", "2"]
 DISCOVER += ["--population-size", "4", "--agents-per-candidate", "2", "--evaluation-episodes", "1"]
 DISCOVER += [
@@ -63,20 +59,10 @@ def call(*arguments):
     return SimpleNamespace(code=code, out=out.getvalue(), err=err.getvalue())
 
 
-def small(*arguments):
-    spec = bandit_agent(*arguments)
-    if spec.algorithm == "ppo":
-        return replace(spec, config=TINY)
-    sizes = {"buffer_size": 16, "prefill": 8, "batch_size": 4, "hidden_sizes": (4,)}
-    return spec.with_values(num_envs=2, gradient_steps=1, total_steps=16, **sizes)
-
-
 @pytest.fixture(scope="module", autouse=True)
 def small_inner_loop():
     """The commands take the paper's 10 000 steps; here 16 must do."""
-    with pytest.MonkeyPatch.context() as patch:
-        for module in ("scb.discovery", "scb.commands"):
-            patch.setattr(f"{module}.bandit_agent", small)
+    with small_agents():
         yield
 
 
@@ -523,7 +509,7 @@ def test_a_reader_that_stops_early_is_no_error(monkeypatch):
         ),
         ("discover --expert pop", "unknown expert 'pop': did you mean ppo"),
         ("discover --expert dqn", "dqn does not fit the environment's continuous actions"),
-        ("discover --expert sac --expert-steps 10", "prefill is 1000, which leaves nothing of 10"),
+        ("discover --expert sac --expert-steps 4", "prefill is 8, which leaves nothing of 4"),
         ("discover --expert evolution --expert-steps 10", "expert_steps is 10, but evolution"),
         ("discover --min-spread 1 --construction q", "min_spread is 1.0, which the construction q"),
         ("discover --min-spread -1", "min_spread is -1.0: it must be 0 or larger, and finite"),
