@@ -47,6 +47,9 @@ experiments: $(INSTALLED) ## the paper's experiments: measure what is missing (q
 	@$(BIN)/python -m experiments --preset quick
 
 docs: $(INSTALLED) .venv-docs/.installed ## the documentation's site, in site/; its pages as pictures in site/screenshots where Chromium is
+	@$(BIN)/scb explain Synthetic-Pendulum-v1 --html --out docs/interactive/Synthetic-Pendulum-v1
+	@$(BIN)/lpo show lpo-pendulum --html --out docs/interactive/lpo-pendulum
+	@.venv-docs/bin/jupyter nbconvert --log-level=WARN --execute --to markdown --output-dir docs/notebooks notebooks/*.ipynb
 	@.venv-docs/bin/zensical build --strict --clean
 	@$(BIN)/python -m tests.site
 
@@ -64,14 +67,14 @@ docs: $(INSTALLED) .venv-docs/.installed ## the documentation's site, in site/; 
 	@.venv-sb3/bin/python -m pip --disable-pip-version-check --quiet install -c constraints.txt -e . stable-baselines3==2.9.2 torch==2.15.0
 	@touch $@
 
-.venv-docs/.installed: pyproject.toml
+.venv-docs/.installed: $(INSTALLED)
 	@echo "Installing what builds the site into .venv-docs ..."
 	@$(PYTHON) -m venv --clear .venv-docs
-	@.venv-docs/bin/python -m pip --disable-pip-version-check --quiet install zensical==0.0.73 mkdocstrings==1.0.8 mkdocstrings-python==2.0.11
+	@.venv-docs/bin/python -m pip --disable-pip-version-check --quiet install -c constraints.txt -e . zensical==0.0.73 mkdocstrings==1.0.8 mkdocstrings-python==2.0.11 nbconvert==7.17.2 ipykernel==7.4.0
 	@touch $@
 
 clean: ## remove caches and build outputs; .venv and runs stay
-	@rm -rf build dist site htmlcov coverage.xml .coverage .coverage.* *.egg-info
+	@rm -rf build dist site docs/interactive docs/notebooks htmlcov coverage.xml .coverage .coverage.* *.egg-info
 	@rm -rf .hypothesis .mypy_cache .pytest_cache .ruff_cache
 	@find . -path ./$(VENV) -prune -o -path ./.git -prune -o -name __pycache__ -type d -prune -exec rm -rf {} +
 

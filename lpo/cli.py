@@ -8,7 +8,7 @@ from scb.cli import run_program
 
 
 def _commands() -> dict[str, Any]:
-    from lpo import commands, listing, pipeline, training_commands
+    from lpo import commands, listing, pipeline, showing, training_commands
 
     return {
         "run": pipeline.RunAll,
@@ -19,6 +19,7 @@ def _commands() -> dict[str, Any]:
         "certify": commands.certify_command,
         "distill": commands.distill_command,
         "list": listing.list_command,
+        "show": showing.show_command,
     }
 
 

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import numpy as np
 import tyro
 
-from scb import processes
+from scb import experts, processes
 from scb.agents.spec import bandit_agent
 from scb.command_line import LongRun, Measuring, Output
 from scb.console import console
@@ -159,7 +159,8 @@ def scale(environment: str, backend: str | None, warm_start: Mapping[str, float]
     spec = environment_spec(environment)
     known = {"random actions": spec.random_return(backend)}
     if "expert_return" in warm_start:
-        known["the expert that the bandit was fitted to"] = warm_start["expert_return"]
+        who = f"the expert that the bandit was fitted to, in {experts.EPISODES} episodes"
+        known[who] = warm_start["expert_return"]
     if (reference := spec.reference(backend)) is not None:
         known[reference.source] = reference.value
     if (standing := spec.standing_still(backend)) is not None:

@@ -2,6 +2,8 @@
 
 import re
 import subprocess
+import sys
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -10,18 +12,28 @@ ROOT = Path(__file__).parents[1]
 pytestmark = pytest.mark.slow
 
 
+def earned(python, name, *flags):
+    """Runs an example, and returns the mean that its last line says."""
+    command = [python, ROOT / "examples" / f"{name}.py", *flags]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT)
+    assert done.returncode == 0, done.stderr
+    return float(re.search(r": (-?\d+)(?: ± \d+)?$", done.stdout.strip())[1])
+
+
+def environment(name):
+    """The Python of an environment that the Makefile makes."""
+    subprocess.run(["make", f"{name}/.installed"], cwd=ROOT, check=True)
+    return ROOT / name / "bin" / "python"
+
+
 @pytest.fixture(scope="module")
 def sb3():
-    """Runs an example of SB3's, and returns the mean that it prints."""
-    subprocess.run(["make", ".venv-sb3/.installed"], cwd=ROOT, check=True)
+    return partial(earned, environment(".venv-sb3"))
 
-    def run(name, *flags):
-        command = [ROOT / ".venv-sb3/bin/python", ROOT / "examples" / f"{name}.py", *flags]
-        done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT)
-        assert done.returncode == 0, done.stderr
-        return float(re.search(r": (-?\d+) ± \d+$", done.stdout.strip())[1])
 
-    return run
+@pytest.fixture(scope="module")
+def rejax():
+    return partial(earned, environment(".venv-rejax"))
 
 
 def test_an_agent_of_sb3_learns_in_a_bandit_what_its_environment_pays(sb3):
@@ -31,5 +43,24 @@ def test_an_agent_of_sb3_learns_in_a_bandit_what_its_environment_pays(sb3):
 
 @pytest.mark.parametrize("objective", ["ppo", "lpo-pendulum"])
 def test_sb3s_ppo_trains_with_an_objective(sb3, objective):
-    earned = sb3("sb3_learned_objective", "--objective", objective, "--steps", "8192")
-    assert -2000 < earned < 0
+    assert -2000 < sb3("sb3_learned_objective", "--objective", objective, "--steps", "8192") < 0
+
+
+# The objective that ships, whose file is read without this library.
+@pytest.mark.parametrize("objective", ["ppo", "lpo/zoo/lpo-pendulum.npz"])
+def test_rejaxs_ppo_trains_with_an_objective(rejax, objective):
+    # Random actions earn about -1200.
+    flags = ["--agents", "2", "--steps", "150000"]
+    assert rejax("rejax_learned_objective", "--objective", objective, *flags) > -1100
+
+
+@pytest.mark.parametrize("objective", ["ppo", "lpo-pendulum"])
+def test_ppo_in_one_file_swings_the_pendulum_up_with_an_objective(objective):
+    assert earned(sys.executable, "purejax_ppo_pendulum", "--objective", objective) > -400
+
+
+@pytest.mark.parametrize("objective", ["ppo", "lpo-pendulum"])
+def test_braxs_ppo_trains_with_an_objective(objective):
+    # What has not learned holds the pole up for about 25 steps.
+    flags = ["--objective", objective, "--steps", "60000"]
+    assert earned(sys.executable, "brax_learned_objective", *flags) > 60

@@ -1,5 +1,6 @@
 """`scb explain`: what a bandit says about its environment, as one figure and one JSON file."""
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -48,12 +49,22 @@ def explain(
     trajectories = follow(place.env, place.params, optimal_policy(bandit), key_episode, episodes)
     returns = trajectories.returns()
     earned = estimate(returns)
-    best = jax.jit(jax.vmap(optimal_actions(bandit)))
+    optimal_action = optimal_actions(bandit)
+    best = jax.jit(jax.vmap(optimal_action))
     num_actions, bounds = first_action(space)
 
     def drawn(observations: np.ndarray) -> np.ndarray:
         actions = np.asarray(best(jnp.asarray(observations)))
         return actions.reshape(len(observations), -1)[:, 0]
+
+    mean_reward = jax.jit(jax.vmap(partial(bandit.mean_reward, params=bandit.default_params)))
+    several = num_actions is None and bandit.num_actions > 1
+
+    def reward(observations: np.ndarray, first: float | None) -> np.ndarray:
+        actions = np.array(best(jnp.asarray(observations)))
+        if first is not None:
+            actions.reshape(len(actions), -1)[:, 0] = first
+        return np.asarray(mean_reward(jnp.asarray(observations), jnp.asarray(actions)))
 
     visited = trajectories.states()
     shown = visited[:: max(1, len(visited) // STATES)]
@@ -70,7 +81,6 @@ def explain(
     }
     if bandit.observation_size < 2:
         return numbers, {}
-    several = num_actions is None and bandit.num_actions > 1
     everything = np.concatenate([contexts, shown])
     low, high = flat_bounds(place.env.observation_space(place.params))
     box = (np.asarray(low), np.asarray(high))
@@ -79,6 +89,7 @@ def explain(
         "summary": f"its optimal policy earns {earned} in {place.name}",
         "plane": plane_for(place.name, everything, importance.tolist(), box),
         "best": drawn,
+        "reward": reward,
         "num_actions": num_actions,
         "bounds": bounds,
         "episode": trajectories.observations[usual][trajectories.active[usual]],
@@ -98,22 +109,26 @@ def explain_command(
     backend: str | None = None,
     episodes: int = 20,
     seed: int = 0,
+    html: bool = False,
 ) -> None:
     """Show what a bandit knows: its best actions, its states, and what its reward depends on.
 
     Args:
       bandit: a zoo name such as Synthetic-Pendulum-v1, or path.npz.
-      out: folder for explain.png and explain.json; runs/explain/NAME where left out.
+      out: folder for explain.png, explain.json and explain.html; runs/explain/NAME where left out.
       evaluation_environment: where the bandit's optimal policy acts; the bandit's own where left out.
       backend: Brax's physics: generalized, positional or spring.
       episodes: of the optimal policy.
       seed: decides everything.
+      html: also write a page where the reward's surface can be turned and the action moved (extra `html`).
     """
-    from scb import plotting
-    from scb.analysis import figures
+    from scb import interactive, plotting
+    from scb.analysis import figures, page
 
     at_least(1, episodes=episodes)
     at_least(0, seed=seed)
+    if html:
+        interactive.plotly()  # before the work, not after it
     loaded = open_bandit(bandit)
     place = evaluation_place(loaded, bandit, evaluation_environment, backend)
     folder = Path("runs") / "explain" / loaded.name if out is None else out
@@ -129,4 +144,6 @@ def explain_command(
         printer.print(f"  {share:6.1%} of the reward's variance: {name}")
     if parts:
         plotting.save(figures.explained(parts), folder / "explain.png")
+    if parts and html:
+        page.save_bandit_page(folder / "explain.html", parts)
     printer.print(f"written to {folder}", soft_wrap=True)

@@ -14,7 +14,7 @@ from scb.analysis.planes import Plane
 
 POINTS = 80  # of a plane's grid in either direction
 # Discrete actions, in order; they stay apart for colour-blind readers and in grey.
-_DISCRETE = ("#D9F0D3", "#FFFFFF", "#C2A5CF", "#F1A340")
+DISCRETE = ("#D9F0D3", "#FFFFFF", "#C2A5CF", "#F1A340")
 
 
 def action_map(
@@ -49,8 +49,8 @@ def action_grid(
     """`action_map` of [P, P] actions that are known, x fastest."""
     x, y = (np.linspace(low, high, len(actions)) for low, high in plane.limits)
     low, high = (-0.5, num_actions - 0.5) if num_actions else (bounds or (None, None))
-    colors: Any = ListedColormap(_DISCRETE[:num_actions]) if num_actions else "PuOr"
-    if num_actions and num_actions > len(_DISCRETE):
+    colors: Any = ListedColormap(DISCRETE[:num_actions]) if num_actions else "PuOr"
+    if num_actions and num_actions > len(DISCRETE):
         colors = "tab20"
     axes.grid(False)
     _label_axes(axes, plane)
@@ -82,14 +82,19 @@ def importance_bars(
     axes.set_xlabel("share of the reward's variance", fontsize=9)
 
 
-def draw_trajectory(axes: Axes, plane: Plane, states: NDArray[np.floating]) -> None:
-    """[T, O] states of one episode as a black line, its end a cross; a jump in the angle is no line."""
+def trajectory_line(plane: Plane, states: NDArray[np.floating]) -> NDArray[np.floating]:
+    """[T, O] states of one episode -> points of a line in the plane, interrupted by NaN where the angle jumps."""
     points = plane.project(states).astype(float)
     widths = np.ptp(np.asarray(plane.limits), axis=1)
     jumps = np.any(np.abs(np.diff(points, axis=0)) > 0.5 * widths, axis=1)
-    line = np.insert(points, np.flatnonzero(jumps) + 1, np.nan, axis=0)
+    return np.insert(points, np.flatnonzero(jumps) + 1, np.nan, axis=0)
+
+
+def draw_trajectory(axes: Axes, plane: Plane, states: NDArray[np.floating]) -> None:
+    """[T, O] states of one episode as a black line, its end a cross."""
+    line = trajectory_line(plane, states)
     axes.plot(*line.T, color=plotting.BLACK, linewidth=1.2, label="an episode in the environment")
-    axes.plot(*points[-1], "x", color=plotting.BLACK, markersize=8, label="its end", linestyle="")
+    axes.plot(*line[-1], "x", color=plotting.BLACK, markersize=8, label="its end", linestyle="")
 
 
 def explained(parts: Mapping[str, Any]) -> Figure:
@@ -97,7 +102,8 @@ def explained(parts: Mapping[str, Any]) -> Figure:
 
     Args:
       parts: "name", "environment", "plane", "best", "num_actions", "bounds", "episode" [T, O],
-        "contexts" [N, O], "visited" [N, O], "names", "importance", "action" (its name).
+        "contexts" [N, O], "visited" [N, O], "names", "importance", "action" (its name), as
+        `scb.analysis.explain.explain` gives them.
     """
     plane: Plane = parts["plane"]
     with plotting.figure_style():

@@ -1,0 +1,166 @@
+"""What a bandit knows, as a page to turn: its reward over a plane of states, and its best actions there."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from scb import plotting
+from scb.analysis.figures import DISCRETE, trajectory_line
+from scb.analysis.planes import Plane
+from scb.interactive import plotly, save_page, slider
+
+POINTS = 64  # of the plane's grid in either direction
+ACTIONS = 9  # values of a continuous action that the slider has
+SHOWN = 400  # contexts, and visited states
+
+
+def save_bandit_page(path: Path, parts: Mapping[str, Any]) -> Path:
+    """Writes the page of `scb.analysis.figures.explained`'s parts.
+
+    Args:
+      path: of the file.
+      parts: of `scb.analysis.explain.explain`.
+    """
+    plane: Plane = parts["plane"]
+    x, y, observations = plane.grid(POINTS)
+    values = (
+        np.arange(parts["num_actions"])
+        if parts["num_actions"]
+        else np.linspace(parts["bounds"][0], parts["bounds"][1], ACTIONS)
+    )
+    shares = zip(parts["names"], parts["importance"], strict=True)
+    reasons = ", ".join(f"{name} {share:.0%}" for name, share in shares)
+    reward = (
+        "The surface is the reward for the action that the slider chooses, or for the best one, in each state of the "
+        "plane; what is not on its axes is held at what is usual. Points have their own rewards: they lie off the "
+        f"surface where the rest of their observation differs. What the reward's variance comes from: {reasons}."
+    )
+    best = "The best action of each state, and an episode that takes it, in the environment. Point at it to read."
+    return save_page(
+        path,
+        f"{parts['name']}: its reward and its best actions",
+        f"{parts['name']}: {parts['summary']}.",
+        {
+            "Reward over states: turn it": (reward, _surface(parts, x, y, observations, values)),
+            "Best actions": (best, _best_actions(parts, x, y, observations)),
+        },
+    )
+
+
+def _surface(parts: Mapping[str, Any], x: Any, y: Any, observations: Any, values: Any) -> Any:
+    go = plotly()
+    plane: Plane = parts["plane"]
+    clouds = {
+        "contexts of the bandit": (parts["contexts"][:SHOWN], plotting.SKY_BLUE),
+        "visited by its optimal policy": (_spread(parts["visited"]), plotting.VERMILLION),
+    }
+
+    def rewards(states: Any, action: float | None) -> Any:
+        return np.round(np.asarray(parts["reward"](states, action), float), 4)
+
+    positions = [("the best", None), *((f"{value:.3g}", float(value)) for value in values)]
+    heights = [
+        [
+            rewards(observations, value).reshape(POINTS, POINTS),
+            *(rewards(points, value) for points, _ in clouds.values()),
+        ]
+        for _, value in positions
+    ]
+    everything = np.concatenate([grid.ravel() for grid, *_ in heights])
+    low, high = float(everything.min()), float(everything.max())
+    traces = [
+        go.Surface(
+            x=x,
+            y=y,
+            z=heights[0][0],
+            cmin=low,
+            cmax=high,
+            colorscale="Viridis",
+            colorbar={"title": "reward", "len": 0.7},
+            opacity=0.9,
+        )
+    ]
+    for (name, (points, color)), z in zip(clouds.items(), heights[0][1:], strict=True):
+        a, b = plane.project(points).T
+        traces.append(
+            go.Scatter3d(
+                x=a, y=b, z=z, mode="markers", name=name, marker={"size": 2, "color": color}
+            )
+        )
+    figure = go.Figure(traces)
+    figure.update_layout(
+        height=720,
+        margin={"l": 30, "r": 0, "t": 10, "b": 40},
+        legend={"x": 0, "y": 1, "itemsizing": "constant"},
+        scene={
+            "xaxis": {"title": plane.labels[0], "range": plane.limits[0]},
+            "yaxis": {"title": plane.labels[1], "range": plane.limits[1]},
+            "zaxis": {"title": "reward"},
+            "aspectratio": {"x": 1.2, "y": 1.2, "z": 0.8},
+            "camera": {"eye": {"x": 1.6, "y": 1.7, "z": 1.2}},
+        },
+        sliders=[
+            slider(
+                parts["action"],
+                [(text, {"z": z}) for (text, _), z in zip(positions, heights, strict=True)],
+                0,
+            )
+        ],
+    )
+    return figure
+
+
+def _best_actions(parts: Mapping[str, Any], x: Any, y: Any, observations: Any) -> Any:
+    go = plotly()
+    plane: Plane = parts["plane"]
+    number = parts["num_actions"]
+    if number:
+        # One band of colour an action, without blending.
+        edges = np.arange(number + 1) / number
+        colors = [
+            (float(edge), DISCRETE[i % len(DISCRETE)])
+            for i in range(number)
+            for edge in edges[i : i + 2]
+        ]
+        scale = {
+            "zmin": -0.5,
+            "zmax": number - 0.5,
+            "colorscale": colors,
+            "colorbar": {"title": parts["action"], "tickvals": list(range(number))},
+        }
+    else:
+        low, high = parts["bounds"]
+        scale = {
+            "zmin": low,
+            "zmax": high,
+            "colorscale": "PuOr",
+            "colorbar": {"title": parts["action"]},
+        }
+    episode = trajectory_line(plane, parts["episode"])
+    figure = go.Figure(
+        [
+            go.Heatmap(x=x, y=y, z=parts["best"](observations).reshape(POINTS, POINTS), **scale),
+            go.Scatter(
+                x=episode[:, 0],
+                y=episode[:, 1],
+                mode="lines+markers",
+                name="an episode",
+                line={"color": plotting.BLACK, "width": 1},
+                marker={"size": 4},
+            ),
+        ]
+    )
+    figure.update_layout(
+        height=520,
+        margin={"l": 0, "r": 0, "t": 10, "b": 0},
+        xaxis={"title": plane.labels[0], "range": plane.limits[0]},
+        yaxis={"title": plane.labels[1], "range": plane.limits[1]},
+        showlegend=False,
+    )
+    return figure
+
+
+def _spread(states: Any) -> Any:
+    return states[:: max(1, len(states) // SHOWN)][:SHOWN]
