@@ -25,10 +25,10 @@ import jax
 import numpy as np
 from flax import traverse_util
 
+from scb import schema
 from scb.errors import UserError
 from scb.files import strict_json, write_bytes
 
-SCHEMA_VERSION = 1
 KINDS = ("bandit", "drift", "synthetic_mdp")
 
 # numpy.ndarray leaves under any depth of dictionaries: {"reward": {"Dense_0": {"kernel": ...}}}.
@@ -54,7 +54,7 @@ _PACKAGES = ("jax", "jaxlib", "flax", "optax", "evosax", "gymnax", "brax", "nump
 
 @dataclasses.dataclass(frozen=True)
 class Artefact:
-    """A checked artefact: its name, its weights as nested dictionaries, and all of NAME.json."""
+    """A checked artefact: its name, its weights as nested dictionaries, and all of NAME.json in the newest version."""
 
     name: str
     arrays: ArrayTree
@@ -90,7 +90,7 @@ def save(path: str | Path, arrays: Mapping[str, Any], metadata: Mapping[str, Any
 
     written = {
         **metadata,
-        "schema_version": SCHEMA_VERSION,
+        "schema_version": schema.VERSION,
         "name": npz_path.name.removesuffix(".npz"),
         "versions": package_versions(),
         "sha256": hashlib.sha256(data).hexdigest(),
@@ -135,7 +135,8 @@ def load(path: str | Path, *kinds: str) -> Artefact:
             f"{npz_path} is not the file that {json_path.name} describes (its SHA-256 differs): it "
             "was changed, or saving it was interrupted; fetch or save both again."
         )
-    return Artefact(metadata["name"], unflatten(npz_path, _parse_npz(npz_path, data)), metadata)
+    arrays = unflatten(npz_path, _parse_npz(npz_path, data))
+    return Artefact(metadata["name"], arrays, schema.upgraded(metadata))
 
 
 def read_arrays(path: Path) -> dict[str, np.ndarray]:
@@ -339,10 +340,10 @@ def _parse_metadata(path: Path, text: bytes) -> dict[str, Any]:
 
 def _check_metadata(path: Path, metadata: Mapping[str, Any]) -> None:
     # The version first: another version may well have other keys.
-    version = metadata.get("schema_version", SCHEMA_VERSION)
-    if version != SCHEMA_VERSION or isinstance(version, bool):
+    version = metadata.get("schema_version", schema.VERSION)
+    if type(version) is not int or not 1 <= version <= schema.VERSION:
         raise UserError(
-            f"{path} has schema version {version!r} and this installation reads {SCHEMA_VERSION}: "
+            f"{path} has schema version {version!r} and this installation reads 1 to {schema.VERSION}: "
             "install a version of lpo that matches it."
         )
     missing = [key for key in _FIELDS if key not in metadata]

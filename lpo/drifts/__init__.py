@@ -61,10 +61,7 @@ def drift_from_config(config: Mapping[str, Any]) -> Drift:
       KeyError, TypeError: an entry is missing, or of another type.
       UserError: an unknown family, or numbers that make no drift.
     """
-    if "family" in config:
-        name = config["family"]
-    else:  # from before there were families, when a file held a network or a formula
-        name = (ClosedFormDrift if "expression" in config else LearnedDrift).name
+    name = config["family"]
     if name not in DRIFTS:
         raise unknown_name("drift", str(name), DRIFTS)
     return DRIFTS[name].from_config(config)

@@ -121,11 +121,6 @@ class CorrectedDrift(Drift):
         if not (self.clip > 0 and self.xi > 0):
             raise UserError(f"clip and xi are {self.clip} and {self.xi}: both must be positive.")
 
-    @classmethod
-    def from_config(cls, config: Mapping[str, Any]) -> Self:
-        # What was learned before there was a gate has none.
-        return super().from_config({"gate": 0.0, **config})
-
     @abstractmethod
     def correction(
         self, parameters: Any, log_ratio: Array, advantage: Array, progress: Array, xp: Any

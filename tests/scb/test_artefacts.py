@@ -13,7 +13,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from scb import artefacts
+from scb import artefacts, schema
 from scb.errors import UserError
 
 WEIGHTS = {
@@ -85,7 +85,7 @@ def test_what_was_saved_is_what_is_loaded(saved):
         np.testing.assert_array_equal(flat[name], array)
         assert (flat[name].dtype, flat[name].shape) == (array.dtype, array.shape)
     assert METADATA.items() <= artefact.metadata.items()
-    assert artefact.metadata["schema_version"] == artefacts.SCHEMA_VERSION
+    assert artefact.metadata["schema_version"] == schema.VERSION
     assert artefact.metadata["versions"]["python"] == platform.python_version()
 
 
@@ -208,10 +208,28 @@ def test_another_kind_is_refused(saved):
     assert "is a bandit: give a drift here" in load_error(saved, "drift")
 
 
-@pytest.mark.parametrize("version", [2, "1", None, True])
+def test_what_an_older_version_said_is_read_as_the_newest_says_it(saved):
+    older = {"drift": {"expression": "x"}, "bandit": {"latent": "normal"}}
+    change_json(saved, schema_version=1, config=older)
+    metadata = artefacts.load(saved, "bandit").metadata
+    assert metadata["schema_version"] == schema.VERSION
+    assert metadata["config"] == {
+        "drift": {"family": "formula", "gate": 0.0, "expression": "x"},
+        "bandit": {"form": "networks", "latent": "normal"},
+    }
+    # What says it already is as it was.
+    change_json(saved, config=metadata["config"])
+    assert artefacts.load(saved, "bandit").metadata["config"] == metadata["config"]
+
+
+def test_every_version_is_read():
+    assert list(schema.UPGRADES) == list(range(1, schema.VERSION))
+
+
+@pytest.mark.parametrize("version", [schema.VERSION + 1, 0, "1", None, True])
 def test_another_schema_version_is_refused_before_anything_else(saved, version):
     saved.with_suffix(".json").write_text(json.dumps({"schema_version": version}))
-    assert f"has schema version {version!r} and this installation reads 1" in load_error(saved)
+    assert f"has schema version {version!r} and this installation reads 1 to 2" in load_error(saved)
 
 
 def test_a_missing_or_mistyped_entry_is_said_by_name(saved):
