@@ -238,18 +238,20 @@ def alignment(fitness: Mapping[str, np.ndarray], outcome: Mapping[str, np.ndarra
     names = list(outcome)
     generator = np.random.default_rng(0)
 
-    def correlation(resample: bool) -> float | None:
-        def drawn(x: np.ndarray) -> np.ndarray:
-            return x[generator.integers(0, len(x), len(x))] if resample else x
+    found = [fitness[n] for n in names], [outcome[n] for n in names]
 
-        return spearman(
-            [float(drawn(fitness[n]).mean()) for n in names],
-            [float(iqm(drawn(outcome[n]))) for n in names],
-        )
+    def drawn(x: np.ndarray) -> np.ndarray:
+        return x[generator.integers(0, len(x), len(x))]
 
-    resampled = [correlation(True) or 0.0 for _ in range(RESAMPLES)]
-    low, high = np.percentile(resampled, [2.5, 97.5])
-    return Alignment(correlation(False), float(low), float(high))
+    draws = [[[drawn(x) for x in of] for of in found] for _ in range(RESAMPLES)]
+    # All resamples of an objective at once, the measured numbers before them.
+    means, iqms = (
+        np.stack([statistic(np.stack(rows), axis=1) for rows in zip(*samples, strict=True)], axis=1)
+        for statistic, samples in zip((np.mean, iqm), zip(found, *draws, strict=True), strict=True)
+    )
+    correlation, *resampled = (spearman(*pair) for pair in zip(means, iqms, strict=True))
+    low, high = np.percentile([x or 0.0 for x in resampled], [2.5, 97.5])
+    return Alignment(correlation, float(low), float(high))
 
 
 def measure_alignment(

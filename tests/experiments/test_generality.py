@@ -124,6 +124,7 @@ def test_agents_from_a_bandit_and_from_the_environment(tmp_path, monkeypatch, sm
     assert len(saved) == number == 2 * (1 + 4) - 1
 
 
+@pytest.mark.slow
 def test_agents_from_a_search(tmp_path, monkeypatch, small_agents):
     monkeypatch.setattr(generality, "SOURCES", (DRAWN,))
     monkeypatch.setattr(generality, "agents_of", lambda name: ["ppo"])

@@ -398,7 +398,7 @@ print(jax.device_count("cpu"), jax.config.values["jax_compilation_cache_dir"])
     ("devices", "cache", "expected"),
     [
         (None, None, f"{CORES} home/lpo/jax"),
-        ("3", "elsewhere", "3 elsewhere"),
+        pytest.param("3", "elsewhere", "3 elsewhere", marks=pytest.mark.slow),
     ],
 )
 def test_jax_gets_a_device_a_core_and_a_cache_unless_told_otherwise(

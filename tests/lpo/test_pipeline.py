@@ -179,6 +179,7 @@ def test_resuming_trains_the_missing_agents_to_the_same_bytes(folder):
         assert after[name] == before[name], name
 
 
+@pytest.mark.slow
 def test_a_half_saved_objective_is_saved_again(folder, monkeypatch):
     # The .json is written last: without it, the evolution's checkpoint gives the same weights.
     before = contents(folder)

@@ -180,6 +180,7 @@ def test_environment_steps_of_a_candidate(discovered):
     assert (steps.training, steps.evaluation) == (3 * 2 * 16, 3 * 2 * 500)
 
 
+@pytest.mark.slow
 def test_judging_is_of_the_same_agents_whatever_their_actions_and_of_others_for_another_seed(
     discovered, monkeypatch
 ):

@@ -148,6 +148,7 @@ def test_one_is_fitted_to_an_expert_and_evolved():
     assert all((step > 0).all() and (step < 1).all() for step in steps)
 
 
+@pytest.mark.slow
 def test_a_run_looks_for_its_expert_once(tmp_path, monkeypatch):
     config = pendulum_config()
     run = Run.open(tmp_path / "run", config_dict(config))

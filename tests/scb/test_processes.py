@@ -153,6 +153,7 @@ def test_processes_that_were_lost_and_told_to_end_find_what_one_finds(tmp_path):
     assert (folder / "metrics.jsonl").read_bytes() == (one / "metrics.jsonl").read_bytes()
 
 
+@pytest.mark.slow
 def test_a_folder_that_the_first_is_refused_is_refused_to_all(tmp_path):
     (tmp_path / "mine.txt").write_text("")
     for status, _, error in ended(started(2, 1, f"--out={tmp_path}")):

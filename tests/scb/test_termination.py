@@ -129,7 +129,14 @@ def test_two_commands_do_not_write_into_one_run(tmp_path, whole):
     assert fingerprint(folder, resume=True) == whole
 
 
-@pytest.mark.parametrize("room", [3000, 6000, 200_000])
+@pytest.mark.parametrize(
+    "room",
+    [
+        pytest.param(3000, marks=pytest.mark.slow),
+        6000,
+        pytest.param(200_000, marks=pytest.mark.slow),
+    ],
+)
 def test_where_there_is_no_room_a_sentence_says_so_and_what_was_saved_stays(tmp_path, whole, room):
     # A limit on the size of files, which the system refuses to exceed as it refuses to fill a full disk.
     code = f"""{SEARCH}
