@@ -238,17 +238,15 @@ def alignment(fitness: Mapping[str, np.ndarray], outcome: Mapping[str, np.ndarra
     names = list(outcome)
     generator = np.random.default_rng(0)
 
-    found = [fitness[n] for n in names], [outcome[n] for n in names]
-
-    def drawn(x: np.ndarray) -> np.ndarray:
-        return x[generator.integers(0, len(x), len(x))]
-
-    draws = [[[drawn(x) for x in of] for of in found] for _ in range(RESAMPLES)]
-    # All resamples of an objective at once, the measured numbers before them.
-    means, iqms = (
-        np.stack([statistic(np.stack(rows), axis=1) for rows in zip(*samples, strict=True)], axis=1)
-        for statistic, samples in zip((np.mean, iqm), zip(found, *draws, strict=True), strict=True)
-    )
+    # The measured numbers first, then resamples of them: {objective: [1 + RESAMPLES, runs]}.
+    fit: dict[str, list[np.ndarray]] = {n: [fitness[n]] for n in names}
+    ends: dict[str, list[np.ndarray]] = {n: [outcome[n]] for n in names}
+    for _ in range(RESAMPLES):
+        for samples in (fit, ends):
+            for rows in samples.values():
+                rows.append(rows[0][generator.integers(0, len(rows[0]), len(rows[0]))])
+    means = np.stack([np.mean(fit[n], axis=1) for n in names], axis=1)
+    iqms = np.stack([iqm(ends[n], axis=1) for n in names], axis=1)
     correlation, *resampled = (spearman(*pair) for pair in zip(means, iqms, strict=True))
     low, high = np.percentile([x or 0.0 for x in resampled], [2.5, 97.5])
     return Alignment(correlation, float(low), float(high))
