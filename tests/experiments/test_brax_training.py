@@ -31,6 +31,7 @@ def test_steps_to_match_are_of_the_first_evaluation_that_reaches_the_level():
     assert experiment.steps_to_match(found, 8.0) == [20, 10, None]
 
 
+@pytest.mark.slow
 def test_agents_are_followed_in_a_bandit_and_in_an_environment(tmp_path, monkeypatch, small_agents):
     # Pendulum stands in for Brax, whose physics compile for long.
     plan = {

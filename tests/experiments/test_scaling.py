@@ -6,6 +6,7 @@ from experiments import scaling
 from scb.errors import UserError
 
 
+@pytest.mark.slow
 def test_processes_gather_together_and_the_first_says_how_long_it_took():
     assert 0 < scaling._gathering(2, scaling.Options(candidates=4)) < 1000
 

@@ -53,6 +53,7 @@ def test_points_are_stored_to_a_thousandth_of_the_plane():
     np.testing.assert_allclose(again[:, 0], points[:, 0], atol=0.0021)
 
 
+@pytest.mark.slow
 def test_states_and_best_actions_of_one_environment(small_agents):
     plan = {
         "environments": ["MountainCar-v0"],

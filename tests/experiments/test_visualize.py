@@ -31,6 +31,7 @@ def test_gifs_are_made_from_the_report(report, tmp_path):
         assert gif.n_frames == 5
 
 
+@pytest.mark.slow
 def test_an_agent_is_trained_in_its_bandit_and_shown(monkeypatch):
     monkeypatch.setattr(visualize, "CLASSIC_CONTROL", ("CartPole-v1",))
     # As if the run had been interrupted with Hopper done, whose page is there.

@@ -65,6 +65,7 @@ def test_what_is_no_factory_is_refused(module, name, message):
         make(name.format(module))
 
 
+@pytest.mark.slow
 def test_a_bandit_is_discovered_for_it_and_says_what_its_returns_are_to_be_compared_with(
     module, tmp_path, capsys, monkeypatch, small_agents
 ):

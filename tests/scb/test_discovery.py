@@ -122,6 +122,7 @@ def worth(name, sampled=True, **size):
     return returns["sampled_actions"]
 
 
+@pytest.mark.slow
 def test_agents_of_the_zoos_pendulum_bandit_swing_the_pendulum_up():
     # The paper's inner loop in full. A random policy earns -1230; the entry says -229 [-361, -176].
     assert worth("Synthetic-Pendulum-v1", sampled=False, num_agents=2, num_episodes=4).min() > -400

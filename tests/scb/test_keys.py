@@ -103,6 +103,7 @@ DISCOVERY = DiscoveryConfig(
 
 # What shares keys on purpose does so at one place in the code: all candidates of a generation, the judgements
 # of a mean, sampled and most likely actions of one agent. A key at two places, or split and drawn from, is a mistake.
+@pytest.mark.slow
 def test_a_discovery_uses_every_key_at_one_place():
     with recorded() as record:
         discover(DISCOVERY, quiet=True)

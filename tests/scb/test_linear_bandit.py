@@ -137,6 +137,7 @@ def pendulum(**changes):
     return discover(config, quiet=True)
 
 
+@pytest.mark.slow
 def test_one_is_fitted_to_an_expert_and_evolved():
     problem, outcome = pendulum()
     assert problem.warm_start_report["action_r2"] > 0.99

@@ -861,7 +861,12 @@ def test_evaluations_happen_before_the_first_and_after_every_nth_iteration():
 # MNISTBandit downloads its pictures when it is made; Brax takes a minute to trace.
 @pytest.mark.parametrize(
     "environment",
-    [n for n in environment_names() if n in gymnax.registered_envs and "MNIST" not in n],
+    [
+        # MinAtar's compile longest.
+        pytest.param(n, marks=pytest.mark.slow) if n.endswith("MinAtar") else n
+        for n in environment_names()
+        if n in gymnax.registered_envs and "MNIST" not in n
+    ],
 )
 def test_every_environment_can_be_trained_in(environment):
     # Traced only. A scan refuses a state whose shapes or dtypes change, a buffer another dtype.
