@@ -6,21 +6,13 @@ from typing import Any
 
 import numpy as np
 
+from lpo.figures import looks
 from lpo.objectives import Objective
 from lpo.update_regions import ADVANTAGES, CLIP, RATIOS, REGIONS, analyze, midpoints
-from scb import plotting
 from scb.interactive import plotly, save_page, slider
 
 STEPS = np.delete(np.linspace(*ADVANTAGES, 25), 12)  # advantages of the slider, without the 0
 FIRST = 15  # +1
-_COLORS = (
-    plotting.BLACK,
-    plotting.SKY_BLUE,
-    plotting.VERMILLION,
-    plotting.GREEN,
-    plotting.PURPLE,
-    plotting.ORANGE,
-)
 
 
 def save_objective_page(path: Path, objectives: Sequence[Objective], progress: float) -> Path:
@@ -64,6 +56,7 @@ def _curves(log_ratios: Any, found: Sequence[Any]) -> Any:
     go = plotly()
     ratios = np.exp(log_ratios)
     regions = list(REGIONS)
+    colors = looks([analysis.objective for analysis in found])
     figure = make_subplots(
         rows=1,
         cols=2,
@@ -86,7 +79,7 @@ def _curves(log_ratios: Any, found: Sequence[Any]) -> Any:
                     legendgroup=analysis.objective,
                     showlegend=column == 1,
                     hovertemplate="%{y:.3f} (%{text})",
-                    line={"color": _COLORS[i % len(_COLORS)], "width": 2.5},
+                    line={"color": colors[analysis.objective].color, "width": 2.5},
                 ),
                 row=1,
                 col=column,

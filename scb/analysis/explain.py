@@ -1,5 +1,6 @@
 """`scb explain`: what a bandit says about its environment, as one figure and one JSON file."""
 
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ from scb.agents.agent import flat_bounds
 from scb.analysis.importance import reward_variance
 from scb.analysis.optimal_actions import first_action, optimal_actions, optimal_policy
 from scb.analysis.planes import observation_names, plane_for
-from scb.analysis.states import bandit_states, follow
+from scb.analysis.states import bandit_states, follow, thinned
 from scb.console import console
 from scb.environments.synthetic import SyntheticBandit
 from scb.environments.zoo import open_bandit
@@ -49,8 +50,7 @@ def explain(
     trajectories = follow(place.env, place.params, optimal_policy(bandit), key_episode, episodes)
     returns = trajectories.returns()
     earned = estimate(returns)
-    optimal_action = optimal_actions(bandit)
-    best = jax.jit(jax.vmap(optimal_action))
+    best = jax.jit(jax.vmap(optimal_actions(bandit)))
     num_actions, bounds = first_action(space)
 
     def drawn(observations: np.ndarray) -> np.ndarray:
@@ -60,14 +60,17 @@ def explain(
     mean_reward = jax.jit(jax.vmap(partial(bandit.mean_reward, params=bandit.default_params)))
     several = num_actions is None and bandit.num_actions > 1
 
-    def reward(observations: np.ndarray, first: float | None) -> np.ndarray:
+    def rewards(observations: np.ndarray, firsts: Sequence[float]) -> list[np.ndarray]:
+        # The best actions are what takes long: once for all values.
         actions = np.array(best(jnp.asarray(observations)))
-        if first is not None:
+        found = [mean_reward(jnp.asarray(observations), jnp.asarray(actions.copy()))]
+        for first in firsts:
             actions.reshape(len(actions), -1)[:, 0] = first
-        return np.asarray(mean_reward(jnp.asarray(observations), jnp.asarray(actions)))
+            found.append(mean_reward(jnp.asarray(observations), jnp.asarray(actions.copy())))
+        return [np.asarray(x) for x in found]
 
     visited = trajectories.states()
-    shown = visited[:: max(1, len(visited) // STATES)]
+    shown = thinned(visited, STATES)
     usual = int(np.argsort(returns)[len(returns) // 2])  # the episode to draw: of median return
     numbers = {
         "bandit": bandit.name,
@@ -89,7 +92,7 @@ def explain(
         "summary": f"its optimal policy earns {earned} in {place.name}",
         "plane": plane_for(place.name, everything, importance.tolist(), box),
         "best": drawn,
-        "reward": reward,
+        "rewards": rewards,
         "num_actions": num_actions,
         "bounds": bounds,
         "episode": trajectories.observations[usual][trajectories.active[usual]],

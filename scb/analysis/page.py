@@ -9,6 +9,7 @@ import numpy as np
 from scb import plotting
 from scb.analysis.figures import DISCRETE, trajectory_line
 from scb.analysis.planes import Plane
+from scb.analysis.states import thinned
 from scb.interactive import plotly, save_page, slider
 
 POINTS = 64  # of the plane's grid in either direction
@@ -54,20 +55,26 @@ def _surface(parts: Mapping[str, Any], x: Any, y: Any, observations: Any, values
     plane: Plane = parts["plane"]
     clouds = {
         "contexts of the bandit": (parts["contexts"][:SHOWN], plotting.SKY_BLUE),
-        "visited by its optimal policy": (_spread(parts["visited"]), plotting.VERMILLION),
+        "visited by its optimal policy": (
+            thinned(parts["visited"], SHOWN)[:SHOWN],
+            plotting.VERMILLION,
+        ),
     }
 
-    def rewards(states: Any, action: float | None) -> Any:
-        return np.round(np.asarray(parts["reward"](states, action), float), 4)
-
-    positions = [("the best", None), *((f"{value:.3g}", float(value)) for value in values)]
+    texts = ["the best", *(f"{value:.3g}" for value in values)]
+    # A position of the slider each: of the surface, then of either cloud.
     heights = [
-        [
-            rewards(observations, value).reshape(POINTS, POINTS),
-            *(rewards(points, value) for points, _ in clouds.values()),
-        ]
-        for _, value in positions
+        [np.round(np.asarray(x, float), 4) for x in position]
+        for position in zip(
+            *(
+                parts["rewards"](states, values.tolist())
+                for states in (observations, *(points for points, _ in clouds.values()))
+            ),
+            strict=True,
+        )
     ]
+    for position in heights:
+        position[0] = position[0].reshape(POINTS, POINTS)
     everything = np.concatenate([grid.ravel() for grid, *_ in heights])
     low, high = float(everything.min()), float(everything.max())
     traces = [
@@ -104,7 +111,7 @@ def _surface(parts: Mapping[str, Any], x: Any, y: Any, observations: Any, values
         sliders=[
             slider(
                 parts["action"],
-                [(text, {"z": z}) for (text, _), z in zip(positions, heights, strict=True)],
+                [(text, {"z": z}) for text, z in zip(texts, heights, strict=True)],
                 0,
             )
         ],
@@ -160,7 +167,3 @@ def _best_actions(parts: Mapping[str, Any], x: Any, y: Any, observations: Any) -
         showlegend=False,
     )
     return figure
-
-
-def _spread(states: Any) -> Any:
-    return states[:: max(1, len(states) // SHOWN)][:SHOWN]

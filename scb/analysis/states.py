@@ -83,3 +83,8 @@ def record_episode(
         1
     ]
     return records
+
+
+def thinned(states: np.ndarray, number: int) -> np.ndarray:
+    """[N, O] states -> every k-th of them, which are `number` or somewhat more."""
+    return states[:: max(1, len(states) // number)]
