@@ -23,6 +23,7 @@ import numpy as np
 from flax import struct
 from gymnax.environments import environment, spaces
 
+from scb.environments.brax_physics import accelerate
 from scb.environments.returns import IDLE, table
 from scb.environments.spec import Family, Made, Reference
 from scb.errors import UserError, one_of
@@ -272,11 +273,14 @@ def _load(name: str, backend: str) -> "brax.envs.Env":
 
         _accept_old_clip_keywords(brax.fluid)
         try:
-            return brax.envs.get_environment(name, backend=backend)
+            loaded = brax.envs.get_environment(name, backend=backend)
         except ValueError as error:
             raise UserError(
                 f"Brax's {name} has no {backend!r} backend: use backend='generalized'."
             ) from error
+        if backend == "generalized":
+            accelerate(loaded)
+        return loaded
 
 
 @cache
