@@ -76,11 +76,10 @@ class SyntheticEnv(gymnasium.Env[np.ndarray, Any]):
         rng = self.np_random
         # Another generator came with a seed, and what the last one drew is not of it.
         if self._drawn_by is not rng or self._next == len(self._starts):
-            self._starts, self._drawn_by, self._next = (
-                self._functions.start(rng, _BLOCK),
-                rng,
-                0,
-            )
+            self._starts = self._functions.start(rng, _BLOCK)
+            self._drawn_by, self._next = rng, 0
+            if self._functions.one_step:
+                self._reward = self._functions.rewards_of(self._starts)
         self._observation = self._starts[self._next : self._next + 1]
         self._next, self._time = self._next + 1, 0
         return self._observation[0].copy(), {}
@@ -88,6 +87,9 @@ class SyntheticEnv(gymnasium.Env[np.ndarray, Any]):
     def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         if self._observation is None:
             raise UserError("the episode has not begun, or is over: call reset first.")
+        if self._functions.one_step:
+            observation, self._observation = self._observation[0].copy(), None
+            return observation, self._reward(self._next - 1, np.asarray(action)), True, False, {}
         after, reward, terminations = self._functions.step(
             self._observation, np.asarray(action)[None]
         )

@@ -70,11 +70,21 @@ class PolicyDistanceParts(NamedTuple):
 
     def __call__(self, observation: Any, action: Any) -> Any:
         """[..., O] observations and [..., A] actions -> [...]."""
-        best = self.xp.tanh((observation - self.center).dot(self.kernel) + self.bias)
-        difference = (action - self.middle) / self.half_width - best
+        difference = self.share(action) - self.best(observation)
+        return self.reward((difference**2).sum(-1))
+
+    def best(self, observation: Any) -> Any:
+        """[..., O] observations -> [..., A] the best actions, -1 to 1 their range."""
+        return self.xp.tanh((observation - self.center).dot(self.kernel) + self.bias)
+
+    def share(self, action: Any) -> Any:
+        """[..., A] actions, -1 to 1 their range."""
+        return (action - self.middle) / self.half_width
+
+    def reward(self, squared_distance: Any) -> Any:
+        """[...] of actions that are so far from the best."""
         # A power below 2 has no gradient at zero distance.
-        distance = ((difference**2).sum(-1) + 1e-4) ** self.half_power
-        return self.offset - self.scale * distance
+        return self.offset - self.scale * (squared_distance + 1e-4) ** self.half_power
 
 
 def fitted(

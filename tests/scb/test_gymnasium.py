@@ -142,6 +142,20 @@ def test_a_module_in_the_name_is_all_that_has_to_be_imported():
     assert done.stdout == "(3,)\n", done.stderr
 
 
+@pytest.mark.parametrize("name", zoo_names())
+def test_a_single_step_pays_what_many_together_pay(name):
+    env = gymnasium.make(f"scb/{name}").unwrapped
+    functions = InNumpy(open_bandit(name))
+    actions = actions_of(env.action_space, 300)  # more than are drawn together
+    observations, rewards = [], []
+    env.reset(seed=4)
+    for action in actions:
+        observations.append(env.reset()[0])
+        rewards.append(env.step(action)[1])
+    _, expected, _ = functions.step(np.stack(observations), actions)
+    np.testing.assert_allclose(rewards, expected, rtol=1e-3, atol=2e-4 * np.abs(expected).max())
+
+
 def test_a_bandits_episode_is_one_step():
     env = gymnasium.make(BANDIT)
     first, info = env.reset(seed=1)
