@@ -275,10 +275,9 @@ def measure(
         )
         for name, objective in named.items()
     }
-    groups: Sequence[Sequence[Objective]] = families(objectives) or [()]
-    for family in groups:
-        agent = spec.agent(train_in.env, family[0].drift if family else None)
-        parameters = {objective.name: objective.parameters for objective in family}
+    # Physics take a minute to compile, however short the training.
+    for drift, parameters in _programs_for(objectives, shared=train_in.backend is not None):
+        agent = spec.agent(train_in.env, drift)
         names: list[str | None] = list(parameters) or [None]
         wanted = [(name, i) for name in names for i in range(len(agents.names))]
         size = min(side_by_side or len(wanted), len(wanted))
@@ -291,7 +290,7 @@ def measure(
             padded = [batch[i % len(batch)] for i in range(size)]
             which = np.array([i for _, i in padded])
             hyperparameters = jax.tree.map(itemgetter(which), agents.hyperparameters)
-            if family:
+            if parameters:
                 drifts = [parameters[name] for name, _ in padded if name is not None]
                 stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *drifts)
                 hyperparameters = replace(hyperparameters, drift=stacked)
@@ -336,6 +335,42 @@ def families(objectives: Sequence[AnyObjective]) -> list[list[AnyObjective]]:
         else:
             family.append(objective)
     return found
+
+
+@dataclass(frozen=True)
+class _OneOf:
+    """Several drifts as one, whose parameters are (number of the one that counts, parameters of each)."""
+
+    drifts: tuple[Callable[..., jax.Array], ...]
+
+    def __call__(
+        self, parameters: Any, log_ratio: jax.Array, advantage: jax.Array, progress: jax.Array
+    ) -> jax.Array:
+        number, each = parameters
+        penalty = jnp.zeros_like(log_ratio)
+        for i, (drift, own) in enumerate(zip(self.drifts, each, strict=True)):
+            # The others see a ratio of 1, where all are finite and flat: 0 times what they say is 0.
+            seen = jnp.where(number == i, log_ratio, 0.0)
+            penalty += jnp.where(number == i, drift(own, seen, advantage, progress), 0.0)
+        return penalty
+
+
+def _programs_for(
+    objectives: Sequence[Objective], shared: bool
+) -> list[tuple[Any, dict[str, Any]]]:
+    """[(drift, {objective: its parameters})] of the programs that train the objectives; one program where `shared`."""
+    groups = families(objectives)
+    if not groups:
+        return [(None, {})]
+    if not shared or len(groups) == 1:
+        return [(group[0].drift, {o.name: o.parameters for o in group}) for group in groups]
+    of_each = [group[0].parameters for group in groups]
+    parameters = {
+        o.name: (jnp.int32(i), (*of_each[:i], o.parameters, *of_each[i + 1 :]))
+        for i, group in enumerate(groups)
+        for o in group
+    }
+    return [(_OneOf(tuple(group[0].drift for group in groups)), parameters)]
 
 
 def _program_of(

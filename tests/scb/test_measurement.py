@@ -15,6 +15,7 @@ from scb import measurement
 from scb.agents.ppo import DIAGNOSIS, PPOConfig, PPOHyperparameters, clipped_surrogate_drift
 from scb.agents.spec import AgentSpec
 from scb.errors import UserError
+from scb.evolution import map_population
 from scb.measurement import Agents, Judge, Place, measure, spaced, train_and_judge
 from scb.rows import Rows, pivot
 
@@ -156,6 +157,30 @@ def test_long_trainings_are_kept_as_they_come(copy, measured, file):
         pivot(file[1], "objective", "seed", "step"),
         rtol=1e-3,
     )
+
+
+def test_with_physics_different_drifts_share_a_program(bandit, monkeypatch):
+    def square(parameters, log_ratio, advantage, progress):
+        return parameters["factor"] * log_ratio**2
+
+    objectives = [*CLIPS, Clip("square", {"factor": 2.0}, square)]
+
+    def earned(place):
+        programs = []
+
+        def counted(*arguments):
+            programs.append(arguments)
+            return map_population(*arguments)
+
+        monkeypatch.setattr(measurement, "map_population", counted)
+        rows = measure(SPEC, place, bandit, SEEDS, objectives=objectives, episodes=5)
+        return len(programs), pivot(rows, "objective", "seed")
+
+    apart, expected = earned(bandit)
+    together, found = earned(replace(bandit, backend="generalized"))
+    assert (apart, together) == (2, 1)
+    assert len({tuple(x) for x in np.round(expected, 3)}) == 3
+    np.testing.assert_allclose(found, expected, rtol=1e-3)
 
 
 @pytest.mark.parametrize(
