@@ -17,10 +17,11 @@ import jax
 import numpy as np
 
 from experiments.harness import Experiment, Report, Save
-from scb.environments.brax import BRAX_NAMES, DEFAULT_BACKEND, BraxEnvironment
+from scb.environments.registry import environment_spec, families
 from scb.errors import at_least
 
 OWN, PEER = "scb", "brax"
+BACKEND = "generalized"
 SEED = 1
 
 
@@ -28,7 +29,7 @@ SEED = 1
 class Options:
     """What is timed."""
 
-    environments: tuple[str, ...] = BRAX_NAMES
+    environments: tuple[str, ...] = tuple(families()["brax"].names())
     """of Brax"""
     num_envs: int = 64
     """side by side"""
@@ -64,9 +65,10 @@ def measure(options: Options, report: dict[str, Any], save: Save) -> None:
     report |= {"num_envs": options.num_envs, "steps": options.steps, "repeats": options.repeats}
     found = report.setdefault("environments", {})
     for name in options.environments:
-        original = brax.envs.get_environment(name, backend=DEFAULT_BACKEND)
+        original = brax.envs.get_environment(name, backend=BACKEND)
+        own: Any = environment_spec(name).make(BACKEND)[0]
         calls = {
-            OWN: rollout(BraxEnvironment(name).brax_env, options),
+            OWN: rollout(own.brax_env, options),
             PEER: rollout(original, options),
         }
         compilation = {}
