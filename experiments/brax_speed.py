@@ -12,15 +12,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import brax.envs
 import jax
 import numpy as np
 
 from experiments.harness import Experiment, Report, Save
+from experiments.timing import OWN, in_turn
 from scb.environments.registry import environment_spec, families
 from scb.errors import at_least
+from scb.keys import named_key, root_key, split_key
 
-OWN, PEER = "scb", "brax"
+PEER = "brax"
 BACKEND = "generalized"
 SEED = 1
 
@@ -42,12 +43,12 @@ class Options:
         at_least(1, self, "num_envs", "steps", "repeats")
 
 
-def rollout(env: Any, options: Options) -> Callable[[], Any]:
+def rollout(env: Any, options: Options) -> Callable[[], jax.Array]:
     """A call that takes all steps from the same start states, and gives the [num_envs, O] last observations."""
-    keys = jax.random.split(jax.random.key(SEED), options.num_envs)
-    states = jax.jit(jax.vmap(env.reset))(keys)
+    key = root_key(SEED)
+    states = jax.jit(jax.vmap(env.reset))(split_key(key, options.num_envs))
     shape = (options.steps, options.num_envs, env.action_size)
-    actions = jax.random.uniform(jax.random.key(SEED + 1), shape, minval=-1.0)
+    actions = jax.random.uniform(named_key(key, "actions"), shape, minval=-1.0)
 
     @jax.jit
     def steps(states: Any, actions: jax.Array) -> jax.Array:
@@ -60,40 +61,33 @@ def rollout(env: Any, options: Options) -> Callable[[], Any]:
     return lambda: jax.block_until_ready(steps(states, actions))
 
 
+def seconds(call: Callable[[], Any]) -> float:
+    """That a call takes."""
+    start = time.perf_counter()
+    call()
+    return time.perf_counter() - start
+
+
 def measure(options: Options, report: dict[str, Any], save: Save) -> None:
-    """In turn, so that what else the machine does meets both."""
+    """An environment at a time."""
+    import brax.envs  # it prints what it misses
+
     report |= {"num_envs": options.num_envs, "steps": options.steps, "repeats": options.repeats}
     found = report.setdefault("environments", {})
+    steps = options.num_envs * options.steps
     for name in options.environments:
-        original = brax.envs.get_environment(name, backend=BACKEND)
         own: Any = environment_spec(name).make(BACKEND)[0]
-        calls = {
-            OWN: rollout(own.brax_env, options),
-            PEER: rollout(original, options),
-        }
-        compilation = {}
-        for who, call in calls.items():
-            start = time.perf_counter()
-            call()
-            compilation[who] = round(time.perf_counter() - start, 1)
-        rates: dict[str, list[float]] = {who: [] for who in calls}
-        for _ in range(options.repeats):
-            for who, call in calls.items():
-                start = time.perf_counter()
-                call()
-                seconds = time.perf_counter() - start
-                rates[who].append(options.num_envs * options.steps / seconds)
-        found[name] = {
-            **{who: round(float(np.median(x))) for who, x in rates.items()},
-            "ratios": [round(a / b, 2) for a, b in zip(rates[OWN], rates[PEER], strict=True)],
-            "compilation": compilation,
-        }
+        peer = brax.envs.get_environment(name, backend=BACKEND)
+        calls = {OWN: rollout(own.brax_env, options), PEER: rollout(peer, options)}
+        compilation = {who: round(seconds(call), 1) for who, call in calls.items()}
+        rates = {who: lambda call=call: steps / seconds(call) for who, call in calls.items()}
+        found[name] = {**in_turn(rates, options.repeats), "compilation": compilation}
         print(name, found[name], flush=True)
         save()
 
 
 def facts(report: Report) -> dict[str, Any]:
-    """The median of each ratio, and what they are between."""
+    """The median of each environment's ratios."""
     ratios = {
         name: float(np.median(cell["ratios"])) for name, cell in report["environments"].items()
     }

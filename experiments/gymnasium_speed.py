@@ -9,6 +9,7 @@ in one process, several times over; compare the ratios, for the seconds are the 
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +19,11 @@ import numpy as np
 from gymnax.wrappers.gym import GymnaxToGymWrapper, GymnaxToVectorGymWrapper
 
 from experiments.harness import Experiment, Report, Save
+from experiments.timing import OWN, in_turn
 from scb.errors import at_least
 from scb.gymnasium import NAMESPACE
 
-OWN, PEER = "scb", "gymnax's wrapper"
+PEER = "gymnax's wrapper"
 
 
 @dataclass(frozen=True)
@@ -86,20 +88,16 @@ def _episode(env: Any, action: Any, alone: bool) -> Callable[[], Any]:
 
 
 def measure(options: Options, report: dict[str, Any], save: Save) -> None:
-    """In turn, so that what else the machine does meets both."""
+    """One bandit after the other, alone and many of it."""
     found: dict[str, Any] = {}
     for name in options.bandits:
         found[name] = {}
         for kind, num_envs in (("one", None), ("many", options.num_envs)):
-            calls = stepping(name, num_envs)
-            rates: dict[str, list[float]] = {who: [] for who in calls}
-            for _ in range(options.repeats):
-                for who, call in calls.items():
-                    rates[who].append(steps_a_second(call, num_envs or 1, options.seconds))
-            found[name][kind] = {
-                **{who: round(float(np.median(x))) for who, x in rates.items()},
-                "ratios": [round(a / b, 2) for a, b in zip(rates[OWN], rates[PEER], strict=True)],
+            rates = {
+                who: partial(steps_a_second, call, num_envs or 1, options.seconds)
+                for who, call in stepping(name, num_envs).items()
             }
+            found[name][kind] = in_turn(rates, options.repeats)
             print(name, kind, found[name][kind], flush=True)
     report |= {"bandits": found, "num_envs": options.num_envs}
     save()

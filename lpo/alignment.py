@@ -27,7 +27,8 @@ from scb.environments.registry import environment_spec, make
 from scb.errors import UserError, at_least
 from scb.evolution import map_population
 from scb.keys import root_key, split_key
-from scb.measurement import Judge, check_seeds, families, train_and_judge
+from scb.measurement import Judge, check_seeds, train_and_judge
+from scb.objectives import families
 from scb.rows import Rows
 from scb.runs import Stopwatch
 from scb.statistics import iqm, spearman

@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 from operator import itemgetter
-from typing import Any, NamedTuple, Protocol, TypeVar
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -26,6 +26,7 @@ from scb.evaluation import Episodes
 from scb.evolution import map_population
 from scb.files import plain
 from scb.keys import root_key, split_key
+from scb.objectives import Objective, programs_for
 from scb.rows import Row, Rows
 
 MODE, SAMPLED = "mode", "sampled"
@@ -129,20 +130,6 @@ class Place:
         """An environment or bandit of the registry, with this physics."""
         spec = environment_spec(name)
         return cls(spec.name, *spec.make(backend), spec.physics(backend))
-
-
-class Objective(Protocol):
-    """What may take the place of an agent's own: a drift and its parameters, under a name."""
-
-    @property
-    def name(self) -> str: ...
-    @property
-    def drift(self) -> Any: ...
-    @property
-    def parameters(self) -> Any: ...
-
-
-AnyObjective = TypeVar("AnyObjective", bound=Objective)
 
 
 @dataclass(frozen=True, eq=False)
@@ -276,7 +263,7 @@ def measure(
         for name, objective in named.items()
     }
     # Physics take a minute to compile, however short the training.
-    for drift, parameters in _programs_for(objectives, shared=train_in.backend is not None):
+    for drift, parameters in programs_for(objectives, shared=train_in.backend is not None):
         agent = spec.agent(train_in.env, drift)
         names: list[str | None] = list(parameters) or [None]
         wanted = [(name, i) for name in names for i in range(len(agents.names))]
@@ -323,54 +310,6 @@ def measure(
             done = sum(len(cells[name].done) for name in names)
             tell(f"{', '.join([judge_in.name, *parameters])}: {done} of {len(wanted)} agents")
     return [row for cell in cells.values() for one in agents.names for row in cell.done[one]]
-
-
-def families(objectives: Sequence[AnyObjective]) -> list[list[AnyObjective]]:
-    """Objectives that differ in their drifts' parameters alone stand together: one program trains them all."""
-    found: list[list[AnyObjective]] = []
-    for objective in objectives:
-        family = next((f for f in found if f[0].drift == objective.drift), None)
-        if family is None:
-            found.append([objective])
-        else:
-            family.append(objective)
-    return found
-
-
-@dataclass(frozen=True)
-class _OneOf:
-    """Several drifts as one, whose parameters are (number of the one that counts, parameters of each)."""
-
-    drifts: tuple[Callable[..., jax.Array], ...]
-
-    def __call__(
-        self, parameters: Any, log_ratio: jax.Array, advantage: jax.Array, progress: jax.Array
-    ) -> jax.Array:
-        number, each = parameters
-        penalty = jnp.zeros_like(log_ratio)
-        for i, (drift, own) in enumerate(zip(self.drifts, each, strict=True)):
-            # The others see a ratio of 1, where all are finite and flat: 0 times what they say is 0.
-            seen = jnp.where(number == i, log_ratio, 0.0)
-            penalty += jnp.where(number == i, drift(own, seen, advantage, progress), 0.0)
-        return penalty
-
-
-def _programs_for(
-    objectives: Sequence[Objective], shared: bool
-) -> list[tuple[Any, dict[str, Any]]]:
-    """[(drift, {objective: its parameters})] of the programs that train the objectives; one program where `shared`."""
-    groups = families(objectives)
-    if not groups:
-        return [(None, {})]
-    if not shared or len(groups) == 1:
-        return [(group[0].drift, {o.name: o.parameters for o in group}) for group in groups]
-    of_each = [group[0].parameters for group in groups]
-    parameters = {
-        o.name: (jnp.int32(i), (*of_each[:i], o.parameters, *of_each[i + 1 :]))
-        for i, group in enumerate(groups)
-        for o in group
-    }
-    return [(_OneOf(tuple(group[0].drift for group in groups)), parameters)]
 
 
 def _program_of(

@@ -62,26 +62,21 @@ def _surface(parts: Mapping[str, Any], x: Any, y: Any, observations: Any, values
     }
 
     texts = ["the best", *(f"{value:.3g}" for value in values)]
-    # A position of the slider each: of the surface, then of either cloud.
-    heights = [
-        [np.round(np.asarray(x, float), 4) for x in position]
-        for position in zip(
-            *(
-                parts["rewards"](states, values.tolist())
-                for states in (observations, *(points for points, _ in clouds.values()))
-            ),
-            strict=True,
-        )
-    ]
-    for position in heights:
-        position[0] = position[0].reshape(POINTS, POINTS)
-    everything = np.concatenate([grid.ravel() for grid, *_ in heights])
-    low, high = float(everything.min()), float(everything.max())
+
+    def rewards(states: Any) -> list[np.ndarray]:
+        """Of the states, at each position of the slider."""
+        found = parts["rewards"](states, values.tolist())
+        return [np.round(np.asarray(x, float), 4) for x in found]
+
+    surfaces = [x.reshape(POINTS, POINTS) for x in rewards(observations)]
+    heights = {name: rewards(points) for name, (points, _) in clouds.items()}
+    positions = [list(z) for z in zip(surfaces, *heights.values(), strict=True)]
+    low, high = float(np.min(surfaces)), float(np.max(surfaces))
     traces = [
         go.Surface(
             x=x,
             y=y,
-            z=heights[0][0],
+            z=surfaces[0],
             cmin=low,
             cmax=high,
             colorscale="Viridis",
@@ -89,12 +84,11 @@ def _surface(parts: Mapping[str, Any], x: Any, y: Any, observations: Any, values
             opacity=0.9,
         )
     ]
-    for (name, (points, color)), z in zip(clouds.items(), heights[0][1:], strict=True):
+    for name, (points, color) in clouds.items():
         a, b = plane.project(points).T
+        marker = {"size": 2, "color": color}
         traces.append(
-            go.Scatter3d(
-                x=a, y=b, z=z, mode="markers", name=name, marker={"size": 2, "color": color}
-            )
+            go.Scatter3d(x=a, y=b, z=heights[name][0], mode="markers", name=name, marker=marker)
         )
     figure = go.Figure(traces)
     figure.update_layout(
@@ -111,7 +105,7 @@ def _surface(parts: Mapping[str, Any], x: Any, y: Any, observations: Any, values
         sliders=[
             slider(
                 parts["action"],
-                [(text, {"z": z}) for text, z in zip(texts, heights, strict=True)],
+                [(text, {"z": z}) for text, z in zip(texts, positions, strict=True)],
                 0,
             )
         ],

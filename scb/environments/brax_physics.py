@@ -8,8 +8,8 @@ and products cost far more than their arithmetic:
 - The forces of contacts and joint limits: accelerated projected gradient descent (Beck & Teboulle, 2009) with a line
   search, which is jaxopt's there (`nonnegative_forces`).
 
-Brax's loops always run to their ends, here they stop when all have converged. And the axis that vmap adds is the last
-one here, so that each product of small matrices is arithmetic on whole batches.
+Brax's loops always run to their ends, here they stop when all have converged. And for the inverse, the axis that vmap
+adds is the last one here, so that each product of small matrices is arithmetic on whole batches.
 
 Loops that stop have no reverse mode: whoever differentiates through the physics takes Brax's own environment.
 """
@@ -27,7 +27,7 @@ from jax.custom_batching import custom_vmap
 
 TOLERANCE = 1e-3  # jaxopt's, of the iterates' change over the size of the step
 SMALLEST = 1e-6  # step, below which jaxopt starts from 1 again
-Carry = tuple[jax.Array, ...]
+Carry = tuple[Any, ...]
 
 
 def accelerate(env: Any) -> None:
@@ -59,7 +59,7 @@ def matrix_inv(sys: Any, state: Any, iterations: int) -> Any:
     from brax.generalized import mass
 
     matrix = mass.matrix(sys, state)
-    inverse = _batches_last(partial(improved_inverse, iterations=iterations), (2, 2), 2)
+    inverse = _batches_last(partial(improved_inverse, iterations=iterations))
     return state.replace(mass_mx=matrix, mass_mx_inv=inverse(matrix, state.mass_mx_inv))
 
 
@@ -79,15 +79,11 @@ def constraint_force(sys: Any, state: Any) -> jax.Array:
     return _combined(state.con_jac, forces)
 
 
-# -- arithmetic on arrays whose last axes, "...", are batches
-# ------------------------------------------------------------------------
-
-
 def improved_inverse(matrix: jax.Array, guess: jax.Array, iterations: int) -> jax.Array:
     """`brax.math.inv_approximate`, ended where it has converged: [N, N, ...] and a guess at its inverse -> [N, N, ...].
 
     The guess is given up for a small multiple of the matrix where it is far off. As in Brax, the first iteration
-    then still has the residual of the guess; for walker2d and the humanoids, that and a mass matrix of a condition
+    then still has the residual of the guess; on walker2d and humanoidstandup, that and a mass matrix of a condition
     of about 1000 keep the result from being an inverse, and it is part of what these environments are.
     """
     eye = jnp.eye(len(matrix), dtype=matrix.dtype).reshape(
@@ -109,12 +105,18 @@ def improved_inverse(matrix: jax.Array, guess: jax.Array, iterations: int) -> ja
     small = jnp.swapaxes(matrix, 0, 1) / (2 * jnp.sum(matrix**2, axis=(0, 1)))
     found = jnp.where(norm(residual) > 1, small, guess)
     errors = jnp.ones(matrix.shape[2:], matrix.dtype)
-    # Each error is the one before squared: after 1e-3 comes what rounding leaves.
-    return _while(
-        lambda carry: (carry[0] < iterations) & (carry[-1] > 1e-3),
-        improve,
-        (jnp.zeros_like(errors), found, residual, errors, errors),
-    )[1]
+
+    def goes_on(carry: Carry) -> jax.Array:
+        # Each error is the one before squared: after 1e-3 comes what rounding leaves.
+        return (carry[0] < iterations) & (carry[-1] > 1e-3)
+
+    def improve_some(carry: Carry) -> Carry:
+        """What vmap would do: a matrix that has converged keeps its inverse while others go on."""
+        going = goes_on(carry)
+        return tuple(jnp.where(going, *x) for x in zip(improve(carry), carry, strict=True))
+
+    start = (jnp.zeros_like(errors), found, residual, errors, errors)
+    return jax.lax.while_loop(lambda carry: jnp.any(goes_on(carry)), improve_some, start)[1]
 
 
 def nonnegative_forces(
@@ -123,13 +125,13 @@ def nonnegative_forces(
     """Minimizes |response(x) + offset|^2 / 2 over x >= 0, as `jaxopt.ProjectedGradient` does from x = 0.
 
     Args:
-      response: linear and symmetric, [C, ...] -> [C, ...].
-      offset: [C, ...].
+      response: linear and symmetric, [C] -> [C].
+      offset: [C].
       iterations: the most that are made.
       halvings: of the step in one line search, the most that are made.
 
     Returns:
-      [C, ...] x.
+      [C] x.
     """
     rounding = jnp.finfo(offset.dtype).eps
 
@@ -137,52 +139,38 @@ def nonnegative_forces(
         number, x, point, momentum, size, _ = carry
         residual = response(point) + offset
         gradient = response(residual)
-        value = jnp.sum(residual**2, axis=0) / 2
+        value = jnp.sum(residual**2) / 2
 
         def tried(size: jax.Array) -> Carry:
             """Where a step of this size leads, and whether the step was too large."""
             there = jnp.maximum(point - size * gradient, 0)
             change = there - point
-            gain = jnp.sum((response(there) + offset) ** 2, axis=0) / 2 - value
-            bound = size * jnp.sum(gradient * change, axis=0) + jnp.sum(change**2, axis=0) / 2
+            gain = jnp.sum((response(there) + offset) ** 2) / 2 - value
+            bound = size * jnp.sum(gradient * change) + jnp.sum(change**2) / 2
             return there, size * gain > bound + rounding
 
         def halved(carry: Carry) -> Carry:
             count, size, _, _ = carry
             return count + 1, size / 2, *tried(size / 2)
 
-        _, size, there, _ = _while(
+        _, size, there, _ = jax.lax.while_loop(
             lambda carry: carry[-1] & (carry[0] < halvings),
             halved,
-            (jnp.zeros_like(size), size, *tried(size)),
+            (0, size, *tried(size)),
         )
         size = jnp.where(size <= SMALLEST, 1.0, size * 2)
         next_momentum = (1 + jnp.sqrt(1 + 4 * momentum**2)) / 2
         change = there - x
         point = there + (momentum - 1) / next_momentum * change
-        error = jnp.sqrt(jnp.sum(change**2, axis=0)) / size
+        error = jnp.sqrt(jnp.sum(change**2)) / size
         return number + 1, there, point, next_momentum, size, error
 
-    zero, ones = jnp.zeros_like(offset), jnp.ones(offset.shape[1:], offset.dtype)
-    return _while(
+    zero, one = jnp.zeros_like(offset), jnp.ones((), offset.dtype)
+    return jax.lax.while_loop(
         lambda carry: (carry[0] < iterations) & (carry[-1] > TOLERANCE),
         iterate,
-        (jnp.zeros_like(ones), zero, zero, ones, ones, jnp.full_like(ones, jnp.inf)),
+        (0, zero, zero, one, one, one * jnp.inf),
     )[1]
-
-
-def _while(
-    goes_on: Callable[[Carry], jax.Array], body: Callable[[Carry], Carry], carry: Carry
-) -> Carry:
-    """`jax.lax.while_loop` of a batch: `goes_on` gives [...], and what does not go on keeps its values."""
-
-    def step(carry: Carry) -> Carry:
-        going = goes_on(carry)
-        return tuple(
-            jnp.where(going, new, old) for new, old in zip(body(carry), carry, strict=True)
-        )
-
-    return jax.lax.while_loop(lambda carry: jnp.any(goes_on(carry)), step, carry)
 
 
 def _product(left: jax.Array, right: jax.Array) -> jax.Array:
@@ -191,14 +179,12 @@ def _product(left: jax.Array, right: jax.Array) -> jax.Array:
 
 
 def _combined(rows: jax.Array, weights: jax.Array) -> jax.Array:
-    """[R, C, ...] rows, [R, ...] weights -> [C, ...] their sum."""
+    """[R, C] rows, [R] weights -> [C] their sum."""
     return reduce(add, (row * weight for row, weight in zip(rows, weights, strict=True)))
 
 
-def _batches_last(
-    function: Callable[..., jax.Array], axes: tuple[int, ...], out_axes: int
-) -> Callable[..., jax.Array]:
-    """`function`, with its batch axes last where vmap adds some; of their own, its arguments have so many `axes`."""
+def _batches_last(function: Callable[..., jax.Array]) -> Callable[..., jax.Array]:
+    """A function of [N, N, ...] arrays that gives one, with the batch axes that vmap adds as its "..."."""
 
     @custom_vmap
     def batched(*arrays: jax.Array) -> jax.Array:
@@ -207,13 +193,11 @@ def _batches_last(
     @batched.def_vmap
     def rule(size: int, is_batched: list[bool], *arrays: jax.Array) -> tuple[jax.Array, bool]:
         last = [
-            jnp.moveaxis(array, 0, own)
+            jnp.moveaxis(array, 0, 2)
             if there
-            else jnp.broadcast_to(
-                jnp.expand_dims(array, own), (*array.shape[:own], size, *array.shape[own:])
-            )
-            for array, there, own in zip(arrays, is_batched, axes, strict=True)
+            else jnp.repeat(jnp.expand_dims(array, 2), size, axis=2)
+            for array, there in zip(arrays, is_batched, strict=True)
         ]
-        return jnp.moveaxis(batched(*last), out_axes, 0), True
+        return jnp.moveaxis(batched(*last), 2, 0), True
 
     return batched

@@ -19,7 +19,7 @@ def matrices(condition: float, number: int, size: int = 6) -> np.ndarray:
 
 
 def inverted(matrix: jax.Array, guess: jax.Array, iterations: int) -> jax.Array:
-    return _batches_last(partial(improved_inverse, iterations=iterations), (2, 2), 2)(matrix, guess)
+    return _batches_last(partial(improved_inverse, iterations=iterations))(matrix, guess)
 
 
 # Near: a guess from which it converges. Far: one that is given up, which converges or, as for walker2d, doesn't.
