@@ -4,10 +4,11 @@
 
 Physics is `generalized`, on which agents hop: 5.24 million steps, minutes an agent. A few agents of every objective
 are trained at a time, and --out is saved after each few: the same command goes on where it was, and with more
-`--seeds` or `--objectives` adds to it.
+`--seeds` or `--objectives` adds to it. With `--tuning-agents` a clip is chosen for each environment first, by agents
+that report nothing, and compared like the others. (As jobs, the same command once more trains it.)
 """
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -21,12 +22,12 @@ from experiments.parts import InParts, Part
 from lpo import figures
 from lpo.comparison import LearningCurves, compare, ppo_spec
 from lpo.full_size import as_comparison
-from lpo.objectives import load_objective
+from lpo.objectives import CLIPS, load_objective
 from scb.errors import at_least
 from scb.files import plain
 from scb.rows import Rows
-from scb.seeds import reporting
-from scb.statistics import Estimate, paired_difference
+from scb.seeds import reporting, validation
+from scb.statistics import Estimate, iqm, paired_difference
 
 BACKEND = "generalized"
 REFERENCE = "ppo"
@@ -45,37 +46,69 @@ class Options:
     """agents of each"""
     together: int = 2
     """agents that are trained side by side, and saved when all of them have ended"""
+    tuning_agents: int = 0
+    """of each of some clips, on seeds that report nothing: the best clip is compared as well"""
     runs: Path = Path("runs/locomotion")
     """for agents until they are saved"""
 
     def __post_init__(self) -> None:
         at_least(1, self, "seeds", "together")
+        at_least(0, self, "tuning_agents")
 
 
 def parts(options: Options, report: dict[str, Any]) -> Iterator[Part]:
-    """A few seeds of every objective at a time, so that all have as many wherever it ends."""
+    """The choice of a clip, then a few seeds of every objective at a time: all have as many wherever it ends."""
     for name in options.objectives:
         load_objective(name)  # that nobody waits for a name that is none
-    seeds = reporting(options.seeds)
     for environment in options.environments:
-        for start in range(0, len(seeds), options.together):
-            for name in options.objectives:
-                there = _agents(report, environment, name)
-                few = [s for s in seeds[start : start + options.together] if str(s) not in there]
-                trained = partial(_trained, environment, name, few, options.runs)
-                names = tuple(("agents", name, str(seed)) for seed in few)
-                yield Part(("environments", environment), trained, names)
+        names = options.objectives
+        if options.tuning_agents:
+            seeds = validation(options.tuning_agents)
+            yield from _of(environment, CLIPS, seeds, options, report, "sweep")
+            best = tuned(report.get("environments", {}).get(environment, {}))
+            names = (*names, best) if best and best not in names else names
+        yield from _of(environment, names, reporting(options.seeds), options, report, "agents")
+
+
+def _of(
+    environment: str,
+    objectives: Sequence[str],
+    seeds: Sequence[int],
+    options: Options,
+    report: Report,
+    place: str,
+) -> Iterator[Part]:
+    for start in range(0, len(seeds), options.together):
+        for name in objectives:
+            there = report.get("environments", {}).get(environment, {}).get(place, {}).get(name, {})
+            few = [s for s in seeds[start : start + options.together] if str(s) not in there]
+            trained = partial(_trained, environment, name, few, options.runs, place)
+            names = tuple((place, name, str(seed)) for seed in few)
+            yield Part(("environments", environment), trained, names)
 
 
 measure = InParts(parts)
 
 
-def _agents(report: Report, environment: str, objective: str) -> Report:
-    entry = report.get("environments", {}).get(environment, {})
-    return dict(entry.get("agents", {}).get(objective, {}))
+def swept(entry: Report) -> dict[str, float]:
+    """{clip: what it earns over the last quarter of the training}, as soon as all have as many agents."""
+    found = entry.get("sweep", {})
+    numbers = {len(found.get(clip, ())) for clip in CLIPS}
+    if len(numbers) > 1 or numbers == {0}:
+        return {}
+    curves = as_comparison("", {**entry, "agents": {clip: found[clip] for clip in CLIPS}}).curves
+    return {curve.objective: float(iqm(curve.late)) for curve in curves}
 
 
-def _trained(environment: str, objective: str, seeds: list[int], runs: Path) -> dict[str, Any]:
+def tuned(entry: Report) -> str | None:
+    """The clip that earns most of them."""
+    sweep = swept(entry)
+    return max(sweep, key=lambda clip: sweep[clip]) if sweep else None
+
+
+def _trained(
+    environment: str, objective: str, seeds: list[int], runs: Path, place: str
+) -> dict[str, Any]:
     rows = Rows(runs / environment / f"{objective}-{seeds[0]}.rows.jsonl")
     (found,) = compare(
         environment,
@@ -91,7 +124,7 @@ def _trained(environment: str, objective: str, seeds: list[int], runs: Path) -> 
         "backend": BACKEND,
         "steps": found.steps.tolist(),
         "episodes": found.episodes,
-        "agents": {objective: kept(found)},
+        place: {objective: kept(found)},
     }
 
 
@@ -154,6 +187,11 @@ def facts(report: Report) -> dict[str, Any]:
             name: as_comparison(name, entry) for name, entry in report["environments"].items()
         },
         "deciding": DECIDING,
+        "sweeps": {
+            name: (sweep, len(entry["sweep"][REFERENCE]), tuned(entry))
+            for name, entry in report["environments"].items()
+            if (sweep := swept(entry))
+        },
         "diagnosed": [name for name in report["environments"] if _diagnosed(report, name)],
     }
 

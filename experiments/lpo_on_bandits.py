@@ -28,7 +28,7 @@ from experiments.searches import judgements, objective_of_run, read_log
 from lpo import figures
 from lpo.comparison import LearningCurves, compare
 from lpo.full_size import full_size
-from lpo.objectives import Objective, load_objective
+from lpo.objectives import CLIPS, Objective, load_objective
 from scb import plotting
 from scb.agents.spec import AgentSpec, environment_agent
 from scb.errors import UserError
@@ -42,7 +42,6 @@ ROUGHLY = 50  # times as many are roughly two orders of magnitude
 SIZES = ("population_size", "agents_per_candidate", "generations")
 # Of the zoo: one search on the bandit, one on Pendulum.
 HOPPER = {"ppo": "ppo", "dpo": "dpo", BANDIT: "lpo-pendulum", ENVIRONMENT: "lpo-pendulum-ee"}
-CLIPS = ("ppo-0.1", "ppo", "ppo-0.3", "ppo-0.5", "ppo-1")
 SCALES = {"Flax's initialisation": 1.0, "small last layer": 0.01}
 
 

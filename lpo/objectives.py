@@ -18,6 +18,7 @@ from scb.keys import root_key
 
 KIND = "drift"
 KNOWN: dict[str, Drift] = {"ppo": ClipDrift(), "dpo": DPODrift(), "none": NoDrift()}
+CLIPS = ("ppo-0.1", "ppo", "ppo-0.3", "ppo-0.5", "ppo-1")  # among which a tuned one is looked for
 _CLIP_NAME = re.compile(r"ppo-(\d*\.?\d+)$")
 
 

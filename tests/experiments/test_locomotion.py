@@ -12,7 +12,7 @@ from experiments import locomotion as module
 from lpo import full_size
 from lpo.comparison import Comparison, LearningCurves
 from scb.agents.ppo import DIAGNOSIS
-from scb.seeds import REPORTING
+from scb.seeds import REPORTING, VALIDATING
 
 STEPS = [0, 50, 100]
 
@@ -69,6 +69,36 @@ def test_an_interrupted_measurement_goes_on_where_it_was(tmp_path, compared):
         "| dpo | 4 | 502 [500, 503] | 502 [500, 503] |" in page
         and "fewer than 10 agents decide nothing" in page
     )
+
+
+def test_a_clip_is_chosen_on_seeds_that_report_nothing_and_compared(
+    tmp_path, compared, monkeypatch
+):
+    asked, limit = compared
+    made = module.compare
+
+    def best_at_half(environment, objectives, seeds, *rest, **further):
+        (of,) = made(environment, objectives, seeds, *rest, **further).curves
+        return Comparison(
+            [replace(of, returns=of.returns + 50 * (objectives[0].name == "ppo-0.5"))]
+        )
+
+    monkeypatch.setattr(module, "compare", best_at_half)
+    flags = ["--objectives", "ppo", "--seeds", "2", "--tuning-agents", "3"]
+    out = tmp_path / "report.json"
+    limit[0] = 9
+    with pytest.raises(ConnectionError):
+        module.EXPERIMENT.main([*flags, "--out", str(out)])
+    assert module.tuned(json.loads(out.read_text())["environments"]["hopper"]) is None
+    limit[0] = 100
+    assert module.EXPERIMENT.main([*flags, "--out", str(out)]) == 0
+    judged = tuple(REPORTING[:2])
+    sweeps, rest = asked[:10], asked[10:]
+    assert {clip for _, clip, _ in sweeps} == set(module.CLIPS)
+    assert {seeds for *_, seeds in sweeps} == {tuple(VALIDATING[:2]), tuple(VALIDATING[2:3])}
+    assert rest == [("hopper", clip, judged) for clip in ("ppo", "ppo-0.5")]
+    page = (tmp_path / "locomotion.md").read_text()
+    assert "| ppo-0.5 | 2 |" in page and "ppo-0.5 is the tuned one." in page
 
 
 def test_what_was_kept_is_read_as_it_was(tmp_path):
