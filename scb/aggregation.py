@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from scb.agents.agent import Agent
 from scb.agents.spec import AgentSpec
 from scb.environments.synthetic import SyntheticBandit, Weights
 from scb.evolution import map_population
@@ -49,6 +50,18 @@ def trajectory(
     return jax.lax.scan(step, (env_state, observation), keys)[1]
 
 
+class Learned(NamedTuple):
+    """Agents of one algorithm.
+
+    Attributes:
+      returns: [N] what each earns; what is not finite counts as -inf.
+      states: of the agents, every leaf [N], to act with; keys are left as numbers.
+    """
+
+    returns: np.ndarray
+    states: Any
+
+
 class Learners:
     """Agents that train in a bandit: what they earn in the environment, and where they go there.
 
@@ -57,18 +70,23 @@ class Learners:
       specs: of the agents, by algorithm; what they have lists for is drawn.
       place: the environment.
       number: of agents of each algorithm.
+      episodes: by which each is judged.
     """
 
     def __init__(
-        self, bandit: SyntheticBandit, specs: Mapping[str, AgentSpec], place: Place, number: int
+        self,
+        bandit: SyntheticBandit,
+        specs: Mapping[str, AgentSpec],
+        place: Place,
+        number: int,
+        episodes: int = EPISODES,
     ) -> None:
         self._bandit, self._specs, self._number = bandit, specs, number
-        judge = Judge(place.env, place.params, EPISODES, mode=True)
+        self.agents = {name: spec.agent(bandit) for name, spec in specs.items()}
+        judge = Judge(place.env, place.params, episodes, mode=True)
         each = -(-TRAJECTORIES // (number * len(specs)))
 
-        def program(spec: AgentSpec) -> Any:
-            agent = spec.agent(bandit)
-
+        def program(agent: Agent) -> Any:
             def one(hyperparameters: Any, key: jax.Array, params: Any) -> Any:
                 state, earned = train_and_judge(
                     agent, hyperparameters, key, params, {"return": judge}
@@ -81,24 +99,31 @@ class Learners:
                     return trajectory(place, act, *split_key(key))
 
                 visited = jax.vmap(roll)(split_key(named_key(key, "visits"), each))
-                return earned["return"].returns.mean(), visited
+                return earned["return"].returns.mean(), visited, jax.tree.map(_as_number, state)
 
             return map_population(one, number, (0, 0, None))
 
-        self._programs = {name: program(spec) for name, spec in specs.items()}
+        self._programs = {name: program(agent) for name, agent in self.agents.items()}
         limit = int(place.params.max_steps_in_episode)
-        self.steps = number * len(specs) * EPISODES * limit
+        self.steps = number * len(specs) * episodes * limit
 
-    def __call__(self, weights: Weights, key: jax.Array) -> tuple[float, Visited]:
-        """(mean return of all agents, [N, T, ...] states that they visit); what is not finite counts as -inf."""
-        params, found = self._bandit.params(weights), []
+    def __call__(
+        self, weights: Weights, key: jax.Array
+    ) -> tuple[float, Visited, dict[str, Learned]]:
+        """(mean return of all agents, [N, T, ...] states that they visit, the agents by algorithm)."""
+        params, visits, learned = self._bandit.params(weights), [], {}
         for name, spec in self._specs.items():
             key_draw, key_agents = split_key(named_key(key, name))
             drawn = spec.sample(key_draw, self._number)
-            found.append(self._programs[name](drawn, split_key(key_agents, self._number), params))
-        returns = np.concatenate([earned for earned, _ in found])
-        visited = jax.tree.map(
-            lambda *x: jnp.concatenate([jnp.reshape(y, (-1, *y.shape[2:])) for y in x]),
-            *(visited for _, visited in found),
-        )
-        return float(np.where(np.isfinite(returns), returns, -np.inf).mean()), visited
+            earned, visited, states = self._programs[name](
+                drawn, split_key(key_agents, self._number), params
+            )
+            learned[name] = Learned(np.where(np.isfinite(earned), earned, -np.inf), states)
+            visits.append(jax.tree.map(lambda x: jnp.reshape(x, (-1, *x.shape[2:])), visited))
+        mean = np.concatenate([of.returns for of in learned.values()]).mean()
+        return float(mean), jax.tree.map(lambda *x: jnp.concatenate(x), *visits), learned
+
+
+def _as_number(leaf: jax.Array) -> jax.Array:
+    """A key as the numbers that it is made of; anything else as it is."""
+    return jax.random.key_data(leaf) if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) else leaf

@@ -150,6 +150,11 @@ class DiscoveryConfig:
         fitted = self.init == "expert" and self.start is None
         if fitted and self.bandit.form == "linear":
             check_linear(self.warm_start.construction)
+        if fitted and self.bandit.form != "linear" and self.warm_start.refinement_rounds:
+            raise UserError(
+                f"refinement_rounds is {self.warm_start.refinement_rounds}, and only a linear bandit's policy is "
+                "refined: choose the form linear, or leave it out."
+            )
         if self.lists and self.fixed_hyperparameters:
             raise UserError(
                 "fixed hyperparameters are not drawn from lists: leave out the lists, or draw."

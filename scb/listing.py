@@ -68,12 +68,15 @@ def print_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]
 
 
 def found(metadata: Mapping[str, Any]) -> str:
-    """How a bandit was: fitted to an expert, with or without aggregation, or from random weights; evolved or not."""
+    """How a bandit was: fitted to an expert, and by what more than that, or from random weights; evolved or not."""
     discovery = metadata["config"]["discovery"]
     earlier = metadata["config"].get("started_from")
     start = "random weights" if discovery["init"] == "random" else "fitted"
-    if start == "fitted" and discovery["warm_start"].get("aggregation_rounds"):
-        start = "fitted with aggregation"
+    if start == "fitted":
+        rounds = [
+            x for x in ("aggregation", "refinement") if discovery["warm_start"].get(f"{x}_rounds")
+        ]
+        start += f" with {' and '.join(rounds)}" if rounds else ""
     evolved = earlier or metadata["cost"].get(
         "generation", discovery["evolution"]["num_generations"]
     )

@@ -97,7 +97,7 @@ class Fake:
 
     def __call__(self, weights, key):
         observation = jnp.tile(jnp.array([1.0, 0.0, 0.5 * jax.random.uniform(key)]), (2, 3, 1))
-        return next(self.returns), Visited(jnp.zeros((2, 3)), observation)
+        return next(self.returns), Visited(jnp.zeros((2, 3)), observation), {}
 
 
 def test_the_fit_whose_agents_earn_most_is_kept(bandit, place, expert, datasets, monkeypatch):
@@ -111,8 +111,9 @@ def test_the_fit_whose_agents_earn_most_is_kept(bandit, place, expert, datasets,
 def test_agents_whose_training_breaks_are_the_worst(bandit, place, monkeypatch):
     monkeypatch.setattr(aggregation, "TRAJECTORIES", 2)
     broken = jax.tree.map(lambda x: x * np.nan, bandit.init_weights(jax.random.key(0)))
-    earned, visited = Learners(bandit, SPECS, place, 2)(broken, jax.random.key(1))
+    earned, visited, learned = Learners(bandit, SPECS, place, 2)(broken, jax.random.key(1))
     assert earned == -np.inf and visited.observation.shape == (2, 200, 3)
+    assert (learned["ppo"].returns == -np.inf).all()
 
 
 def test_an_expert_below_random_actions_is_refused(bandit, place, monkeypatch):

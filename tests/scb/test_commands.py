@@ -178,6 +178,7 @@ EVERY_FLAG = """--preset=paper --environment=MountainCar-v0 --backend=spring --m
 --construction=q --expert=sac --expert-noise=0.2 --expert-episode-steps=5 --near-actions=2 --num-experts=3
 --expert-steps=9 --expert-generations=8 --discount=0.5 --num-states=7 --num-actions=6 --horizon=4 --fit-steps=3
 --aggregation-rounds=2 --aggregation-agents=3
+--refinement-rounds=1 --refinement-generations=2 --refinement-agents=4
 --strategy=Open_ES --population-size=6 --generations=9 --sigma=0.2 --sigma-decay=0.9 --sigma-limit=0.1
 --learning-rate=0.3 --learning-rate-decay=0.8 --learning-rate-limit=0.2 --combine=ranks --mean-evaluations=5
 --evaluate-mean-every=4 --checkpoint-every=3 --seed=8"""
@@ -411,6 +412,10 @@ def test_how_a_bandit_was_found():
     evolution = {"num_generations": 3}
     config = {"discovery": {"init": "expert", "warm_start": warm_start, "evolution": evolution}}
     assert listing.found({"config": config, "cost": {"generation": 0}}) == "fitted with aggregation"
+    warm_start["refinement_rounds"] = 1
+    assert listing.found({"config": config, "cost": {}}) == (
+        "fitted with aggregation and refinement, evolved"
+    )
 
 
 def test_the_programs_say_their_version_and_complete_their_words():

@@ -1,0 +1,137 @@
+"""A linear bandit's policy, searched for further under the errors of the agents that learn from it.
+
+What an agent does differs from the bandit's best action, by most where the agent learned least, and how much a policy
+earns says little of what its agents will. Retraining them for every candidate is what evolution of the bandit does.
+Here agents are trained once a round, and augmented random search moves the policy while what each agent adds to it is
+held fixed: that changes little while the policy does, and a candidate costs an episode and no training.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from evosax.algorithms import ARS
+
+from scb.agents.agent import Agent
+from scb.aggregation import Learned
+from scb.environments.linear import PolicyDistanceParts, units
+from scb.environments.synthetic import SyntheticBandit, Weights
+from scb.evaluation import evaluate
+from scb.evolution import map_population
+from scb.keys import key_at, split_key
+from scb.measurement import Place
+
+DIRECTIONS = 32  # perturbations of a generation, each tried both ways for one episode
+SIGMA = 0.1  # of the perturbations, in the weights' units
+LEARNING_RATE = 0.025
+Change = dict[str, jax.Array]  # {"kernel": [O, A], "bias": [A]}, in the weights' units
+
+
+def moved(weights: Weights, change: Change) -> Weights:
+    """The bandit whose policy is changed; its contexts are the same."""
+    reward, unit = weights["reward"], units(weights)["reward"]
+    return {
+        **weights,
+        "reward": {**reward, **{k: reward[k] + unit[k] * change[k] for k in ("kernel", "bias")}},
+    }
+
+
+class Refinement:
+    """A search that goes on from a linear bandit's policy, with its agents' errors.
+
+    Args:
+      bandit: of these shapes.
+      agents: by algorithm, which trained in it.
+      place: the environment.
+      generations: of a round, which the algorithms have in turn.
+    """
+
+    def __init__(
+        self, bandit: SyntheticBandit, agents: Mapping[str, Agent], place: Place, generations: int
+    ) -> None:
+        self._bandit, self._generations = bandit, generations
+        low, high = bandit.bounds
+
+        def program(agent: Agent) -> Any:
+            def one(
+                change: Change, which: Any, key: jax.Array, start: Change, states: Any, weights: Any
+            ) -> Any:
+                state = jax.tree.map(lambda x: x[which], states)
+                learned, candidate = (
+                    PolicyDistanceParts.of(w["reward"], low, high)
+                    for w in (weights, moved(weights, jax.tree.map(jnp.add, start, change)))
+                )
+
+                def act(observation: jax.Array, key: jax.Array) -> jax.Array:
+                    seen = jnp.ravel(observation)
+                    action = agent.act(state, observation, key, place.params, mode=True)
+                    share = learned.share(jnp.ravel(action))
+                    share = jnp.clip(share + candidate.best(seen) - learned.best(seen), -1, 1)
+                    return jnp.reshape(
+                        learned.middle + learned.half_width * share, jnp.shape(action)
+                    )
+
+                episodes = evaluate(place.env, place.params, act, key, 1)
+                return episodes.returns[0], episodes.lengths[0]
+
+            return map_population(one, 2 * DIRECTIONS, (0, 0, 0, None, None, None))
+
+        self._programs = {name: program(agent) for name, agent in agents.items()}
+
+    def __call__(
+        self, weights: Weights, learned: Mapping[str, Learned], key: jax.Array
+    ) -> tuple[Weights, int]:
+        """A round: the moved bandit, and the environment steps that it took.
+
+        Args:
+          weights: of the bandit that the agents learned from.
+          learned: by algorithm, the agents.
+        """
+        kernel, bias = (jnp.zeros_like(weights["reward"][k]) for k in ("kernel", "bias"))
+        zero: Change = {"kernel": kernel, "bias": bias}
+        search = ARS(
+            2 * DIRECTIONS,
+            zero,
+            optimizer=optax.sgd(LEARNING_RATE),
+            std_schedule=optax.constant_schedule(SIGMA),
+        )
+        search.elite_ratio = 1.0
+        params, steps = search.default_params, 0
+        key_start, key_search = split_key(key)
+        state = search.init(key_start, zero, params)
+        ask, tell = jax.jit(search.ask), jax.jit(search.tell)
+        for number in range(self._generations):
+            algorithm = list(learned)[number % len(learned)]
+            states = learned[algorithm].states
+            key_ask, key_roll, key_tell = split_key(key_at(key_search, number), 3)
+            population, state = ask(key_ask, state, params)
+            mean = search.get_mean(state)
+            # Both ways with the same agent from the same start state.
+            which = np.arange(DIRECTIONS) % len(learned[algorithm].returns)
+            earned, lengths = self._programs[algorithm](
+                jax.tree.map(lambda x, m: x - m, population, mean),
+                np.tile(which, 2),
+                jnp.tile(split_key(key_roll, DIRECTIONS), 2),
+                mean,
+                states,
+                weights,
+            )
+            state, _ = tell(key_tell, population, -paired_ranks(earned), state, params)
+            steps += int(lengths.sum())
+        change: Any = search.get_mean(state)
+        return jax.tree.map(np.asarray, moved(weights, change)), steps
+
+
+def paired_ranks(returns: np.ndarray) -> np.ndarray:
+    """[2 D] the rank of how much one way earns more than the other, the sign with it; -1 to 1.
+
+    Agents differ by more than what they follow does: by their returns alone the best agents would decide.
+    """
+    ahead, back = np.split(np.nan_to_num(np.asarray(returns, float), neginf=0.0), 2)
+    difference = ahead - back
+    ranks = np.argsort(np.argsort(np.abs(difference))) + 1
+    signed = np.sign(difference) * ranks / len(ranks)
+    return np.concatenate([signed, -signed])
