@@ -40,7 +40,14 @@ class Options:
 
     environments: tuple[str, ...] = ("hopper",)
     """of Brax"""
-    objectives: tuple[str, ...] = (REFERENCE, "dpo", "lpo-pendulum", "lpo-multi", "lpo-pendulum-ee")
+    objectives: tuple[str, ...] = (
+        REFERENCE,
+        "dpo",
+        "lpo-pendulum",
+        "lpo-multi",
+        "lpo-pendulum-ee",
+        "ta-lpo",
+    )
     """as `lpo evaluate` takes them; all are compared with PPO's clip"""
     seeds: int = 10
     """agents of each"""
