@@ -281,7 +281,7 @@ def _refined(
     refine = Refinement(bandit, learners.agents, place, config.refinement_generations)
     space, latest, steps, best = place.env.action_space(place.params), weights, 0, -np.inf
     for number, key_round in enumerate(split_key(key, config.refinement_rounds + 1)):
-        key_agents, key_search, key_pick, key_label, key_old = split_key(key_round, 5)
+        key_agents, key_search, key_pick, key_label, key_old, key_fit = split_key(key_round, 6)
         earned, visited, learned = learners(latest, key_agents)
         steps += learners.steps
         if number == 0 or earned > best:
@@ -303,7 +303,7 @@ def _refined(
         dataset = jax.tree.map(lambda x, y, kept=kept: jnp.concatenate([x[kept], y]), dataset, more)
         actions = jax.jit(jax.vmap(policy))(dataset.observation)
         latest, _ = fit_bandit(
-            bandit, dataset._replace(expert_action=actions), key_round, config.construction
+            bandit, dataset._replace(expert_action=actions), key_fit, config.construction
         )
         steps += taken + labelling
     return weights, report, steps
