@@ -70,9 +70,7 @@ class Refinement:
                     action = agent.act(state, observation, key, place.params, mode=True)
                     share = learned.share(jnp.ravel(action))
                     share = jnp.clip(share + candidate.best(seen) - learned.best(seen), -1, 1)
-                    return jnp.reshape(
-                        learned.middle + learned.half_width * share, jnp.shape(action)
-                    )
+                    return jnp.reshape(learned.action(share), jnp.shape(action))
 
                 episodes = evaluate(place.env, place.params, act, key, 1)
                 return episodes.returns[0], episodes.lengths[0]

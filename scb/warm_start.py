@@ -293,8 +293,7 @@ def _refined(
         parts = PolicyDistanceParts.of(latest["reward"], *bandit.bounds)
 
         def policy(observation: jax.Array, parts: PolicyDistanceParts = parts) -> jax.Array:
-            action = parts.middle + parts.half_width * parts.best(jnp.ravel(observation))
-            return jnp.reshape(action, space.shape)
+            return jnp.reshape(parts.action(parts.best(jnp.ravel(observation))), space.shape)
 
         refined = Expert(policy, earned, 0)
         more, labelling = labelled(refined, place, visited, key_pick, key_label, config)

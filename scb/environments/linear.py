@@ -81,6 +81,10 @@ class PolicyDistanceParts(NamedTuple):
         """[..., A] actions, -1 to 1 their range."""
         return (action - self.middle) / self.half_width
 
+    def action(self, share: Any) -> Any:
+        """[..., A] what `share` is of."""
+        return self.middle + self.half_width * share
+
     def reward(self, squared_distance: Any) -> Any:
         """[...] of actions that are so far from the best."""
         # A power below 2 has no gradient at zero distance.
