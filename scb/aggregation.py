@@ -124,6 +124,36 @@ class Learners:
         return float(mean), jax.tree.map(lambda *x: jnp.concatenate(x), *visits), learned
 
 
+Fit = tuple[Weights, dict[str, float]]  # a bandit's weights, and how they came about
+Improve = Callable[[Weights, Visited, dict[str, Learned], jax.Array], tuple[Fit, int]]
+
+
+def best_round(
+    start: Fit, learners: Learners, rounds: int, key: jax.Array, improve: Improve
+) -> tuple[Fit, int]:
+    """Of a fit and of those that are made of it round by round, the one whose agents earn most: rounds scatter.
+
+    Args:
+      rounds: how often the latest is made a better one.
+      improve: takes its weights, what its agents visit, these, and a key; returns the next fit and the
+        environment steps that it took.
+
+    Returns:
+      (the fit, whose report tells its round and what its agents earn; environment steps of all).
+    """
+    (latest, report), best, kept, steps = start, -np.inf, start, 0
+    for number, key_round in enumerate(split_key(key, rounds + 1)):
+        key_agents, key_improve = split_key(key_round)
+        earned, visited, learned = learners(latest, key_agents)
+        steps += learners.steps
+        if number == 0 or earned > best:
+            kept, best = (latest, {**report, "round": number, "agents_return": earned}), earned
+        if number < rounds:
+            (latest, report), taken = improve(latest, visited, learned, key_improve)
+            steps += taken
+    return kept, steps
+
+
 def _as_number(leaf: jax.Array) -> jax.Array:
     """A key as the numbers that it is made of; anything else as it is."""
     return jax.random.key_data(leaf) if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) else leaf

@@ -131,7 +131,7 @@ class Discover(LongRun):
                 self.judgement.judge_agents,
                 self.judgement.judge_episodes,
             )
-            told = scale(config.environment, config.backend, problem.warm_start_report)
+            told = scale(config.environment, config.backend, problem.start_reports)
             console().print(told, soft_wrap=True)
         if not processes.first():
             return
@@ -146,7 +146,7 @@ class Discover(LongRun):
             "results": results,
             "cost": {
                 **outcome.cost(problem, config.evolution, best),
-                "warm_start": problem.warm_start_report,
+                **problem.start_reports,
             },
             "command": self.command,
         }
@@ -154,13 +154,17 @@ class Discover(LongRun):
         console().print(f"bandit: {path}", soft_wrap=True)
 
 
-def scale(environment: str, backend: str | None, warm_start: Mapping[str, float]) -> str:
-    """What returns of an environment are to be compared with, in a sentence."""
+def scale(environment: str, backend: str | None, start: Mapping[str, Mapping[str, float]]) -> str:
+    """What returns of an environment are to be compared with, in a sentence.
+
+    Args:
+      start: how what the search started from came about, by what it was.
+    """
     spec = environment_spec(environment)
     known = {"random actions": spec.random_return(backend)}
-    if "expert_return" in warm_start:
+    if "warm_start" in start:
         who = f"the expert that the bandit was fitted to, in {experts.EPISODES} episodes"
-        known[who] = warm_start["expert_return"]
+        known[who] = start["warm_start"]["expert_return"]
     if (reference := spec.reference(backend)) is not None:
         known[reference.source] = reference.value
     if (standing := spec.standing_still(backend)) is not None:

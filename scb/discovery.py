@@ -5,9 +5,9 @@ hyperparameters drawn from the paper's lists so that the bandit suits any of the
 their return in the evaluation environment. The same search finds the paper's fully synthetic MDPs.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, cast
 
@@ -50,6 +50,7 @@ from scb.judgement import check_fits
 from scb.keys import named_key, root_key, split_key
 from scb.lists import read_lists, write_lists
 from scb.measurement import Judge, Place, train_and_judge
+from scb.refinement import RefinementConfig, refined
 from scb.runs import Run, config_dict
 from scb.warm_start import WarmStartConfig, expert_agent, warm_start
 
@@ -104,6 +105,7 @@ class DiscoveryConfig:
         can lead it away again).
       bandit: the networks and the latent.
       warm_start: how the expert is found and the bandit fitted to it.
+      refinement: of the bandit that the search starts from.
       evolution: of the candidates.
     """
 
@@ -132,6 +134,9 @@ class DiscoveryConfig:
     warm_start: Annotated[WarmStartConfig, tyro.conf.arg(name="warm start")] = field(
         default_factory=WarmStartConfig
     )
+    refinement: Annotated[RefinementConfig, tyro.conf.arg(name="refinement")] = field(
+        default_factory=RefinementConfig
+    )
     evolution: Annotated[EvolutionConfig, tyro.conf.arg(name="outer loop")] = field(
         default_factory=lambda: EvolutionConfig(combine="ranks")
     )
@@ -150,10 +155,10 @@ class DiscoveryConfig:
         fitted = self.init == "expert" and self.start is None
         if fitted and self.bandit.form == "linear":
             check_linear(self.warm_start.construction)
-        if fitted and self.bandit.form != "linear" and self.warm_start.refinement_rounds:
+        if self.refinement.rounds and self.bandit.form != "linear":
             raise UserError(
-                f"refinement_rounds is {self.warm_start.refinement_rounds}, and only a linear bandit's policy is "
-                "refined: choose the form linear, or leave it out."
+                f"there are {self.refinement.rounds} refinement rounds, and only a linear bandit's policy is refined: "
+                "choose the form linear, or leave them out."
             )
         if self.lists and self.fixed_hyperparameters:
             raise UserError(
@@ -207,7 +212,8 @@ class BanditDiscovery:
             limit = int(self.place.params.max_steps_in_episode)
             check_curriculum(config.curriculum, limit, config.environment)
             self._horizon, self._longest = horizon(config.curriculum), config.curriculum.longest
-        self.warm_start_report: dict[str, float] = {}
+        self._starts: dict[str, Weights] = {}
+        self.start_reports: dict[str, dict[str, float]] = {}
         self._folder: Path | None = None
         # Read now, so that a wrong name is told before anything is computed or written.
         self._start = None if config.start is None else self._weights_of(config.start)
@@ -237,52 +243,61 @@ class BanditDiscovery:
         return start.default_params.weights
 
     def initial_solution(self, key: jax.Array) -> Weights:
+        config, seed = self.config, root_key(self.config.evolution.seed)
         if self._start is not None:
             weights = self._start
-        elif self.config.init == "random":
+        elif config.init == "random":
             weights = self.bandit.init_weights(key)
         else:
-            weights = self._expert_fit
-        if self.config.reward_std is None:
+            weights = self._kept("warm_start", partial(self._fit, named_key(seed, "expert")))
+        if config.refinement.rounds:
+            refine = partial(self._refine, weights, named_key(seed, "refinement"))
+            weights = self._kept("refinement", refine)
+        if config.reward_std is None:
             return weights
         assert isinstance(self.bandit, SyntheticBandit)
-        return standardize_reward(self.bandit, weights, self.config.reward_std)
+        return standardize_reward(self.bandit, weights, config.reward_std)
 
     def units(self, solution: Weights) -> Weights | None:
         """What a change of 1 is for each weight."""
         return self.bandit.units(solution) if isinstance(self.bandit, SyntheticBandit) else None
 
-    @cached_property
-    def _expert_fit(self) -> Weights:
+    def _fit(self, key: jax.Array) -> tuple[Weights, dict[str, float]]:
         assert isinstance(self.bandit, SyntheticBandit)
-        path = None if self._folder is None else self._folder / "warm_start.npz"
-        found: Any = None
+        return warm_start(self.bandit, self.specs, self.place, key, self.config.warm_start)
+
+    def _refine(self, weights: Weights, key: jax.Array) -> tuple[Weights, dict[str, float]]:
+        assert isinstance(self.bandit, SyntheticBandit)
+        config = self.config.refinement
+        return refined(self.bandit, weights, self.specs, self.place, key, config)
+
+    def _kept(self, name: str, made: Callable[[], tuple[Weights, dict[str, float]]]) -> Weights:
+        """What the search starts from: made once, and kept in the run's folder; what it cost is in `start_reports`."""
+        if name in self._starts:
+            return self._starts[name]
+        path = None if self._folder is None else self._folder / f"{name}.npz"
+        report: Any = None
         weights: Weights = self.bandit.init_weights(root_key(0))
         if processes.first() and path is not None and path.with_suffix(".json").exists():
-            found = dict(bandit_metadata(str(path))["cost"])  # it is written last
+            report = dict(bandit_metadata(str(path))["cost"])  # it is written last
             weights = load_bandit(path).default_params.weights
-        if (found := processes.told(found)) is not None:
-            self.warm_start_report = found
-            return cast(Weights, processes.agreed(weights))
-        weights, self.warm_start_report = warm_start(
-            self.bandit,
-            self.specs,
-            self.place,
-            named_key(root_key(self.config.evolution.seed), "expert"),  # of the seed alone
-            self.config.warm_start,
-        )
-        if path is not None and processes.first():
-            metadata = {
-                "config": {
-                    "evaluation_environment": self.config.environment,
-                    "discovery": config_dict(self.config),
-                },
-                "seeds": {"discovery": self.config.evolution.seed},
-                "results": {},
-                "cost": self.warm_start_report,
-                "command": "scb discover (what its search starts from)",
-            }
-            save_bandit(path, self.bandit, weights, metadata)
+        if (report := processes.told(report)) is not None:
+            weights = cast(Weights, processes.agreed(weights))
+        else:
+            weights, report = made()
+            if path is not None and processes.first():
+                metadata = {
+                    "config": {
+                        "evaluation_environment": self.config.environment,
+                        "discovery": config_dict(self.config),
+                    },
+                    "seeds": {"discovery": self.config.evolution.seed},
+                    "results": {},
+                    "cost": report,
+                    "command": "scb discover (what its search starts from)",
+                }
+                save_bandit(path, self.bandit, weights, metadata)
+        self._starts[name], self.start_reports[name] = weights, report
         return weights
 
     def evaluate(

@@ -38,9 +38,9 @@ class LinearSearchConfig:
       best: of the directions, those that the step is made of.
       sigma: standard deviation of the perturbations.
       learning_rate: of the step.
-      action_noise: standard deviation of Gaussian noise on the actions of the search's episodes, as a
-        share of half their range. Under it a policy is found that bears errors, such as those of an
-        agent that learned from it; judgements are without it.
+      action_noise: standard deviation of Gaussian noise on the actions of all episodes but those of the
+        expert's return, as a share of half their range. Under it a policy is found that bears errors,
+        such as those of an agent that learned from it.
       episode_steps: at which the search's episodes are cut; the environment's own limit where None. Where
         nothing ends an episode early a gait shows in a fraction of it. Judgements are of whole episodes.
       judge_every: generations between judgements of the unperturbed policy, of 20 episodes each; the
@@ -117,7 +117,7 @@ def search_linear_expert(
 
     @jax.jit
     def mean_return(policy: Linear, seen: RunningStatistics, key: jax.Array) -> Any:
-        act = noisy(_policy(policy, seen, space), space, 0.0)
+        act = noisy(_policy(policy, seen, space), space, config.action_noise)
         episodes = evaluate(env, env_params, act, key, EPISODES)
         return episodes.returns.mean(), episodes.lengths.sum()
 

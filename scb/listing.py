@@ -73,10 +73,8 @@ def found(metadata: Mapping[str, Any]) -> str:
     earlier = metadata["config"].get("started_from")
     start = "random weights" if discovery["init"] == "random" else "fitted"
     if start == "fitted":
-        rounds = [
-            x for x in ("aggregation", "refinement") if discovery["warm_start"].get(f"{x}_rounds")
-        ]
-        start += f" with {' and '.join(rounds)}" if rounds else ""
+        start += " with aggregation" if discovery["warm_start"].get("aggregation_rounds") else ""
+    start += ", refined" if discovery.get("refinement", {}).get("rounds") else ""
     evolved = earlier or metadata["cost"].get(
         "generation", discovery["evolution"]["num_generations"]
     )
@@ -84,9 +82,10 @@ def found(metadata: Mapping[str, Any]) -> str:
 
 
 def _seconds(cost: Mapping[str, Any], started_from: Mapping[str, Any] | None) -> float:
-    """Of a search, the warm start before it, and the searches that it goes on from."""
+    """Of a search, the warm start and refinement before it, and the searches that it goes on from."""
     before = _seconds(started_from["cost"], started_from["started_from"]) if started_from else 0.0
-    return float(cost["seconds"] + cost.get("warm_start", {}).get("seconds", 0.0) + before)
+    start = sum(cost.get(x, {}).get("seconds", 0.0) for x in ("warm_start", "refinement"))
+    return float(cost["seconds"] + start + before)
 
 
 def _cell(result: Mapping[str, Any] | None) -> str:

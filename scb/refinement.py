@@ -7,27 +7,92 @@ held fixed: that changes little while the policy does, and a candidate costs an 
 """
 
 from collections.abc import Mapping
-from typing import Any
+from dataclasses import dataclass
+from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
+import tyro
 from evosax.algorithms import ARS
 
 from scb.agents.agent import Agent
-from scb.aggregation import Learned
-from scb.environments.linear import PolicyDistanceParts, units
+from scb.agents.spec import AgentSpec
+from scb.aggregation import Learned, Learners, Visited, best_round
+from scb.environments.linear import PolicyDistanceParts, units, with_states
 from scb.environments.synthetic import SyntheticBandit, Weights
+from scb.errors import at_least
 from scb.evaluation import evaluate
 from scb.evolution import map_population
 from scb.keys import key_at, split_key
 from scb.measurement import Place
+from scb.runs import Stopwatch
 
 DIRECTIONS = 32  # perturbations of a generation, each tried both ways for one episode
 SIGMA = 0.1  # of the perturbations, in the weights' units
 LEARNING_RATE = 0.025
+EPISODES = 4  # by which the agents of a round are judged
 Change = dict[str, jax.Array]  # {"kernel": [O, A], "bias": [A]}, in the weights' units
+
+
+@dataclass(frozen=True)
+class RefinementConfig:
+    """Refinement of a linear bandit's policy before the evolution.
+
+    Attributes:
+      rounds: in each of which agents train in the bandit, the linear search goes on under their errors, and
+        half of the contexts come to be where they went. The round whose agents earn most is kept.
+      generations: of the search in each round.
+      agents: of each algorithm of the inner loop, in every round and after the last.
+    """
+
+    rounds: Annotated[int, tyro.conf.arg(name="refinement-rounds")] = 0
+    generations: Annotated[int, tyro.conf.arg(name="refinement-generations")] = 20
+    agents: Annotated[int, tyro.conf.arg(name="refinement-agents")] = 16
+
+    def __post_init__(self) -> None:
+        at_least(0, self, "rounds")
+        at_least(1, self, "generations", "agents")
+
+
+def refined(
+    bandit: SyntheticBandit,
+    weights: Weights,
+    specs: Mapping[str, AgentSpec],
+    place: Place,
+    key: jax.Array,
+    config: RefinementConfig,
+) -> tuple[Weights, dict[str, float]]:
+    """A linear bandit's weights after rounds of refinement, and how they came about.
+
+    Args:
+      bandit: of these shapes.
+      weights: to start from.
+      specs: of the agents that train in it.
+      place: the environment.
+      key: decides everything.
+      config: of the rounds.
+    """
+    watch = Stopwatch()
+    learners = Learners(bandit, specs, place, config.agents, EPISODES)
+    refine = Refinement(bandit, learners.agents, place, config.generations)
+
+    def improve(
+        latest: Weights, visited: Visited, learned: Mapping[str, Learned], key: jax.Array
+    ) -> Any:
+        latest, taken = refine(latest, learned, key)
+        states = visited.observation
+        went = np.reshape(states, (states.shape[0] * states.shape[1], -1))
+        return (with_states(latest, went), {}), taken + len(went)
+
+    (weights, report), steps = best_round((weights, {}), learners, config.rounds, key, improve)
+    return weights, {
+        "refinement": report["round"],
+        "refined_return": report["agents_return"],
+        "environment_steps": steps,
+        "seconds": round(watch.lap(), 1),
+    }
 
 
 def moved(weights: Weights, change: Change) -> Weights:

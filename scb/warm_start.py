@@ -12,7 +12,6 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from gymnax.environments import spaces
 
 from scb.agents.spec import (
@@ -24,9 +23,8 @@ from scb.agents.spec import (
     kind_of_actions,
 )
 from scb.agents.tables import WARM_START
-from scb.aggregation import TRAJECTORIES, Learners, Visited, trajectory
+from scb.aggregation import TRAJECTORIES, Learners, Visited, best_round, trajectory
 from scb.curriculum import paper_curriculum
-from scb.environments.linear import PolicyDistanceParts
 from scb.environments.registry import environment_spec
 from scb.environments.synthetic import SyntheticBandit, Weights
 from scb.errors import UserError, at_least, one_of, positive
@@ -35,7 +33,6 @@ from scb.fitting import CONSTRUCTIONS, ExpertDataset, fit_bandit
 from scb.keys import named_key, split_key
 from scb.linear_expert import LinearSearchConfig, noisy, search_linear_expert
 from scb.measurement import Place
-from scb.refinement import Refinement
 from scb.runs import Stopwatch
 
 
@@ -114,11 +111,6 @@ class WarmStartConfig:
         they visit join the dataset with what the expert does there, and all is fitted again. The fit
         whose agents earn most is kept: rounds scatter.
       aggregation_agents: of each algorithm of the inner loop, in every round and after the last.
-      refinement_rounds: of a linear bandit's policy (`scb.refinement`): agents train in the fit, the linear
-        search goes on under these agents' errors, and the bandit is fitted anew to states that they
-        visit. The fit whose agents earn most is kept.
-      refinement_generations: of the search in each round.
-      refinement_agents: of each algorithm of the inner loop, in every round and after the last.
     """
 
     construction: str = "action_distance"
@@ -138,16 +130,12 @@ class WarmStartConfig:
     fit_steps: int = 4000
     aggregation_rounds: int = 0
     aggregation_agents: int = 8
-    refinement_rounds: int = 0
-    refinement_generations: int = 20
-    refinement_agents: int = 16
 
     def __post_init__(self) -> None:
         one_of("warm-start construction", self.construction, CONSTRUCTIONS)
         experts = ("auto", *SEARCHES, *ALGORITHMS)
         one_of("expert", self.expert, experts)
         at_least(0, self, "min_spread", "expert_noise", "near_actions", "aggregation_rounds")
-        at_least(0, self, "refinement_rounds")
         if not 0 <= self.discount <= 1:
             raise UserError(f"discount is {self.discount}: it must be between 0 and 1.")
         positive(self, "stretch")
@@ -160,7 +148,7 @@ class WarmStartConfig:
                 )
         at_least(1, self, "num_experts", "num_states", "num_actions")
         at_least(1, self, "horizon", "fit_steps", "expert_generations", "expert_episode_steps")
-        at_least(1, self, "aggregation_agents", "refinement_generations", "refinement_agents")
+        at_least(1, self, "aggregation_agents")
         if self.near_actions >= self.num_actions:
             raise UserError(
                 f"near_actions is {self.near_actions} of {self.num_actions} actions, one of them the expert's: take "
@@ -239,73 +227,27 @@ def warm_start(
         )
     dataset, steps = expert_dataset(expert, place, key_data, config)
     fit = partial(fit_bandit, bandit, construction=config.construction, steps=config.fit_steps)
-    weights, report = fit(dataset, key_fit)
+    found = fit(dataset, key_fit)
     if config.aggregation_rounds:
+
+        def improve(latest: Weights, visited: Visited, learned: Any, key: jax.Array) -> Any:
+            nonlocal dataset
+            key_pick, key_label, key_fit = split_key(key, 3)
+            more, taken = labelled(expert, place, visited, key_pick, key_label, config)
+            dataset = jax.tree.map(lambda *x: jnp.concatenate(x), dataset, more)
+            return fit(dataset, key_fit), taken
+
         learners = Learners(bandit, specs, place, config.aggregation_agents)
-        latest, found, best, last = weights, report, -np.inf, config.aggregation_rounds
-        for number, key_round in enumerate(split_key(named_key(key, "rounds"), last + 1)):
-            key_agents, key_pick, key_label, key_fit = split_key(key_round, 4)
-            earned, visited, _ = learners(latest, key_agents)
-            steps += learners.steps
-            if number == 0 or earned > best:
-                weights, best = latest, earned
-                report = {**found, "round": number, "agents_return": earned}
-            if number < last:
-                more, taken = labelled(expert, place, visited, key_pick, key_label, config)
-                dataset = jax.tree.map(lambda *x: jnp.concatenate(x), dataset, more)
-                latest, found = fit(dataset, key_fit)
-                steps += taken
-    if config.refinement_rounds:
-        key_refine = named_key(key, "refinement")
-        weights, found, taken = _refined(bandit, weights, dataset, specs, place, key_refine, config)
-        report, steps = {**report, **found}, steps + taken
+        key_rounds = named_key(key, "rounds")
+        found, taken = best_round(found, learners, config.aggregation_rounds, key_rounds, improve)
+        steps += taken
+    weights, report = found
     return weights, {
         "expert_return": expert.mean_return,
         "environment_steps": expert.environment_steps + steps,
         "seconds": round(watch.lap(), 1),
         **report,
     }
-
-
-def _refined(
-    bandit: SyntheticBandit,
-    weights: Weights,
-    dataset: ExpertDataset,
-    specs: Mapping[str, AgentSpec],
-    place: Place,
-    key: jax.Array,
-    config: WarmStartConfig,
-) -> tuple[Weights, dict[str, float], int]:
-    """A linear bandit after rounds of refinement, how they came about, and environment steps that they took."""
-    learners = Learners(bandit, specs, place, config.refinement_agents, episodes=4)
-    refine = Refinement(bandit, learners.agents, place, config.refinement_generations)
-    space, latest, steps, best = place.env.action_space(place.params), weights, 0, -np.inf
-    for number, key_round in enumerate(split_key(key, config.refinement_rounds + 1)):
-        key_agents, key_search, key_pick, key_label, key_old, key_fit = split_key(key_round, 6)
-        earned, visited, learned = learners(latest, key_agents)
-        steps += learners.steps
-        if number == 0 or earned > best:
-            weights, best = latest, earned
-            report = {"refinement": number, "refined_return": earned}
-        if number == config.refinement_rounds:
-            break
-        latest, taken = refine(latest, learned, key_search)
-        parts = PolicyDistanceParts.of(latest["reward"], *bandit.bounds)
-
-        def policy(observation: jax.Array, parts: PolicyDistanceParts = parts) -> jax.Array:
-            return jnp.reshape(parts.action(parts.best(jnp.ravel(observation))), space.shape)
-
-        refined = Expert(policy, earned, 0)
-        more, labelling = labelled(refined, place, visited, key_pick, key_label, config)
-        # Half of the states are new: agents go astray at first where they later do not.
-        kept = jax.random.choice(key_old, len(dataset.observation), (config.num_states,))
-        dataset = jax.tree.map(lambda x, y, kept=kept: jnp.concatenate([x[kept], y]), dataset, more)
-        actions = jax.jit(jax.vmap(policy))(dataset.observation)
-        latest, _ = fit_bandit(
-            bandit, dataset._replace(expert_action=actions), key_fit, config.construction
-        )
-        steps += taken + labelling
-    return weights, report, steps
 
 
 def find_expert(place: Place, key: jax.Array, config: WarmStartConfig) -> Expert:

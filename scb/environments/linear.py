@@ -5,6 +5,7 @@ distance to the action of a linear policy, and a context is a linear function of
 in so few dimensions where it hardly moves in a thousand, and the bandit can be read off its weights.
 """
 
+from collections.abc import Mapping
 from typing import Any, NamedTuple, Self
 
 import jax
@@ -102,10 +103,8 @@ def fitted(
       low, high: [A] the actions' bounds.
     """
     states = np.asarray(observations, np.float64)
-    center, covariance = states.mean(axis=0), np.cov(states.T).reshape(states.shape[1], -1)
+    center, covariance = moments(states)
     spread = np.sqrt(np.diag(covariance)) + 1e-6
-    # Entries that the others determine make a covariance singular.
-    root = np.linalg.cholesky(covariance + np.diag(1e-6 * spread**2))
     shares = (np.asarray(actions, np.float64) - (low + high) / 2) / ((high - low) / 2)
     inputs = np.column_stack([(states - center) / spread, np.ones(len(states))])
     solution = _censored(inputs, np.arctanh(np.clip(shares, -SATURATED, SATURATED)))
@@ -117,8 +116,37 @@ def fitted(
         "log_power": np.zeros(()),
         "offset": np.zeros(()),
     }
+    return _weights(center, covariance, reward)
+
+
+def with_states(weights: Mapping[str, Any], observations: np.ndarray) -> dict[str, Any]:
+    """The bandit of the same policy whose contexts are half its own and half these [S, O] states.
+
+    They are of the mean and covariance of the two together.
+    """
+    contexts, reward = weights["initial_state"]["Dense_0"], weights["reward"]
+    root, own = (np.asarray(contexts[k], np.float64) for k in ("kernel", "bias"))
+    other, covariance = moments(np.asarray(observations, np.float64))
+    center, apart = (own + other) / 2, (own - other) / 2
+    covariance = (root.T @ root + covariance) / 2 + np.outer(apart, apart)
+    bias = reward["bias"] + (center - reward["center"]) @ np.asarray(reward["kernel"], np.float64)
+    return _weights(center, covariance, {**reward, "center": center, "bias": bias})
+
+
+def moments(states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """[O] mean and [O, O] covariance of [S, O] states."""
+    return states.mean(axis=0), np.cov(states.T).reshape(states.shape[1], -1)
+
+
+def _weights(
+    center: np.ndarray, covariance: np.ndarray, reward: Mapping[str, Any]
+) -> dict[str, Any]:
+    """A bandit's, of the [O] mean and [O, O] covariance of its contexts and of its reward."""
+    # Entries that the others determine make a covariance singular.
+    spread = np.sqrt(np.diag(covariance)) + 1e-6
+    root = np.linalg.cholesky(covariance + np.diag(1e-6 * spread**2))
     contexts = {"Dense_0": {"kernel": root.T, "bias": center}}
-    weights = {"initial_state": contexts, "reward": reward}
+    weights = {"initial_state": contexts, "reward": dict(reward)}
     return jax.tree.map(lambda x: np.asarray(x, np.float32), weights)
 
 

@@ -193,7 +193,7 @@ def test_the_command_that_a_configuration_is_written_as_asks_for_it_again():
     paper = config_dict(Discover.parse(["--preset=paper", "--environment=CartPole-v1"]).config)
     same = {
         name
-        for group in ("bandit", "warm_start", "evolution")
+        for group in ("bandit", "warm_start", "refinement", "evolution")
         for name, value in paper[group].items()
         if value == getattr(getattr(command.config, group), name)
     } | {name for name, value in paper.items() if value == config_dict(command.config)[name]}
@@ -412,9 +412,9 @@ def test_how_a_bandit_was_found():
     evolution = {"num_generations": 3}
     config = {"discovery": {"init": "expert", "warm_start": warm_start, "evolution": evolution}}
     assert listing.found({"config": config, "cost": {"generation": 0}}) == "fitted with aggregation"
-    warm_start["refinement_rounds"] = 1
+    config["discovery"]["refinement"] = {"rounds": 1}
     assert listing.found({"config": config, "cost": {}}) == (
-        "fitted with aggregation and refinement, evolved"
+        "fitted with aggregation, refined, evolved"
     )
 
 

@@ -472,7 +472,7 @@ def test_an_expert_start_is_fitted_once_and_from_the_seed_alone(monkeypatch):
     assert shapes(start) == problem.bandit.weight_shapes()
     # A resumed run asks again, whatever its key: same weights.
     assert problem.initial_solution(jax.random.key(4)) is start
-    report = problem.warm_start_report
+    report = problem.start_reports["warm_start"]
     assert set(report) == {
         "expert_return",
         "environment_steps",

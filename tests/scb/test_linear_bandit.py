@@ -140,7 +140,7 @@ def pendulum(**changes):
 @pytest.mark.slow
 def test_one_is_fitted_to_an_expert_and_evolved():
     problem, outcome = pendulum()
-    assert problem.warm_start_report["action_r2"] > 0.99
+    assert problem.start_reports["warm_start"]["action_r2"] > 0.99
     start = problem.initial_solution(jax.random.key(0))
     moved = jax.tree.map(lambda a, b: np.abs(a - b), outcome.mean, start)
     units = problem.units(start)
@@ -158,7 +158,7 @@ def test_a_run_looks_for_its_expert_once(tmp_path, monkeypatch):
     run = Run.open(tmp_path / "run", config_dict(config), resume=True)
     resumed, again = discover(config, run, quiet=True)
     jax.tree.map(np.testing.assert_array_equal, again.mean, outcome.mean)
-    assert resumed.warm_start_report == first.warm_start_report
+    assert resumed.start_reports == first.start_reports
     start = first.initial_solution(jax.random.key(0))
     kept = load_bandit(tmp_path / "run" / "warm_start.npz")
     jax.tree.map(np.testing.assert_array_equal, kept.default_params.weights, start)

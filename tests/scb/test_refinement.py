@@ -7,16 +7,17 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from scb import warm_start
+from scb import refinement
 from scb.aggregation import Learned, Visited
-from scb.discovery import DiscoveryConfig
-from scb.environments.linear import PolicyDistanceParts
+from scb.discovery import DiscoveryConfig, discover
+from scb.environments.linear import PolicyDistanceParts, fitted, with_states
 from scb.environments.synthetic import BanditConfig, bandit_for
+from scb.environments.zoo import load_bandit, save_bandit
 from scb.errors import UserError
-from scb.experts import Expert
+from scb.evolution import EvolutionConfig
 from scb.measurement import Place
-from scb.refinement import Refinement, paired_ranks
-from scb.warm_start import WarmStartConfig
+from scb.refinement import Refinement, RefinementConfig, paired_ranks, refined
+from scb.runs import Run, config_dict
 from tests.scb.probes import TWO_TARGETS, ContinuousCorridor
 
 CORRIDOR = Place("corridor", ContinuousCorridor(cells=2), TWO_TARGETS)
@@ -68,17 +69,15 @@ def test_pairs_are_ranked_by_their_difference_whoever_they_are_of():
     assert np.isfinite(paired_ranks(np.array([np.nan, -np.inf, 1.0, 2.0]))).all()
 
 
+PENDULUM = Place.named("Pendulum-v1")
+
+
 @pytest.fixture
-def pendulum(monkeypatch):
-    def turning(observation):
-        return 2 * jnp.tanh(observation[1:2] - observation[2:])
-
-    found = Expert(turning, mean_return=-1000.0, environment_steps=7)
-    monkeypatch.setattr(warm_start, "find_expert", lambda *arguments: found)
-    return Place.named("Pendulum-v1")
+def bandit():
+    return bandit_of(PENDULUM)
 
 
-def test_the_round_whose_agents_earn_most_is_kept(pendulum, monkeypatch):
+def test_the_round_whose_agents_earn_most_is_kept(bandit, monkeypatch):
     seen, returns = [], iter([-5.0, -3.0, -4.0])
 
     class Fake:
@@ -89,8 +88,7 @@ def test_the_round_whose_agents_earn_most_is_kept(pendulum, monkeypatch):
 
         def __call__(self, weights, key):
             seen.append(weights)
-            observation = jnp.tile(jnp.array([1.0, 0.0, 0.5]), (2, 3, 1))
-            return next(returns), Visited(jnp.zeros((2, 3)), observation), {}
+            return next(returns), Visited(None, 0.5 * np.ones((2, 3, 3))), {}
 
     def moving(bandit, agents, place, generations):
         assert generations == 6
@@ -101,26 +99,70 @@ def test_the_round_whose_agents_earn_most_is_kept(pendulum, monkeypatch):
 
         return refine
 
-    monkeypatch.setattr(warm_start, "Learners", Fake)
-    monkeypatch.setattr(warm_start, "Refinement", moving)
-    bandit = bandit_of(pendulum)
-    settings = {"refinement_rounds": 2, "refinement_generations": 6, "refinement_agents": 3}
-    config = WarmStartConfig(num_states=256, num_actions=2, **settings)
-    weights, report = warm_start.warm_start(bandit, {}, pendulum, jax.random.key(1), config)
+    monkeypatch.setattr(refinement, "Learners", Fake)
+    monkeypatch.setattr(refinement, "Refinement", moving)
+    start = bandit.init_weights(jax.random.key(0))
+    config = RefinementConfig(rounds=2, generations=6, agents=3)
+    weights, report = refined(bandit, start, {}, PENDULUM, jax.random.key(1), config)
     assert (report["refinement"], report["refined_return"]) == (1, -3.0)
     jax.tree.map(np.testing.assert_array_equal, weights, seen[1])
-    # The expert's, the dataset's, three times the agents', two searches and what the agents visited in two rounds.
-    assert report["environment_steps"] == 7 + 256 * 200 + 3 * 10 + 2 * 100 + 2 * 6
-    # Each fit holds the policy that was found: a kernel that is larger by 1, and again.
+    # Three times the agents', two searches and what the agents visited in two rounds.
+    assert report["environment_steps"] == 3 * 10 + 2 * 100 + 2 * 6
     for before, after in pairwise(seen):
         difference = after["reward"]["kernel"] - before["reward"]["kernel"]
-        np.testing.assert_allclose(difference, 1.0, atol=0.05)
+        np.testing.assert_allclose(difference, 1.0, atol=1e-5)
     # Half of the contexts lie where the agents were, all in one place.
-    spreads = [np.linalg.norm(w["initial_state"]["Dense_0"]["kernel"]) for w in seen]
-    assert spreads[0] > spreads[1] > spreads[2]
+    means = [w["initial_state"]["Dense_0"]["bias"] for w in seen]
+    for before, after in pairwise(means):
+        np.testing.assert_allclose(after, (before + 0.5) / 2, rtol=1e-5)
+
+
+def test_new_contexts_leave_the_policy_and_have_the_moments_of_both(bandit):
+    rng = np.random.default_rng(0)
+    own, other = rng.normal(1, 2, (500, 3)), rng.normal(-3, 0.5, (500, 3))
+    actions = np.tanh(own @ np.array([[0.1], [0.2], [-0.1]]) + 0.3)
+    low, high = bandit.bounds
+    before = fitted(own, actions, low, high)
+    after = with_states(before, other)
+    states = np.concatenate([own, other])
+    np.testing.assert_allclose(
+        actions_of(bandit, after, states), actions_of(bandit, before, states), atol=1e-5
+    )
+    contexts = after["initial_state"]["Dense_0"]
+    np.testing.assert_allclose(contexts["bias"], states.mean(axis=0), rtol=1e-5)
+    covariance = contexts["kernel"].T @ contexts["kernel"]
+    np.testing.assert_allclose(covariance, np.cov(states.T), rtol=0.01, atol=0.01)
 
 
 def test_only_a_linear_bandit_is_refined():
-    with pytest.raises(UserError, match="refinement_rounds is 1, and only a linear bandit's"):
-        DiscoveryConfig(warm_start=WarmStartConfig(refinement_rounds=1))
-    DiscoveryConfig(bandit=LINEAR, warm_start=WarmStartConfig(refinement_rounds=1))
+    once = RefinementConfig(rounds=1)
+    with pytest.raises(UserError, match="there are 1 refinement rounds, and only a linear"):
+        DiscoveryConfig(refinement=once)
+    DiscoveryConfig(bandit=LINEAR, refinement=once)
+
+
+@pytest.mark.slow
+def test_a_search_goes_on_from_a_bandit_that_it_refined_once(bandit, tmp_path, monkeypatch):
+    path = tmp_path / "start.npz"
+    weights = bandit.init_weights(jax.random.key(3))
+    metadata = {"config": {}, "seeds": {}, "results": {}, "cost": {}, "command": "none"}
+    save_bandit(path, bandit, weights, metadata)
+    config = DiscoveryConfig(
+        start=str(path),
+        bandit=LINEAR,
+        refinement=RefinementConfig(rounds=1, generations=2, agents=2),
+        agents_per_candidate=1,
+        evaluation_episodes=1,
+        evolution=EvolutionConfig(population_size=2, num_generations=1, mean_evaluations=1),
+    )
+    run = Run.open(tmp_path / "run", config_dict(config))
+    first, outcome = discover(config, run, quiet=True)
+    assert set(first.start_reports) == {"refinement"}
+    kept = load_bandit(tmp_path / "run" / "refinement.npz").default_params.weights
+    start = first.initial_solution(jax.random.key(0))
+    jax.tree.map(np.testing.assert_array_equal, kept, start)
+    monkeypatch.delattr("scb.discovery.refined")
+    run = Run.open(tmp_path / "run", config_dict(config), resume=True)
+    resumed, again = discover(config, run, quiet=True)
+    assert resumed.start_reports == first.start_reports
+    jax.tree.map(np.testing.assert_array_equal, again.mean, outcome.mean)
