@@ -13,6 +13,7 @@ import numpy as np
 
 from scb.agents.agent import Agent
 from scb.agents.spec import AgentSpec
+from scb.console import progress_console
 from scb.environments.synthetic import SyntheticBandit, Weights
 from scb.evolution import map_population
 from scb.experts import EPISODES
@@ -129,7 +130,12 @@ Improve = Callable[[Weights, Visited, dict[str, Learned], jax.Array], tuple[Fit,
 
 
 def best_round(
-    start: Fit, learners: Learners, rounds: int, key: jax.Array, improve: Improve
+    start: Fit,
+    learners: Learners,
+    rounds: int,
+    key: jax.Array,
+    improve: Improve,
+    quiet: bool = True,
 ) -> tuple[Fit, int]:
     """Of a fit and of those that are made of it round by round, the one whose agents earn most: rounds scatter.
 
@@ -137,15 +143,18 @@ def best_round(
       rounds: how often the latest is made a better one.
       improve: takes its weights, what its agents visit, these, and a key; returns the next fit and the
         environment steps that it took.
+      quiet: nothing on the terminal.
 
     Returns:
       (the fit, whose report tells its round and what its agents earn; environment steps of all).
     """
+    console = progress_console(quiet)
     (latest, report), best, kept, steps = start, -np.inf, start, 0
     for number, key_round in enumerate(split_key(key, rounds + 1)):
         key_agents, key_improve = split_key(key_round)
         earned, visited, learned = learners(latest, key_agents)
         steps += learners.steps
+        console.print(f"round {number}/{rounds}: agents earn {earned:.4g}")
         if number == 0 or earned > best:
             kept, best = (latest, {**report, "round": number, "agents_return": earned}), earned
         if number < rounds:

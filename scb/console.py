@@ -22,6 +22,11 @@ def console() -> Console:
     return made if made.quiet or sys.stdout.isatty() else Console(width=max(PIPE_WIDTH, made.width))
 
 
+def progress_console(quiet: bool) -> Console:
+    """Standard error, where nothing is said if `quiet`, and of several processes by the first alone."""
+    return Console(file=sys.stderr, quiet=quiet or not processes.first())
+
+
 class Progress:
     """A bar with fitness and time left on a terminal; a line now and then elsewhere (a log file, CI)."""
 

@@ -215,12 +215,13 @@ class BanditDiscovery:
         self._starts: dict[str, Weights] = {}
         self.start_reports: dict[str, dict[str, float]] = {}
         self._folder: Path | None = None
+        self._quiet = True
         # Read now, so that a wrong name is told before anything is computed or written.
         self._start = None if config.start is None else self._weights_of(config.start)
 
     def search(self, run: Run | None = None, quiet: bool = False) -> Outcome:
         """Evolves; in a run's folder the fit is kept, so that a resumed one need not look for an expert again."""
-        self._folder = None if run is None else run.folder
+        self._folder, self._quiet = None if run is None else run.folder, quiet
         return evolve(self, self.config.evolution, run, quiet)
 
     def _spec(self, name: str) -> AgentSpec:
@@ -264,12 +265,13 @@ class BanditDiscovery:
 
     def _fit(self, key: jax.Array) -> tuple[Weights, dict[str, float]]:
         assert isinstance(self.bandit, SyntheticBandit)
-        return warm_start(self.bandit, self.specs, self.place, key, self.config.warm_start)
+        config = self.config.warm_start
+        return warm_start(self.bandit, self.specs, self.place, key, config, self._quiet)
 
     def _refine(self, weights: Weights, key: jax.Array) -> tuple[Weights, dict[str, float]]:
         assert isinstance(self.bandit, SyntheticBandit)
         config = self.config.refinement
-        return refined(self.bandit, weights, self.specs, self.place, key, config)
+        return refined(self.bandit, weights, self.specs, self.place, key, config, self._quiet)
 
     def _kept(self, name: str, made: Callable[[], tuple[Weights, dict[str, float]]]) -> Weights:
         """What the search starts from: made once, and kept in the run's folder; what it cost is in `start_reports`."""

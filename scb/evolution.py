@@ -6,7 +6,6 @@ a failed candidate gets, the sign, sharding over devices, the evaluation of the 
 distribution's mean, checkpoints, resume, and logs.
 """
 
-import sys
 from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import dataclass
@@ -17,12 +16,11 @@ import jax.numpy as jnp
 import numpy as np
 import tyro
 from jax.sharding import NamedSharding, PartitionSpec
-from rich.console import Console
 from scipy.stats import rankdata
 
 from scb import processes, termination
 from scb.artefacts import machine_description
-from scb.console import Progress
+from scb.console import Progress, progress_console
 from scb.errors import UserError, at_least, one_of, positive
 from scb.files import plain
 from scb.keys import key_at, root_key, split_key
@@ -278,7 +276,7 @@ def evolve(
         "best_mean_fitness": jnp.float32(-jnp.inf),
         "best_mean_generation": jnp.int32(-1),
     }
-    console = Console(file=sys.stderr, quiet=quiet or not processes.first())
+    console = progress_console(quiet)
     checkpoints = Checkpoints(run.folder) if run and processes.first() else None
     first = saved = 0
     if run and run.resumed:

@@ -198,16 +198,18 @@ def evolve_expert(
     env_params: Any,
     config: PolicySearchConfig,
     key: jax.Array,
+    quiet: bool = True,
 ) -> Expert:
     """The mean of an evolution over policy networks.
 
     Args:
       key: decides everything; `config.evolution.seed` is not used.
+      quiet: no progress on the terminal.
     """
     key_search, key_judge = split_key(key)
     evolution = config.evolution
     problem = _PolicySearch(env, env_params, config)
-    outcome = evolve(problem, evolution, quiet=True, key=key_search)
+    outcome = evolve(problem, evolution, quiet=quiet, key=key_search)
     steps = problem.steps().total * evolution.population_size * evolution.num_generations
     return judged(problem.policy(outcome.mean), env, env_params, key_judge, steps)
 

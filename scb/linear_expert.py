@@ -18,12 +18,14 @@ from gymnax.environments import environment, spaces
 
 from scb.agents.agent import clip_to_space
 from scb.agents.normalization import RunningStatistics, merge_statistics, normalize
+from scb.console import Progress, progress_console
 from scb.errors import UserError, at_least, positive
 from scb.evaluation import Episodes, Policy, evaluate
 from scb.evolution import map_population
 from scb.experts import EPISODES, Expert, judged
 from scb.keys import key_at, named_key, split_key
 from scb.neuroevolution import network_action
+from scb.runs import Stopwatch
 
 Linear = dict[str, jax.Array]  # {"matrix": [O, A], "bias": [A]}
 
@@ -70,6 +72,7 @@ def search_linear_expert(
     key: jax.Array,
     config: LinearSearchConfig | None = None,
     bonus: float = 0.0,
+    quiet: bool = True,
 ) -> Expert:
     """The best unperturbed policy of an augmented random search; its return is one on fresh start states.
 
@@ -78,6 +81,7 @@ def search_linear_expert(
       key: decides everything.
       config: of the search.
       bonus: what every step pays without falling, which the fitness leaves out.
+      quiet: no progress on the terminal.
     """
     config = config or LinearSearchConfig()
     space = env.action_space(env_params)
@@ -125,19 +129,24 @@ def search_linear_expert(
     seen, steps = RunningStatistics.start(observations), 0.0
     expert, best = (zero, seen), -np.inf
     keys, key_judge = named_key(key, "generations"), named_key(key, "judgement")
-    for number in range(1, config.generations + 1):
-        key_ask, key_tell = split_key(key_at(keys, number))
-        population, state, key_roll = ask(state, key_ask)
-        episodes = roll(population, seen, key_roll)
-        state, seen, taken = tell(state, population, episodes, seen, key_tell)
-        steps += float(taken)
-        if number % config.judge_every == 0 or number == config.generations:
-            mean = search.get_mean(state)
-            # The same start states for all, so that judgements are compared in pairs.
-            earned, taken = mean_return(mean, seen, key_judge)
+    with Progress(progress_console(quiet), config.generations, 0) as advance:
+        watch = Stopwatch()
+        for number in range(1, config.generations + 1):
+            key_ask, key_tell = split_key(key_at(keys, number))
+            population, state, key_roll = ask(state, key_ask)
+            episodes = roll(population, seen, key_roll)
+            state, seen, taken = tell(state, population, episodes, seen, key_tell)
             steps += float(taken)
-            if earned > best:
-                expert, best = (mean, seen), float(earned)
+            metrics = {"fitness/mean": float(episodes.returns.mean()), "failed": 0}
+            if number % config.judge_every == 0 or number == config.generations:
+                mean = search.get_mean(state)
+                # The same start states for all, so that judgements are compared in pairs.
+                earned, taken = mean_return(mean, seen, key_judge)
+                steps += float(taken)
+                metrics["mean/fitness"] = float(earned)
+                if earned > best:
+                    expert, best = (mean, seen), float(earned)
+            advance(metrics, watch.lap())
     return judged(_policy(*expert, space), env, env_params, named_key(key, "return"), int(steps))
 
 

@@ -19,7 +19,8 @@ from evosax.algorithms import ARS
 
 from scb.agents.agent import Agent
 from scb.agents.spec import AgentSpec
-from scb.aggregation import Learned, Learners, Visited, best_round
+from scb.aggregation import Fit, Learned, Learners, Visited, best_round
+from scb.console import progress_console
 from scb.environments.linear import PolicyDistanceParts, units, with_states
 from scb.environments.synthetic import SyntheticBandit, Weights
 from scb.errors import at_least
@@ -63,6 +64,7 @@ def refined(
     place: Place,
     key: jax.Array,
     config: RefinementConfig,
+    quiet: bool = True,
 ) -> tuple[Weights, dict[str, float]]:
     """A linear bandit's weights after rounds of refinement, and how they came about.
 
@@ -73,6 +75,7 @@ def refined(
       place: the environment.
       key: decides everything.
       config: of the rounds.
+      quiet: nothing on the terminal.
     """
     watch = Stopwatch()
     learners = Learners(bandit, specs, place, config.agents, EPISODES)
@@ -86,7 +89,11 @@ def refined(
         went = np.reshape(states, (states.shape[0] * states.shape[1], -1))
         return (with_states(latest, went), {}), taken + len(went)
 
-    (weights, report), steps = best_round((weights, {}), learners, config.rounds, key, improve)
+    progress_console(quiet).print(
+        f"refining the policy of a bandit for {place.name}, what its agents earn:"
+    )
+    start: Fit = (weights, {})
+    (weights, report), steps = best_round(start, learners, config.rounds, key, improve, quiet)
     return weights, {
         "refinement": report["round"],
         "refined_return": report["agents_return"],

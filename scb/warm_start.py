@@ -24,6 +24,7 @@ from scb.agents.spec import (
 )
 from scb.agents.tables import WARM_START
 from scb.aggregation import TRAJECTORIES, Learners, Visited, best_round, trajectory
+from scb.console import progress_console
 from scb.curriculum import paper_curriculum
 from scb.environments.registry import environment_spec
 from scb.environments.synthetic import SyntheticBandit, Weights
@@ -36,17 +37,17 @@ from scb.measurement import Place
 from scb.runs import Stopwatch
 
 
-def _evolved(place: Place, key: jax.Array, config: "WarmStartConfig") -> Expert:
+def _evolved(place: Place, key: jax.Array, config: "WarmStartConfig", quiet: bool) -> Expert:
     search, generations = PolicySearchConfig(), config.expert_generations
     search = replace(
         search,
         curriculum=paper_curriculum(place.name, generations),
         evolution=replace(search.evolution, num_generations=generations),
     )
-    return evolve_expert(place.env, place.params, search, key)
+    return evolve_expert(place.env, place.params, search, key, quiet)
 
 
-def _linear(place: Place, key: jax.Array, config: "WarmStartConfig") -> Expert:
+def _linear(place: Place, key: jax.Array, config: "WarmStartConfig", quiet: bool) -> Expert:
     standing = environment_spec(place.name).standing_still(place.backend) or 0.0
     bonus = standing / place.params.max_steps_in_episode
     search = LinearSearchConfig(
@@ -55,14 +56,14 @@ def _linear(place: Place, key: jax.Array, config: "WarmStartConfig") -> Expert:
     if config.expert_noise:
         # Where actions err anyway a larger step is no more noise, and finds gains that bear errors.
         search = replace(search, sigma=0.15, learning_rate=0.09, action_noise=config.expert_noise)
-    return search_linear_expert(place.env, place.params, key, search, bonus)
+    return search_linear_expert(place.env, place.params, key, search, bonus, quiet)
 
 
 class _Search(NamedTuple):
     """What finds experts that are no agents: in words, how, and what it needs and knows."""
 
     what: str
-    find: Callable[[Place, jax.Array, "WarmStartConfig"], Expert]
+    find: Callable[[Place, jax.Array, "WarmStartConfig", bool], Expert]
     continuous: bool = False  # actions, which it needs
     cuts: bool = False  # episodes, where told to
 
@@ -204,6 +205,7 @@ def warm_start(
     place: Place,
     key: jax.Array,
     config: WarmStartConfig,
+    quiet: bool = True,
 ) -> tuple[Weights, dict[str, float]]:
     """A bandit's weights fitted to an expert of an environment, and how the fit came about.
 
@@ -212,13 +214,15 @@ def warm_start(
       specs: of the agents that train in the bandit, for rounds of aggregation.
       place: the environment.
       key: decides everything.
+      config: how.
+      quiet: no progress on the terminal.
 
     Raises:
       UserError: the expert earns less than random actions.
     """
     watch = Stopwatch()
     key_expert, key_data, key_fit = split_key(key, 3)
-    expert = find_expert(place, key_expert, config)
+    expert = find_expert(place, key_expert, config, quiet)
     random = environment_spec(place.name).random_return(place.backend)
     if expert.mean_return < random:
         raise UserError(
@@ -237,9 +241,11 @@ def warm_start(
             dataset = jax.tree.map(lambda *x: jnp.concatenate(x), dataset, more)
             return fit(dataset, key_fit), taken
 
+        rounds = config.aggregation_rounds
         learners = Learners(bandit, specs, place, config.aggregation_agents)
         key_rounds = named_key(key, "rounds")
-        found, taken = best_round(found, learners, config.aggregation_rounds, key_rounds, improve)
+        progress_console(quiet).print("aggregating a dataset, what agents of each fit earn:")
+        found, taken = best_round(found, learners, rounds, key_rounds, improve, quiet)
         steps += taken
     weights, report = found
     return weights, {
@@ -250,11 +256,16 @@ def warm_start(
     }
 
 
-def find_expert(place: Place, key: jax.Array, config: WarmStartConfig) -> Expert:
+def find_expert(
+    place: Place, key: jax.Array, config: WarmStartConfig, quiet: bool = True
+) -> Expert:
     """An expert for an environment of the registry."""
     spec = expert_agent(place.name, place.env.action_space(place.params), config)
     if spec is None:
-        return SEARCHES[_chosen(place.name, config)].find(place, key, config)
+        search = SEARCHES[_chosen(place.name, config)]
+        progress_console(quiet).print(f"looking for an expert of {place.name} by {search.what}")
+        return search.find(place, key, config, quiet)
+    progress_console(quiet).print(f"training {config.num_experts} experts of {place.name}")
     return train_expert(place.env, place.params, spec, key, config.num_experts)
 
 

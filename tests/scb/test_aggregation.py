@@ -45,11 +45,11 @@ def expert(monkeypatch):
     monkeypatch.setattr(warm_start, "find_expert", lambda *arguments: found)
 
 
-def started(bandit, place, rounds):
+def started(bandit, place, rounds, quiet=True):
     config = WarmStartConfig(
         num_states=STATES, num_actions=2, aggregation_rounds=rounds, aggregation_agents=2
     )
-    return warm_start.warm_start(bandit, SPECS, place, jax.random.key(1), config)
+    return warm_start.warm_start(bandit, SPECS, place, jax.random.key(1), config, quiet)
 
 
 @pytest.fixture
@@ -100,10 +100,13 @@ class Fake:
         return next(self.returns), Visited(jnp.zeros((2, 3)), observation), {}
 
 
-def test_the_fit_whose_agents_earn_most_is_kept(bandit, place, expert, datasets, monkeypatch):
+def test_the_fit_whose_agents_earn_most_is_kept(
+    bandit, place, expert, datasets, monkeypatch, capsys
+):
     monkeypatch.setattr(warm_start, "Learners", Fake)
-    weights, report = started(bandit, place, rounds=2)
+    weights, report = started(bandit, place, rounds=2, quiet=False)
     assert (report["round"], report["agents_return"]) == (1, -3.0)
+    assert capsys.readouterr().err.splitlines()[-1] == "round 2/2: agents earn -4"
     second, _ = warm_start.fit_bandit(bandit, datasets[1], jax.random.key(0))
     jax.tree.map(np.testing.assert_array_equal, weights, second)
 

@@ -40,6 +40,14 @@ def test_its_steps_are_counted(expert):
     assert expert.environment_steps == 30 * 2 * 8 * 2 + 3 * 20 * 2
 
 
+def test_it_says_how_far_it_is(capsys):
+    env, config = ContinuousCorridor(cells=2), replace(SEARCH, generations=3, judge_every=2)
+    search_linear_expert(env, TWO_TARGETS, jax.random.key(0), config, quiet=False)
+    lines = capsys.readouterr().err.splitlines()
+    assert [line.split(":")[0] for line in lines] == [f"generation {n}/3" for n in (1, 2, 3)]
+    assert ["mean" in line for line in lines] == [False, True, True]
+
+
 def test_the_key_alone_decides_it(expert):
     between = jax.random.normal(jax.random.key(2), (40, 2))
     again, other = search(), search(key=1)
@@ -47,8 +55,10 @@ def test_the_key_alone_decides_it(expert):
     assert (jax.vmap(other.policy)(between) != jax.vmap(expert.policy)(between)).any()
 
 
-def test_a_policy_that_bears_errors_is_found_under_noise():
+def test_a_policy_that_bears_errors_is_found_and_chosen_under_noise(monkeypatch):
     """Beside the cliff the best action without noise is 0.5; whoever errs keeps away from it."""
+
+    monkeypatch.setattr("scb.linear_expert.EPISODES", 1000)
 
     class Cliff(ContinuousCorridor):
         def step_env(self, key, state, action, params):
@@ -57,7 +67,8 @@ def test_a_policy_that_bears_errors_is_found_under_noise():
             return observation, state, jnp.where(falls, -5.0, action[0]), jnp.bool_(True), info
 
     def best(noise):
-        size = {"generations": 100, "best": 8, "sigma": 0.1, "learning_rate": 0.1}
+        # Judged from the first generation on, and well: what comes closest to the cliff is best without noise.
+        size = {"generations": 100, "best": 8, "sigma": 0.1, "learning_rate": 0.1, "judge_every": 1}
         config = replace(SEARCH, **size, action_noise=noise)
         env = Cliff(cells=1)
         found = search_linear_expert(env, env.default_params, jax.random.key(0), config)
@@ -65,7 +76,7 @@ def test_a_policy_that_bears_errors_is_found_under_noise():
 
     # With a deviation of 0.3 * 1.5 an action of -0.35 earns most; without noise 0.5, to which the search's own
     # deviations keep a distance.
-    assert best(0.3) < 0.0 < 0.3 < best(0.0) <= 0.5
+    assert best(0.3) < -0.2 < 0.3 < best(0.0) <= 0.5
 
 
 class Ledge(ContinuousCorridor):
