@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from scb.environments.linear import fitted
+from scb.environments.linear import PolicyDistanceParts, fitted
 from scb.environments.synthetic import BanditParams, SyntheticBandit, Weights
 from scb.errors import UserError
 from scb.keys import named_key, root_key, split_key
@@ -126,9 +126,8 @@ def _fit_linear(
     best = np.reshape(dataset.expert_action, (len(states), -1))
     low, high = bandit.bounds
     weights = fitted(states, best, low, high)
-    reward = weights["reward"]
-    shares = np.tanh((states - reward["center"]) @ reward["kernel"] + reward["bias"])
-    errors = (low + high) / 2 + shares * (high - low) / 2 - best
+    parts = PolicyDistanceParts.of(weights["reward"], low, high, np)
+    errors = parts.action(parts.best(states)) - best
     return weights, {"action_r2": float(1.0 - errors.var() / best.var(axis=0).mean())}
 
 
