@@ -4,13 +4,12 @@
 
 Each variation changes one setting of `lpo meta-train`, learns an objective with it, and trains PPO
 with what it learned: on Pendulum, with Flax's initialisation of the policy and with a small last layer,
-and on Hopper, which no choice ever looked at. Searches are run folders under --runs and are resumed;
-what --out holds already is not measured again, so the same command continues an interrupted study.
+and in the rest of classic control. Searches are run folders under --runs and are resumed; what --out holds already is not measured again, so the same command continues an interrupted study.
 `--variations` names some of them, and `--meta-seeds` further searches of these; `--only-render` makes
 page and figure from --out.
 """
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -26,11 +25,13 @@ from experiments.parts import InParts, Part
 from experiments.searches import meta_training, objective_of_run
 from lpo.comparison import compare, ppo_spec
 from lpo.objectives import Objective, load_objective
+from lpo.suite import suite
+from scb.environments.registry import environment_spec
 from scb.errors import UserError, unknown_name
 from scb.plotting import BLUE, GREY, VERMILLION, estimate_row
 from scb.rows import Rows
 from scb.seeds import REPORTING
-from scb.statistics import Estimate, estimate, pooled_estimate
+from scb.statistics import Estimate, estimate, normalized_score, pooled_estimate
 
 _PLAN = plan_of("transfer_study")
 VARIATIONS: dict[str, dict[str, Any]] = _PLAN["variations"]
@@ -43,18 +44,26 @@ class Evaluation:
     """Where objectives are judged. The seeds are neither those of searches nor those that report."""
 
     name: str
-    environment: str
-    backend: str | None = None
-    steps: int | None = None
+    environments: tuple[str, ...]
     policy_output_scale: float = 1.0
     seeds: int = 20
     first_seed: int = REPORTING[11_000]
 
+    @property
+    def normalized(self) -> bool:
+        """Returns of several environments have scales of their own."""
+        return len(self.environments) > 1
 
+
+PENDULUM = "Pendulum-v1"
 EVALUATIONS = (
-    Evaluation("Pendulum", "Pendulum-v1"),
-    Evaluation("Pendulum, small last layer", "Pendulum-v1", policy_output_scale=0.01),
-    Evaluation("Hopper (spring), never used", "hopper", "spring", 500_000, seeds=6),
+    Evaluation("Pendulum", (PENDULUM,)),
+    Evaluation("Pendulum, small last layer", (PENDULUM,), policy_output_scale=0.01),
+    Evaluation(
+        "classic control without it",
+        tuple(name for name in suite("classic") if name != PENDULUM),
+        seeds=10,
+    ),
 )
 
 
@@ -138,17 +147,20 @@ def facts(report: Report) -> dict[str, Any]:
         "undecided": those(UNDECIDED),
         "once": [row["name"] for row in rows if row["searches"] == 1],
         "number": number,
+        "places": {
+            e["name"]: 2 if len(e["environments"]) > 1 else 0 for e in report["evaluations"]
+        },
         "level": 100 * (1 - 0.05 / max(1, number)),
     }
 
 
 def draw(report: Mapping[str, Any]) -> Figure:
     """One panel an evaluation, one line an objective: interquartile mean with its interval, each agent a dot."""
-    evaluations = [e["name"] for e in report["evaluations"]]
     rows = summary(report)
     figure = Figure(figsize=(11.0, 1.6 + 0.32 * len(rows)))
-    panels = figure.subplots(1, len(evaluations), sharey=True, squeeze=False)[0]
-    for axes, evaluation in zip(panels, evaluations, strict=True):
+    panels = figure.subplots(1, len(report["evaluations"]), sharey=True, squeeze=False)[0]
+    for axes, at in zip(panels, report["evaluations"], strict=True):
+        evaluation = at["name"]
         for position, row in enumerate(rows):
             if evaluation not in row["in"]:
                 continue
@@ -157,7 +169,8 @@ def draw(report: Mapping[str, Any]) -> Figure:
             returns = report["objectives"][name]["returns"][evaluation]
             agents = np.concatenate(list(returns.values()))
             estimate_row(axes, position, agents, row["in"][evaluation], color)
-        axes.set(title=evaluation, xlabel="final return")
+        score = len(at["environments"]) > 1
+        axes.set(title=evaluation, xlabel="normalised score" if score else "final return")
         axes.xaxis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10]))
     panels[0].set_yticks(range(len(rows)), [row["name"] for row in rows])
     panels[0].invert_yaxis()
@@ -180,7 +193,7 @@ class Options:
 
 
 def parts(options: Options, report: dict[str, Any]) -> Iterator[Part]:
-    """Objectives: each is learned, then judged everywhere."""
+    """Objectives: each is learned, then judged where it is not yet; all have as many searches wherever it ends."""
     for name in options.variations:
         if name not in VARIATIONS:
             raise unknown_name("variation", name, list(VARIATIONS))
@@ -191,19 +204,22 @@ def parts(options: Options, report: dict[str, Any]) -> Iterator[Part]:
         )
     report |= {"searches": searches, "evaluations": [asdict(e) for e in EVALUATIONS]}
     seeds = [str(seed) for seed in options.meta_seeds]
-    for name, of in (
-        *((name, [NO_SEARCH]) for name in REFERENCES),
-        *((name, seeds) for name in options.variations),
+    for name, seed in (
+        *((name, NO_SEARCH) for name in REFERENCES),
+        *((name, seed) for seed in seeds for name in options.variations),
     ):
-        for seed in of:
-            names = tuple(("returns", at.name, seed) for at in EVALUATIONS)
-            yield Part(("objectives", name), partial(_judged, name, seed, options), names)
+        there = report.get("objectives", {}).get(name, {}).get("returns", {})
+        lacking = [at for at in EVALUATIONS if seed not in there.get(at.name, {})]
+        names = tuple(("returns", at.name, seed) for at in lacking)
+        yield Part(("objectives", name), partial(_judged, name, seed, lacking, options), names)
 
 
 measure = InParts(parts)
 
 
-def _judged(name: str, seed: str, options: Options) -> dict[str, Any]:
+def _judged(
+    name: str, seed: str, evaluations: Sequence[Evaluation], options: Options
+) -> dict[str, Any]:
     """What an objective earns, and of one that was learned what that took."""
     if name in REFERENCES:
         entry: dict[str, Any] = {}
@@ -211,19 +227,28 @@ def _judged(name: str, seed: str, options: Options) -> dict[str, Any]:
     else:
         objective, entry = _learned(name, int(seed), options)
     returns = {}
-    for at in EVALUATIONS:
-        (curves,) = compare(
-            at.environment,
-            [objective],
-            list(range(at.first_seed, at.first_seed + at.seeds)),
-            spec=ppo_spec(at.environment, at.steps, at.policy_output_scale),
-            backend=at.backend,
-            points=1,
-            rows=Rows(options.runs / at.name / f"{objective.name}.rows.jsonl"),
-        ).curves
-        returns[at.name] = {seed: np.round(curves.final, 2).tolist()}
-        print(f"{name} | {at.name} | {seed} | {estimate(curves.final)}", flush=True)
+    for at in evaluations:
+        each = [_earned(objective, environment, at, options) for environment in at.environments]
+        earned = np.mean(each, axis=0)
+        returns[at.name] = {seed: np.round(earned, 4 if at.normalized else 2).tolist()}
+        print(f"{name} | {at.name} | {seed} | {estimate(earned)}", flush=True)
     return {**entry, "returns": returns}
+
+
+def _earned(objective: Objective, environment: str, at: Evaluation, options: Options) -> np.ndarray:
+    """[seeds] what agents earn at the end of their training: a score where there are other environments too."""
+    (curves,) = compare(
+        environment,
+        [objective],
+        list(range(at.first_seed, at.first_seed + at.seeds)),
+        spec=ppo_spec(environment, None, at.policy_output_scale),
+        points=1,
+        rows=Rows(options.runs / at.name / f"{objective.name}-{environment}.rows.jsonl"),
+    ).curves
+    if not at.normalized:
+        return curves.final
+    spec = environment_spec(environment)
+    return normalized_score(curves.final, spec.random_return(), spec.reference_return())
 
 
 def _learned(name: str, seed: int, options: Options) -> tuple[Objective, dict[str, Any]]:
