@@ -4,7 +4,8 @@
 
 Each variation changes one setting of `lpo meta-train`, learns an objective with it, and trains PPO
 with what it learned: on Pendulum, with Flax's initialisation of the policy and with a small last layer,
-and in the rest of classic control. Searches are run folders under --runs and are resumed; what --out holds already is not measured again, so the same command continues an interrupted study.
+and in the rest of classic control. Searches are run folders under --runs and are resumed; what --out
+holds already is not measured again, so the same command continues an interrupted study.
 `--variations` names some of them, and `--meta-seeds` further searches of these; `--only-render` makes
 page and figure from --out.
 """
