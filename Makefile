@@ -53,24 +53,20 @@ docs: $(INSTALLED) .venv-docs/.installed ## the documentation's site, in site/; 
 	@.venv-docs/bin/zensical build --strict --clean
 	@$(BIN)/python -m tests.site
 
-# rejax needs a gymnax that this project doesn't run on, so it gets an environment of its own.
-.venv-rejax/.installed: $(INSTALLED)
-	@echo "Installing rejax into .venv-rejax ..."
-	@$(PYTHON) -m venv --clear .venv-rejax
-	@.venv-rejax/bin/python -m pip --disable-pip-version-check --quiet install rejax==0.1.3 gymnax==0.0.9
-	@touch $@
+# What is only for a comparison or the site is apart: rejax needs a gymnax that this project doesn't run on, and
+# PyTorch is large.
+REJAX := rejax==0.1.3 gymnax==0.0.9
+SB3 := -c constraints.txt -e . stable-baselines3==2.9.2 torch==2.15.0
+DOCS := -c constraints.txt -e . zensical==0.0.73 mkdocstrings==1.0.8 mkdocstrings-python==2.0.11 \
+  nbconvert==7.17.2 ipykernel==7.4.0
 
-# PyTorch is large, and nothing else here needs it.
-.venv-sb3/.installed: $(INSTALLED)
-	@echo "Installing Stable-Baselines3 and PyTorch into .venv-sb3 ..."
-	@$(PYTHON) -m venv --clear .venv-sb3
-	@.venv-sb3/bin/python -m pip --disable-pip-version-check --quiet install -c constraints.txt -e . stable-baselines3==2.9.2 torch==2.15.0
-	@touch $@
-
-.venv-docs/.installed: $(INSTALLED)
-	@echo "Installing what builds the site into .venv-docs ..."
-	@$(PYTHON) -m venv --clear .venv-docs
-	@.venv-docs/bin/python -m pip --disable-pip-version-check --quiet install -c constraints.txt -e . zensical==0.0.73 mkdocstrings==1.0.8 mkdocstrings-python==2.0.11 nbconvert==7.17.2 ipykernel==7.4.0
+.venv-rejax/.installed: PACKAGES := $(REJAX)
+.venv-sb3/.installed: PACKAGES := $(SB3)
+.venv-docs/.installed: PACKAGES := $(DOCS)
+.venv-rejax/.installed .venv-sb3/.installed .venv-docs/.installed: $(INSTALLED)
+	@echo "Installing $(filter-out -% . constraints.txt,$(PACKAGES)) into $(@D) ..."
+	@$(PYTHON) -m venv --clear $(@D)
+	@$(@D)/bin/python -m pip --disable-pip-version-check --quiet install $(PACKAGES)
 	@touch $@
 
 clean: ## remove caches and build outputs; .venv and runs stay
