@@ -29,25 +29,8 @@ from scb import schema
 from scb.errors import UserError
 from scb.files import strict_json, write_bytes
 
-KINDS = ("bandit", "drift", "synthetic_mdp")
-
 # numpy.ndarray leaves under any depth of dictionaries: {"reward": {"Dense_0": {"kernel": ...}}}.
 ArrayTree: TypeAlias = "dict[str, np.ndarray | ArrayTree]"
-
-# What every NAME.json holds, in this order, and as what; `results` maps names to numbers with their
-# intervals, `cost` says environment steps and wall-clock time.
-_FIELDS: dict[str, tuple[type, ...]] = {
-    "schema_version": (int,),
-    "kind": (str,),
-    "name": (str,),
-    "config": (dict,),
-    "seeds": (dict, list, int),
-    "versions": (dict,),
-    "results": (dict,),
-    "cost": (dict,),
-    "command": (str,),
-    "sha256": (str,),
-}
 
 _PACKAGES = ("jax", "jaxlib", "flax", "optax", "evosax", "gymnax", "brax", "numpy", "lpo")
 
@@ -95,7 +78,7 @@ def save(path: str | Path, arrays: Mapping[str, Any], metadata: Mapping[str, Any
         "versions": package_versions(),
         "sha256": hashlib.sha256(data).hexdigest(),
     }
-    written = {key: written[key] for key in (*_FIELDS, *written) if key in written}
+    written = {key: written[key] for key in (*schema.FIELDS, *written) if key in written}
     try:
         text = json.dumps(written, indent=2, ensure_ascii=False, allow_nan=False, default=_as_json)
     except (TypeError, ValueError, RecursionError) as error:
@@ -104,7 +87,7 @@ def save(path: str | Path, arrays: Mapping[str, Any], metadata: Mapping[str, Any
             "(None where one is unknown), text, lists and dictionaries."
         ) from error
     # As a reader will see it: a mapping or tuple of the caller's is a plain dict or list by now.
-    _check_metadata(json_path, json.loads(text))
+    schema.check(json_path, json.loads(text))
 
     npz_path.parent.mkdir(parents=True, exist_ok=True)
     write_bytes(npz_path, data)
@@ -117,7 +100,7 @@ def load(path: str | Path, *kinds: str) -> Artefact:
 
     Args:
       path: NAME, NAME.npz or NAME.json.
-      kinds: of `KINDS`, what the caller can use.
+      kinds: of `schema.KINDS`, what the caller can use.
 
     Raises:
       UserError: one sentence that says which file is missing, damaged, changed since it was saved,
@@ -127,7 +110,7 @@ def load(path: str | Path, *kinds: str) -> Artefact:
     # The bytes that are checked are the bytes that are used: each file is read once.
     data, text = _read(npz_path), _read(json_path)
     metadata = _parse_metadata(json_path, text)
-    _check_metadata(json_path, metadata)
+    schema.check(json_path, metadata)
     if metadata["kind"] not in kinds:
         raise UserError(f"{npz_path} is a {metadata['kind']}: give a {' or '.join(kinds)} here.")
     if hashlib.sha256(data).hexdigest() != metadata["sha256"]:
@@ -336,29 +319,6 @@ def _parse_metadata(path: Path, text: bytes) -> dict[str, Any]:
     if not isinstance(metadata, dict):
         raise UserError(f"{path} holds a {type(metadata).__name__}: a JSON object is expected.")
     return metadata
-
-
-def _check_metadata(path: Path, metadata: Mapping[str, Any]) -> None:
-    # The version first: another version may well have other keys.
-    version = metadata.get("schema_version", schema.VERSION)
-    if type(version) is not int or not 1 <= version <= schema.VERSION:
-        raise UserError(
-            f"{path} has schema version {version!r} and this installation reads 1 to {schema.VERSION}: "
-            "install a version of lpo that matches it."
-        )
-    missing = [key for key in _FIELDS if key not in metadata]
-    if missing:
-        raise UserError(
-            f"{path} lacks {', '.join(missing)}: an artefact says all of {', '.join(_FIELDS)}."
-        )
-    for key, types in _FIELDS.items():
-        if not isinstance(metadata[key], types):
-            names = " or ".join({"dict": "object"}.get(t.__name__, t.__name__) for t in types)
-            raise UserError(
-                f"{path} has a {type(metadata[key]).__name__} for {key}: expected is {names}."
-            )
-    if metadata["kind"] not in KINDS:
-        raise UserError(f"{path} is of kind {metadata['kind']!r}: known are {', '.join(KINDS)}.")
 
 
 def _as_json(value: object) -> object:
