@@ -172,10 +172,15 @@ class LongRun(ABC):
         words += flags(self.config, preset(decided))
         return shlex.join([*self.program.split(), *words])
 
+    def further(self) -> Iterator[str]:
+        """Flags of what a resumed run does after it, which is no part of what it finds."""
+        yield from ()
+
     def open(self) -> Run:
         """The run folder, new or resumed."""
         output, wandb = self.output, getattr(self.output, "wandb", None)
-        stored = {"command": self.command, "config": config_dict(self.config)}
+        command = " ".join([self.command, *map(shlex.quote, self.further())])
+        stored = {"command": command, "config": config_dict(self.config)}
         folder, resumed, refused, run = (
             output.resume or output.out,
             output.resume is not None,

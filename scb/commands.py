@@ -1,6 +1,6 @@
 """What the subcommands of `scb` do. Their docstrings are the command line's help."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
@@ -11,7 +11,7 @@ import tyro
 
 from scb import experts, processes
 from scb.agents.spec import bandit_agent
-from scb.command_line import LongRun, Measuring, Output
+from scb.command_line import LongRun, Measuring, Output, flags
 from scb.console import console
 from scb.discovery import BanditDiscovery, DiscoveryConfig
 from scb.environments.registry import environment_spec
@@ -111,6 +111,9 @@ class Discover(LongRun):
     @classmethod
     def decided(cls, config: DiscoveryConfig) -> dict[str, str]:
         return {"environment": config.environment}
+
+    def further(self) -> Iterator[str]:
+        yield from flags(self.judgement, Judgement())
 
     def run(self) -> None:
         # The problem first: where a name is wrong, no folder is left behind to be in the next try's way.

@@ -21,7 +21,7 @@ import scb
 from scb import artefacts, listing
 from scb.cli import main
 from scb.command_line import Output
-from scb.commands import Discover, TrainConfig
+from scb.commands import Discover, Judgement, TrainConfig
 from scb.curriculum import CurriculumConfig, paper_curriculum
 from scb.discovery import BanditDiscovery, DiscoveryConfig
 from scb.environments.registry import make
@@ -134,6 +134,20 @@ def test_a_finished_discovery_is_resumed_to_the_same_bandit(discovered, tmp_path
     assert (result.code, result.err) == (0, "")
     assert (folder / "Synthetic-CartPole-v1.npz").read_bytes() == before
     assert (folder / "metrics.jsonl").read_bytes() == metrics
+
+
+def test_a_resumed_discovery_judges_as_it_was_told_to_at_first(tmp_path):
+    folder = tmp_path / "run"
+    words = ["--environment=CartPole-v1", "--judge-agents=3", "--judge-episodes=2"]
+    command = Discover.parse([*words, "--out", str(folder)])
+    command.open().close()
+    resumed = Discover.parse(["--resume", str(folder)])
+    assert resumed.judgement == command.judgement == Judgement(3, 2)
+    # It is no part of what a search finds, so of the bandit's command neither, and can be another one.
+    assert resumed.command == command.command == "scb discover --environment=CartPole-v1"
+    again = Discover.parse(["--resume", str(folder), "--judge-agents=0"])
+    assert again.judgement == Judgement(0, 2)
+    again.open().close()
 
 
 def test_a_flag_that_contradicts_the_resumed_run_is_refused(discovered):
