@@ -51,6 +51,7 @@ REPORTERS = {
             "generality",
             "locomotion",
             "lpo_on_bandits",
+            "robustness",
             "sb3",
             "transfer_study",
             "zoo_table",

@@ -1,0 +1,238 @@
+"""What is an objective worth to somebody who does not tune? PPO with drawn hyperparameters, all objectives' the same.
+
+    python -m experiments.robustness
+    python -m experiments.robustness --environments Asterix-MinAtar --objectives ppo dpo lpo-multi
+
+Learning rate, discount, GAE's lambda, entropy, initialisation, epochs and minibatches are drawn from the paper's lists
+and usual public defaults (plans/robustness.toml), once for all objectives, so that these are compared in pairs.
+`ppo-drawn` is PPO's clip drawn as well. What --out holds is not measured again: the same command goes on where it
+was, and with other environments or objectives adds to it.
+"""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from experiments.claims import TENTH, Claim
+from experiments.harness import Experiment, Report, finite, packed, plan_of, unpacked
+from experiments.parts import InParts, Part
+from lpo.comparison import ppo_spec
+from lpo.objectives import Objective, load_objective
+from lpo.suite import suite
+from scb.agents.spec import AgentSpec
+from scb.environments.registry import environment_spec
+from scb.errors import at_least
+from scb.measurement import Agents, Place, measure
+from scb.plotting import BLUE, VERMILLION, estimate_row
+from scb.rows import Rows
+from scb.seeds import REPORTING
+from scb.statistics import Statistic, normalized_score, stratified_estimate, worst_decile
+
+_PLAN = plan_of("robustness")
+REFERENCE = "ppo"
+DRAWN = "ppo-drawn"
+REFERENCES = (REFERENCE, DRAWN, "dpo")
+FIRST_SEED = REPORTING[12_000]
+STATISTICS: dict[str, Statistic] = {"mean": np.mean, "worst decile": worst_decile}
+
+
+@dataclass(frozen=True)
+class Options:
+    """What is trained, and where."""
+
+    environments: tuple[str, ...] = suite("classic")
+    """any that PPO trains in"""
+    objectives: tuple[str, ...] = (
+        *REFERENCES,
+        "lpo-pendulum",
+        "lpo-multi",
+        "lpo-pendulum-ee",
+        "ta-lpo",
+    )
+    """as `lpo evaluate` takes them, and ppo-drawn"""
+    draws: int = 17
+    """of hyperparameters for each setting of epochs and minibatches, of which an environment has three"""
+    runs: Path = Path("runs/robustness")
+    """for agents until they are saved"""
+
+    def __post_init__(self) -> None:
+        at_least(2, self, "draws")
+
+
+def parts(options: Options, report: dict[str, Any]) -> Iterator[Part]:
+    """One setting of one environment with one objective at a time."""
+    objectives = {x: None if x == DRAWN else load_objective(x) for x in options.objectives}
+    for environment in options.environments:
+        for i, setting in enumerate(_PLAN["settings"][environment_spec(environment).family]):
+            words = ", ".join(f"{name} {value}" for name, value in setting.items())
+            key = f"{options.draws} of {words}"
+            for name, objective in objectives.items():
+                spec = replace(ppo_spec(environment).with_values(**setting), lists=_PLAN["lists"])
+                drawn = Agents.drawn_from(spec, FIRST_SEED + i, options.draws)
+                place = (environment, name, key)
+                trained = partial(_trained, *place, objective, spec, drawn, options.runs)
+                yield Part(("environments", environment), trained, (("returns", name, key),))
+
+
+def _trained(
+    environment: str,
+    name: str,
+    key: str,
+    objective: Objective | None,
+    spec: AgentSpec,
+    drawn: Agents,
+    runs: Path,
+) -> dict[str, Any]:
+    """What agents of one setting earn at the end of their training."""
+    kept = Rows(runs / environment / f"{name}, {key}.rows.jsonl")
+    objectives = () if objective is None else (objective,)
+    place = Place.named(environment)
+    rows = measure(spec, place, agents=drawn, objectives=objectives, rows=kept)
+    random = environment_spec(environment).random_return()
+    earned, failed = finite([row["return"] for row in rows], random)
+    print(f"{environment}, {name}, {key}: {np.mean(earned):.4g}", flush=True)
+    learning = {} if objective is None else objective.metadata.get("config", {})
+    tasks = learning.get("meta_training", {}).get("tasks", ())
+    return {
+        "random": random,
+        "returns": {name: {key: packed([earned])[0]}},
+        "failed": {name: {key: failed}},
+        "draws": {key: {x: packed([[row[x] for row in rows]])[0] for x in drawn.drawn}},
+        "learned_on": {name: [task.removeprefix("Synthetic-") for task in tasks]},
+    }
+
+
+Scores = dict[str, dict[str, NDArray[np.floating]]]  # {environment: {objective: [draws]}}
+
+
+def scores(report: Report) -> Scores:
+    """Of what has as many draws as PPO's clip: 0 for random actions, 1 for a published expert.
+
+    Where nobody published one, 1 is what a twentieth of all agents here earn more than.
+    """
+    found = {}
+    for environment, entry in report["environments"].items():
+        settings = list(entry["returns"].get(REFERENCE, ()))
+        returns = {
+            name: np.concatenate([unpacked([lines[key]])[0] for key in settings])
+            for name, lines in entry["returns"].items()
+            if settings and all(key in lines for key in settings)
+        }
+        if returns:
+            every = np.concatenate(list(returns.values()))
+            published = environment_spec(environment).reference()
+            best = np.percentile(every, 95) if published is None else published.value
+            found[environment] = {
+                name: normalized_score(x, entry["random"], best) for name, x in returns.items()
+            }
+    return found
+
+
+def groups(
+    report: Report, name: str, other: str = REFERENCE, unseen: bool = False
+) -> tuple[list[NDArray[np.floating]], list[NDArray[np.floating]]]:
+    """[draws] of two objectives in every environment that has both, `unseen`: that the first was not learned on."""
+    learned = {
+        environment
+        for entry in report["environments"].values()
+        for environment in entry["learned_on"].get(name, ())
+    }
+    shared = [
+        (x[name], x[other])
+        for environment, x in scores(report).items()
+        if name in x and other in x and not (unseen and environment in learned)
+    ]
+    return [a for a, _ in shared], [b for _, b in shared]
+
+
+def claims(report: Report) -> list[Claim]:
+    """Of every learned objective, where it was not learned: above PPO's clip and DPO in mean and worst decile."""
+    found = []
+    for name in named(report):
+        if name in REFERENCES:
+            continue
+        for other in (REFERENCE, "dpo"):
+            ours, theirs = groups(report, name, other, unseen=True)
+            if not ours:
+                continue
+            for what, statistic in STATISTICS.items():
+                better = partial(stratified_estimate, ours, theirs, statistic=statistic)
+                found.append(Claim(f"{name}: a higher {what} than {other}", better))
+    return found
+
+
+def named(report: Report) -> list[str]:
+    """The objectives."""
+    return list(dict.fromkeys(name for x in scores(report).values() for name in x))
+
+
+def facts(report: Report) -> dict[str, Any]:
+    """A row for each objective, over all environments and in each."""
+    rows = []
+    for name in named(report):
+        ours, theirs = groups(report, name)
+        above = [(a > b) + (a == b) / 2 for a, b in zip(ours, theirs, strict=True)]
+        failing = [(a < TENTH).astype(float) for a in ours]
+        rows.append(
+            {
+                "name": name,
+                **{
+                    what: stratified_estimate(ours, statistic=statistic)
+                    for what, statistic in STATISTICS.items()
+                },
+                "fails": stratified_estimate(failing, statistic=np.mean),
+                "improves": None
+                if name == REFERENCE
+                else stratified_estimate(above, statistic=np.mean),
+                "in": {e: x[name].mean() for e, x in scores(report).items() if name in x},
+                "agents": sum(x.size for x in ours),
+                "broken": sum(
+                    sum(entry["failed"].get(name, {}).values())
+                    for entry in report["environments"].values()
+                ),
+            }
+        )
+    return {"rows": rows, "places": list(scores(report)), "lists": _PLAN["lists"], "tenth": TENTH}
+
+
+def draw(report: Mapping[str, Any]) -> Figure:
+    """One panel a statistic, one line an objective."""
+    rows = facts(report)["rows"]
+    panels = {
+        "mean": "mean score",
+        "worst decile": "worst decile of the scores",
+        "fails": f"share of agents that fail (score below {TENTH:g})",
+    }
+    figure = Figure(figsize=(11.0, 1.4 + 0.34 * len(rows)))
+    for axes, (what, label) in zip(
+        figure.subplots(1, len(panels), sharey=True), panels.items(), strict=True
+    ):
+        for position, row in enumerate(rows):
+            color = BLUE if row["name"] in REFERENCES else VERMILLION
+            estimate_row(axes, position, np.array([]), row[what], color)
+        axes.set(xlabel=label)
+        axes.set_yticks(range(len(rows)), [row["name"] for row in rows])
+    axes.invert_yaxis()
+    return figure
+
+
+EXPERIMENT = Experiment(
+    "robustness",
+    "What is an objective worth to somebody who does not tune?",
+    InParts(parts),
+    claims=claims,
+    facts=facts,
+    draw=draw,
+    options=Options,
+    keys=("environments",),
+)
+
+
+if __name__ == "__main__":
+    raise SystemExit(EXPERIMENT.main())

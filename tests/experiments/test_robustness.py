@@ -1,0 +1,112 @@
+"""Objectives meet the same drawn hyperparameters, and failures are counted."""
+
+import json
+
+import numpy as np
+import pytest
+
+from experiments import robustness as module
+from experiments.claims import FAILS, HOLDS
+from experiments.harness import packed
+from lpo.objectives import load_objective
+from scb.environments.registry import environment_spec
+
+KEY = "20 of num_epochs 4"
+
+
+def entry(environment, learned_on=(), **scores):
+    """Returns of 20 draws each that are these scores, give or take a little."""
+    spec = environment_spec(environment)
+    random, best = spec.random_return(), spec.reference_return()
+    little = np.linspace(-0.01, 0.01, 20)
+    return {
+        "random": random,
+        "returns": {
+            name.replace("_", "-"): {KEY: packed([random + (best - random) * (x + little)])[0]}
+            for name, x in scores.items()
+        },
+        "failed": {name.replace("_", "-"): {KEY: 0} for name in scores},
+        "draws": {KEY: {}},
+        "learned_on": {"lpo-pendulum": list(learned_on)},
+    }
+
+
+@pytest.fixture
+def report():
+    learned = ["Pendulum-v1"]
+    scores = {"ppo": np.repeat([0.0, 0.5], 10), "dpo": 0.8, "lpo_pendulum": 0.6}
+    return {
+        "environments": {
+            "Pendulum-v1": entry("Pendulum-v1", learned, **{**scores, "lpo_pendulum": -9.0}),
+            "Acrobot-v1": entry("Acrobot-v1", learned, **scores),
+        },
+        "machine": {"cores": 2, "processor": "a processor"},
+    }
+
+
+def test_an_objective_is_judged_where_it_was_not_learned(report):
+    judged = {x.claim.text: x.outcome for x in module.EXPERIMENT.judged(report)}
+    assert judged == {
+        "lpo-pendulum: a higher mean than ppo": HOLDS,
+        "lpo-pendulum: a higher worst decile than ppo": HOLDS,
+        "lpo-pendulum: a higher mean than dpo": FAILS,
+        "lpo-pendulum: a higher worst decile than dpo": FAILS,
+    }
+
+
+def test_failures_are_counted_and_draws_are_compared_in_pairs(report):
+    ppo, dpo, learned = module.facts(report)["rows"]
+    # Half of PPO's agents are at the level of random actions; of the learned one all of Pendulum's.
+    assert ppo["fails"].value == 0.5 and dpo["fails"].value == 0.0 and learned["fails"].value == 0.5
+    assert dpo["improves"].value == 1.0 and learned["improves"].value == 0.5
+    assert learned["in"]["Acrobot-v1"] == pytest.approx(0.6, abs=1e-3)
+    page = module.EXPERIMENT.page(report)
+    assert "**Shown: lpo-pendulum: a higher mean than ppo; lpo-pendulum: a higher worst" in page
+    (figure,) = module.EXPERIMENT.figures(report).values()
+    assert len(figure.axes) == 3
+
+
+def test_an_objective_with_fewer_draws_is_left_out_until_it_has_them(report):
+    acrobot = report["environments"]["Acrobot-v1"]["returns"]
+    acrobot["ppo"]["20 of num_epochs 10"] = acrobot["ppo"][KEY]
+    assert list(module.scores(report)["Acrobot-v1"]) == ["ppo"]
+
+
+def test_without_a_published_expert_the_best_agents_are_the_scale(report):
+    games = {"random": 0.0, "returns": {"ppo": {KEY: packed([np.arange(101)])[0]}}}
+    report["environments"] = {"Asterix-MinAtar": games}
+    assert module.scores(report)["Asterix-MinAtar"]["ppo"].max() == pytest.approx(100 / 95)
+
+
+def test_all_objectives_meet_the_same_draws(tmp_path, monkeypatch):
+    asked = []
+
+    def measure(spec, place, agents, objectives, rows):
+        asked.append((place.name, [o.name for o in objectives], spec.config.num_epochs, agents))
+        numbers = [
+            {n: float(getattr(agents.hyperparameters, n)[i]) for n in agents.drawn} for i in (0, 1)
+        ]
+        return [{"return": r, **drawn} for r, drawn in zip((None, 9.0), numbers, strict=True)]
+
+    monkeypatch.setattr(module, "measure", measure)
+    out = tmp_path / "report.json"
+    flags = ["--draws", "2", "--environments", "CartPole-v1", "--objectives"]
+    module.EXPERIMENT.main([*flags, "ppo", "ppo-drawn", "--out", str(out)])
+    module.EXPERIMENT.main([*flags, "ppo", "ppo-drawn", "lpo-multi", "--out", str(out)])
+    assert [(name, epochs) for _, name, epochs, _ in asked] == [
+        *((name, epochs) for epochs in (4, 10, 10) for name in (["ppo"], [])),
+        *((["lpo-multi"], epochs) for epochs in (4, 10, 10)),
+    ]
+    for first, second in zip(asked[:6:2], asked[6:], strict=True):
+        for name in first[-1].drawn:
+            np.testing.assert_array_equal(
+                *(getattr(x[-1].hyperparameters, name) for x in (first, second))
+            )
+    found = json.loads(out.read_text())["environments"]["CartPole-v1"]
+    assert found["learned_on"]["lpo-multi"] == ["Pendulum-v1", "CartPole-v1"]
+    key = "2 of num_epochs 4, num_minibatches 4"
+    # What ends in NaN counts as random actions.
+    random = environment_spec("CartPole-v1").random_return()
+    assert found["returns"]["ppo"][key] == packed([[random, 9.0]])[0]
+    assert found["failed"]["ppo"][key] == 1
+    assert load_objective("lpo-multi").name in found["returns"]
