@@ -72,9 +72,9 @@ def parts(options: Options, report: dict[str, Any]) -> Iterator[Part]:
         for i, setting in enumerate(_PLAN["settings"][environment_spec(environment).family]):
             words = ", ".join(f"{name} {value}" for name, value in setting.items())
             key = f"{options.draws} of {words}"
+            spec = replace(ppo_spec(environment).with_values(**setting), lists=_PLAN["lists"])
+            drawn = Agents.drawn_from(spec, FIRST_SEED + i, options.draws)
             for name, objective in objectives.items():
-                spec = replace(ppo_spec(environment).with_values(**setting), lists=_PLAN["lists"])
-                drawn = Agents.drawn_from(spec, FIRST_SEED + i, options.draws)
                 place = (environment, name, key)
                 trained = partial(_trained, *place, objective, spec, drawn, options.runs)
                 yield Part(("environments", environment), trained, (("returns", name, key),))
@@ -97,14 +97,13 @@ def _trained(
     random = environment_spec(environment).random_return()
     earned, failed = finite([row["return"] for row in rows], random)
     print(f"{environment}, {name}, {key}: {np.mean(earned):.4g}", flush=True)
-    learning = {} if objective is None else objective.metadata.get("config", {})
-    tasks = learning.get("meta_training", {}).get("tasks", ())
+    tasks = () if objective is None else objective.learned_on
     return {
         "random": random,
         "returns": {name: {key: packed([earned])[0]}},
         "failed": {name: {key: failed}},
         "draws": {key: {x: packed([[row[x] for row in rows]])[0] for x in drawn.drawn}},
-        "learned_on": {name: [task.removeprefix("Synthetic-") for task in tasks]},
+        "learned_on": {name: [environment_spec(x).evaluation_environment for x in tasks]},
     }
 
 
@@ -135,30 +134,27 @@ def scores(report: Report) -> Scores:
 
 
 def groups(
-    report: Report, name: str, other: str = REFERENCE, unseen: bool = False
+    scored: Scores, name: str, other: str
 ) -> tuple[list[NDArray[np.floating]], list[NDArray[np.floating]]]:
-    """[draws] of two objectives in every environment that has both, `unseen`: that the first was not learned on."""
-    learned = {
-        environment
-        for entry in report["environments"].values()
-        for environment in entry["learned_on"].get(name, ())
-    }
-    shared = [
-        (x[name], x[other])
-        for environment, x in scores(report).items()
-        if name in x and other in x and not (unseen and environment in learned)
-    ]
+    """[draws] of two objectives in every environment that has both."""
+    shared = [(x[name], x[other]) for x in scored.values() if name in x and other in x]
     return [a for a, _ in shared], [b for _, b in shared]
 
 
 def claims(report: Report) -> list[Claim]:
     """Of every learned objective, where it was not learned: above PPO's clip and DPO in mean and worst decile."""
-    found = []
-    for name in named(report):
+    found, scored = [], scores(report)
+    for name in named(scored):
         if name in REFERENCES:
             continue
+        learned_on = {
+            place
+            for entry in report["environments"].values()
+            for place in entry["learned_on"].get(name, ())
+        }
+        unseen = {place: x for place, x in scored.items() if place not in learned_on}
         for other in (REFERENCE, "dpo"):
-            ours, theirs = groups(report, name, other, unseen=True)
+            ours, theirs = groups(unseen, name, other)
             if not ours:
                 continue
             for what, statistic in STATISTICS.items():
@@ -167,16 +163,16 @@ def claims(report: Report) -> list[Claim]:
     return found
 
 
-def named(report: Report) -> list[str]:
+def named(scored: Scores) -> list[str]:
     """The objectives."""
-    return list(dict.fromkeys(name for x in scores(report).values() for name in x))
+    return list(dict.fromkeys(name for x in scored.values() for name in x))
 
 
 def facts(report: Report) -> dict[str, Any]:
     """A row for each objective, over all environments and in each."""
-    rows = []
-    for name in named(report):
-        ours, theirs = groups(report, name)
+    rows, scored = [], scores(report)
+    for name in named(scored):
+        ours, theirs = groups(scored, name, REFERENCE)
         above = [(a > b) + (a == b) / 2 for a, b in zip(ours, theirs, strict=True)]
         failing = [(a < TENTH).astype(float) for a in ours]
         rows.append(
@@ -190,7 +186,7 @@ def facts(report: Report) -> dict[str, Any]:
                 "improves": None
                 if name == REFERENCE
                 else stratified_estimate(above, statistic=np.mean),
-                "in": {e: x[name].mean() for e, x in scores(report).items() if name in x},
+                "in": {e: x[name].mean() for e, x in scored.items() if name in x},
                 "agents": sum(x.size for x in ours),
                 "broken": sum(
                     sum(entry["failed"].get(name, {}).values())
@@ -198,7 +194,7 @@ def facts(report: Report) -> dict[str, Any]:
                 ),
             }
         )
-    return {"rows": rows, "places": list(scores(report)), "lists": _PLAN["lists"], "tenth": TENTH}
+    return {"rows": rows, "places": list(scored), "lists": _PLAN["lists"], "tenth": TENTH}
 
 
 def draw(report: Mapping[str, Any]) -> Figure:

@@ -149,7 +149,7 @@ def facts(report: Report) -> dict[str, Any]:
         "once": [row["name"] for row in rows if row["searches"] == 1],
         "number": number,
         "places": {
-            e["name"]: 2 if len(e["environments"]) > 1 else 0 for e in report["evaluations"]
+            e["name"]: 2 if Evaluation(**e).normalized else 0 for e in report["evaluations"]
         },
         "level": 100 * (1 - 0.05 / max(1, number)),
     }
@@ -170,8 +170,8 @@ def draw(report: Mapping[str, Any]) -> Figure:
             returns = report["objectives"][name]["returns"][evaluation]
             agents = np.concatenate(list(returns.values()))
             estimate_row(axes, position, agents, row["in"][evaluation], color)
-        score = len(at["environments"]) > 1
-        axes.set(title=evaluation, xlabel="normalised score" if score else "final return")
+        scale = "normalised score" if Evaluation(**at).normalized else "final return"
+        axes.set(title=evaluation, xlabel=scale)
         axes.xaxis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10]))
     panels[0].set_yticks(range(len(rows)), [row["name"] for row in rows])
     panels[0].invert_yaxis()

@@ -43,10 +43,11 @@ def list_command(json: bool = False) -> None:
 
 def entry(name: str) -> dict[str, Any]:
     """What `lpo list --json` says of a learned objective."""
-    metadata = load_objective(name).metadata
+    objective = load_objective(name)
+    metadata = objective.metadata
     return {
         "name": name,
-        "learned_on": metadata["config"]["meta_training"]["tasks"],
+        "learned_on": list(objective.learned_on),
         "minutes": round(metadata["cost"]["seconds"] / 60, 2),
         "results": _results(metadata["results"], name),
         "certificate": metadata.get("certificate"),

@@ -38,6 +38,12 @@ class Objective:
     parameters: Any
     metadata: Mapping[str, Any] = field(default_factory=dict)
 
+    @property
+    def learned_on(self) -> tuple[str, ...]:
+        """The tasks of its search; none of a formula, which nobody searched for."""
+        config = self.metadata.get("config", {})
+        return tuple(config.get("meta_training", {}).get("tasks", ()))
+
 
 def zoo_names() -> list[str]:
     """Names of the learned objectives that ship with the library."""
