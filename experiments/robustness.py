@@ -2,6 +2,7 @@
 
     python -m experiments.robustness
     python -m experiments.robustness --environments Asterix-MinAtar --objectives ppo dpo lpo-multi
+    python -m experiments.robustness --validation --objectives ppo dpo OBJECTIVE.npz --out runs/validation.json
 
 Learning rate, discount, GAE's lambda, entropy, initialisation, epochs and minibatches are drawn from the paper's lists
 and usual public defaults (plans/robustness.toml), once for all objectives, so that these are compared in pairs.
@@ -27,11 +28,11 @@ from lpo.objectives import Objective, load_objective
 from lpo.suite import suite
 from scb.agents.spec import AgentSpec
 from scb.environments.registry import environment_spec
-from scb.errors import at_least
+from scb.errors import UserError, at_least
 from scb.measurement import Agents, Place, measure
 from scb.plotting import BLUE, VERMILLION, estimate_row
 from scb.rows import Rows
-from scb.seeds import REPORTING
+from scb.seeds import REPORTING, VALIDATING
 from scb.statistics import Statistic, normalized_score, stratified_estimate, worst_decile
 
 _PLAN = plan_of("robustness")
@@ -39,6 +40,7 @@ REFERENCE = "ppo"
 DRAWN = "ppo-drawn"
 REFERENCES = (REFERENCE, DRAWN, "dpo")
 FIRST_SEED = REPORTING[12_000]
+FIRST_TO_CHOOSE = VALIDATING[1000]
 STATISTICS: dict[str, Statistic] = {"mean": np.mean, "worst decile": worst_decile}
 
 
@@ -58,6 +60,8 @@ class Options:
     """as `lpo evaluate` takes them, and ppo-drawn"""
     draws: int = 17
     """of hyperparameters for each setting of epochs and minibatches, of which an environment has three"""
+    validation: bool = False
+    """on seeds that report nothing, to choose among objectives; in a report of its own (--out)"""
     runs: Path = Path("runs/robustness")
     """for agents until they are saved"""
 
@@ -67,13 +71,19 @@ class Options:
 
 def parts(options: Options, report: dict[str, Any]) -> Iterator[Part]:
     """One setting of one environment with one objective at a time."""
+    first = FIRST_TO_CHOOSE if options.validation else FIRST_SEED
+    if report.setdefault("first_seed", first) != first:
+        raise UserError(
+            f"the report holds agents of seeds from {report['first_seed']} on, and these would be from {first} on: "
+            "give --out another file."
+        )
     objectives = {x: None if x == DRAWN else load_objective(x) for x in options.objectives}
     for environment in options.environments:
         for i, setting in enumerate(_PLAN["settings"][environment_spec(environment).family]):
             words = ", ".join(f"{name} {value}" for name, value in setting.items())
             key = f"{options.draws} of {words}"
             spec = replace(ppo_spec(environment).with_values(**setting), lists=_PLAN["lists"])
-            drawn = Agents.drawn_from(spec, FIRST_SEED + i, options.draws)
+            drawn = Agents.drawn_from(spec, first + i, options.draws)
             for name, objective in objectives.items():
                 place = (environment, name, key)
                 trained = partial(_trained, *place, objective, spec, drawn, options.runs)

@@ -153,7 +153,7 @@ def distill_command(
     )
     print(f"expression: {found.drift.expression}")
     gate = f"gate({found.drift.gate:g}) * " if found.drift.gate else ""
-    print(f"drift: relu({'base + ' if found.drift.base == 'ppo' else ''}{gate}expression - xi)")
+    print(f"drift: relu({'' if found.drift.base == 'none' else 'base + '}{gate}expression - xi)")
     print("R² on unseen points: " + ", ".join(f"{k} {v:.3f}" for k, v in found.r2.items()))
     base = ", ".join(f"{k} {v:.3f}" for k, v in found.base_r2.items())
     print(f"R² of the base ({found.drift.base}) alone: {base}")

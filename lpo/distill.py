@@ -22,7 +22,6 @@ from lpo.certificate import certify
 from lpo.drifts import ClosedFormDrift
 from lpo.drifts.contract import CorrectedDrift
 from lpo.drifts.formula import Node, evaluate, parse
-from scb.agents.ppo import clipped_surrogate_drift
 from scb.errors import UserError, at_least
 from scb.keys import root_key
 
@@ -223,9 +222,8 @@ class _Data:
         x = np.concatenate([x, x + _STEP, x - _STEP])
         a, p = np.tile(points["advantage"], 3), np.tile(points["progress"], 3)
         # As the closed form will compute it: its own base, and nothing of the network's.
-        self.xi, self.base, self.gate = around.xi, np.zeros_like(x), np.ones_like(x)
-        if around.base == "ppo":
-            self.base = clipped_surrogate_drift(around.clip, x, a, p, np)
+        self.xi, self.gate = around.xi, np.ones_like(x)
+        self.base = np.zeros_like(x) + around.base_penalty(x, a, p)
         if around.gate:
             self.gate = around.gate_factor(x)
         self.variables = {"d": np.expm1(x), "log_r": x, "A": a, "abs(A)": np.abs(a), "progress": p}

@@ -10,13 +10,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from scb.agents.ppo import clipped_surrogate_drift, relu
+from lpo.drifts.bases import BASES
+from scb.agents.ppo import relu
 from scb.errors import UserError, at_least, unknown_name
 from scb.keys import root_key
 
 # Any: an array of JAX, NumPy or PyTorch; `xp` below is its library.
 Array: TypeAlias = Any
-BASES = ("ppo", "none")
 
 
 class Drift(ABC):
@@ -100,7 +100,8 @@ class CorrectedDrift(Drift):
     out there.
 
     Attributes:
-      base: ppo (the correction is added to PPO's clip drift, so that none is PPO) or none.
+      base: what the correction is added to: ppo (the clip's drift, so that no correction is PPO), dpo
+        (the same of DPO, with its constants), or none.
       clip: epsilon of the PPO base.
       xi: half-width of the dead zone, in units of the penalty; the original code has 1e-4.
       gate: width, in nats of log-ratio, of the region around ratio 1 where the correction is faded out,
@@ -134,11 +135,15 @@ class CorrectedDrift(Drift):
         penalty = self.correction(parameters, log_ratio, advantage, progress, xp)
         if self.gate:
             penalty = penalty * self.gate_factor(log_ratio, xp)
-        if self.base == "ppo":
-            penalty = penalty + clipped_surrogate_drift(
-                self.clip, log_ratio, advantage, progress, xp
-            )
+        penalty = penalty + self.base_penalty(log_ratio, advantage, progress, xp)
         return relu(penalty - self.xi, xp)
+
+    def base_penalty(
+        self, log_ratio: Array, advantage: Array, progress: Array, xp: Any = np
+    ) -> Array | float:
+        """[B] what the base charges, or 0.0 where there is none."""
+        base = BASES[self.base]
+        return 0.0 if base is None else base(self.clip, log_ratio, advantage, progress, xp)
 
     def gate_factor(self, log_ratio: Array, xp: Any = np) -> Array:
         """[B] 1 - exp(-(log r / gate)^2), where there is a gate."""

@@ -7,8 +7,9 @@ import chex
 import jax
 import jax.numpy as jnp
 
+from lpo.drifts.bases import DPO_ALPHA, DPO_BETA, discovered_drift
 from lpo.drifts.contract import Array, Drift
-from scb.agents.ppo import clipped_surrogate_drift, relu
+from scb.agents.ppo import clipped_surrogate_drift
 from scb.errors import UserError
 
 
@@ -39,8 +40,8 @@ class DPODrift(Drift):
 
     name: ClassVar[str] = "dpo"
 
-    alpha: float = 2.0
-    beta: float = 0.6
+    alpha: float = DPO_ALPHA
+    beta: float = DPO_BETA
 
     def __post_init__(self) -> None:
         if not (self.alpha > 0 and self.beta > 0):
@@ -54,13 +55,9 @@ class DPODrift(Drift):
     def __call__(
         self, parameters: Any, log_ratio: Array, advantage: Array, progress: Array, xp: Any = jnp
     ) -> Array:
-        chex.assert_equal_shape([log_ratio, advantage, progress])
-        alpha, beta = parameters["alpha"], parameters["beta"]
-        gain = xp.expm1(log_ratio) * advantage
-        loss = log_ratio * advantage
-        positive = relu(gain - alpha * xp.tanh(gain / alpha), xp)
-        negative = relu(loss - beta * xp.tanh(loss / beta), xp)
-        return xp.where(advantage >= 0, positive, negative)
+        return discovered_drift(
+            parameters["alpha"], parameters["beta"], log_ratio, advantage, progress, xp
+        )
 
 
 @dataclass(frozen=True)

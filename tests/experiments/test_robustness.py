@@ -10,6 +10,7 @@ from experiments.claims import FAILS, HOLDS
 from experiments.harness import packed
 from lpo.objectives import load_objective
 from scb.environments.registry import environment_spec
+from scb.seeds import REPORTING, VALIDATING
 
 KEY = "20 of num_epochs 4"
 
@@ -110,3 +111,14 @@ def test_all_objectives_meet_the_same_draws(tmp_path, monkeypatch):
     assert found["returns"]["ppo"][key] == packed([[random, 9.0]])[0]
     assert found["failed"]["ppo"][key] == 1
     assert load_objective("lpo-multi").name in found["returns"]
+
+
+def test_validation_is_on_other_seeds_and_in_a_report_of_its_own(report, tmp_path, capsys):
+    report |= {"experiment": "robustness", "first_seed": module.FIRST_SEED}
+    out = tmp_path / "report.json"
+    out.write_text(json.dumps(report))
+    assert module.EXPERIMENT.main(["--validation", "--out", str(out)]) == 2
+    error = capsys.readouterr().err
+    assert f"agents of seeds from {module.FIRST_SEED} on, and these would be from" in error
+    assert module.FIRST_SEED in REPORTING and module.FIRST_TO_CHOOSE in VALIDATING
+    assert json.loads(out.read_text()) == report

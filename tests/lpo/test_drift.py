@@ -198,13 +198,15 @@ def test_some_weights_charge_for_moving_away():
 
 @settings(deadline=None)
 @given(log_ratio=log_ratios, advantage=advantages, seed=st.integers(0, 2**32 - 1))
-def test_zero_output_weights_are_ppos_clip_within_xi(log_ratio, advantage, seed):
+def test_zero_output_weights_are_the_base_within_xi(log_ratio, advantage, seed):
     parameters = random_weights(seed, 1.0)
     parameters["output"] = jnp.zeros_like(parameters["output"])
     outcome = learned(parameters, np.float32(log_ratio), np.float32(advantage))
     clip = float(clip_penalty(batch(0.2)[0], batch(log_ratio), batch(advantage))[0])
     # xi is 1e-6; at 200 float32 is 2e-5 coarse.
     assert float(outcome["ppo"][0]) == pytest.approx(clip, rel=1e-6, abs=2e-6)
+    dpo = float(DPODrift()(DPODrift().init(KEY), batch(log_ratio), batch(advantage), batch(0.0))[0])
+    assert float(outcome["dpo"][0]) == pytest.approx(dpo, rel=1e-6, abs=2e-6)
     assert float(outcome["none"][0]) == 0.0
 
 
