@@ -57,7 +57,7 @@ class Options:
         "lpo-pendulum-ee",
         "ta-lpo",
     )
-    """as `lpo evaluate` takes them, and ppo-drawn"""
+    """as `lpo evaluate` takes them, and ppo-drawn; a file's name is the objective's"""
     draws: int = 17
     """of hyperparameters for each setting of epochs and minibatches, of which an environment has three"""
     validation: bool = False
@@ -77,7 +77,15 @@ def parts(options: Options, report: dict[str, Any]) -> Iterator[Part]:
             f"the report holds agents of seeds from {report['first_seed']} on, and these would be from {first} on: "
             "give --out another file."
         )
-    objectives = {x: None if x == DRAWN else load_objective(x) for x in options.objectives}
+    objectives: dict[str, Objective | None] = {}
+    for given in options.objectives:
+        objective = None if given == DRAWN else load_objective(given)
+        name = DRAWN if objective is None else objective.name
+        if name in objectives:
+            raise UserError(
+                f"two objectives are called {name}: give one of the files another name."
+            )
+        objectives[name] = objective
     for environment in options.environments:
         for i, setting in enumerate(_PLAN["settings"][environment_spec(environment).family]):
             words = ", ".join(f"{name} {value}" for name, value in setting.items())

@@ -1,10 +1,13 @@
 """Objectives meet the same drawn hyperparameters, and failures are counted."""
 
 import json
+import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+import lpo
 from experiments import robustness as module
 from experiments.claims import FAILS, HOLDS
 from experiments.harness import packed
@@ -122,3 +125,12 @@ def test_validation_is_on_other_seeds_and_in_a_report_of_its_own(report, tmp_pat
     assert f"agents of seeds from {module.FIRST_SEED} on, and these would be from" in error
     assert module.FIRST_SEED in REPORTING and module.FIRST_TO_CHOOSE in VALIDATING
     assert json.loads(out.read_text()) == report
+
+
+def test_two_objectives_of_one_name_are_refused(tmp_path, capsys):
+    for suffix in (".npz", ".json"):
+        shipped = Path(lpo.__file__).parent / "zoo/lpo-multi"
+        shutil.copy(shipped.with_suffix(suffix), tmp_path)
+    flags = ["--objectives", "lpo-multi", str(tmp_path / "lpo-multi.npz")]
+    assert module.EXPERIMENT.main([*flags, "--out", str(tmp_path / "report.json")]) == 2
+    assert "two objectives are called lpo-multi" in capsys.readouterr().err
