@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from experiments.claims import TENTH, Claim
 from experiments.harness import Experiment, Report, finite, packed, plan_of, unpacked
 from experiments.parts import InParts, Part
-from lpo.comparison import ppo_spec
+from lpo.comparison import check_names, ppo_spec
 from lpo.objectives import Objective, load_objective
 from lpo.suite import suite
 from scb.agents.spec import AgentSpec
@@ -77,15 +77,9 @@ def parts(options: Options, report: dict[str, Any]) -> Iterator[Part]:
             f"the report holds agents of seeds from {report['first_seed']} on, and these would be from {first} on: "
             "give --out another file."
         )
-    objectives: dict[str, Objective | None] = {}
-    for given in options.objectives:
-        objective = None if given == DRAWN else load_objective(given)
-        name = DRAWN if objective is None else objective.name
-        if name in objectives:
-            raise UserError(
-                f"two objectives are called {name}: give one of the files another name."
-            )
-        objectives[name] = objective
+    loaded = [None if x == DRAWN else load_objective(x) for x in options.objectives]
+    check_names([x for x in loaded if x])
+    objectives = {DRAWN if x is None else x.name: x for x in loaded}
     for environment in options.environments:
         for i, setting in enumerate(_PLAN["settings"][environment_spec(environment).family]):
             words = ", ".join(f"{name} {value}" for name, value in setting.items())

@@ -27,7 +27,7 @@ class Objective:
     """A drift with its parameters: what `PPO` takes as its objective.
 
     Attributes:
-      name: as on the command line.
+      name: as on the command line; a file's is the objective's.
       drift: the family, passed to `PPO(env, config, drift)`.
       parameters: traced, passed as `PPOHyperparameters.drift`.
       metadata: of a learned objective, what its artefact says.
@@ -93,7 +93,7 @@ def _from_file(path: Path) -> Objective:
         raise UserError(
             f"{path} holds other numbers than the expression in its .json: fetch or save both again."
         )
-    return Objective(artefact.name, drift, parameters, artefact.metadata)
+    return Objective(path.stem, drift, parameters, artefact.metadata)
 
 
 def save_objective(

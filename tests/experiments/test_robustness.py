@@ -133,4 +133,4 @@ def test_two_objectives_of_one_name_are_refused(tmp_path, capsys):
         shutil.copy(shipped.with_suffix(suffix), tmp_path)
     flags = ["--objectives", "lpo-multi", str(tmp_path / "lpo-multi.npz")]
     assert module.EXPERIMENT.main([*flags, "--out", str(tmp_path / "report.json")]) == 2
-    assert "two objectives are called lpo-multi" in capsys.readouterr().err
+    assert "objective 'lpo-multi' is there twice" in capsys.readouterr().err

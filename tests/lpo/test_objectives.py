@@ -13,6 +13,7 @@ from gymnax.environments import spaces
 
 from lpo.certificate import certify
 from lpo.drifts import ClipDrift, DPODrift, LearnedDrift, NoDrift
+from lpo.drifts.contract import BASES
 from lpo.drifts.network import FEATURES
 from lpo.objectives import load_objective, objective_names, save_objective, zoo_names
 from scb.environments.synthetic import BanditConfig, SyntheticBandit
@@ -86,7 +87,7 @@ def test_an_unknown_name_is_told_what_is_known(name, message, one_sentence):
 # -- files --------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("base", ["ppo", "none"])
+@pytest.mark.parametrize("base", BASES)
 def test_a_saved_objective_charges_the_same_bit_for_bit(tmp_path, base):
     drift = LearnedDrift(base=base, hidden_size=3, clip=0.1, xi=1e-4, gate=0.25)
     parameters = drift.init(jax.random.key(5))
@@ -101,6 +102,13 @@ def test_a_saved_objective_charges_the_same_bit_for_bit(tmp_path, base):
     np.testing.assert_array_equal(
         loaded.drift(loaded.parameters, *arguments), drift(parameters, *arguments)
     )
+
+
+def test_a_copy_goes_by_the_name_of_its_own_file(file):
+    # All run folders have an objective.npz: copied under two names they can be compared.
+    for suffix in (".npz", ".json"):
+        file.with_suffix(suffix).rename(file.with_name(f"another{suffix}"))
+    assert load_objective(file.with_name("another.npz")).name == "another"
 
 
 def test_metadata_of_the_meta_training_is_kept(tmp_path, tiny_drift):
