@@ -25,7 +25,17 @@ import numpy as np
 
 from experiments.harness import Experiment, Save
 from experiments.rendering import digits
-from experiments.zoo_table_page import ACTIONS, BANDITS, TARGETS, facts, figure, pairs, place, rank
+from experiments.zoo_table_page import (
+    ACTIONS,
+    BANDITS,
+    TARGETS,
+    counted,
+    facts,
+    figures,
+    pairs,
+    place,
+    rank,
+)
 from scb.agents.spec import AgentSpec, algorithms_for, bandit_agent
 from scb.environments.registry import environment_spec
 from scb.environments.synthetic import BanditConfig, SyntheticBandit
@@ -212,13 +222,8 @@ def summary(returns: np.ndarray) -> dict[str, Any]:
     """{"iqm", "failed", "agents"} of [N] returns; one that is not finite is None, and counts as the worst."""
     agents = [round(float(r), 3) if np.isfinite(r) else None for r in returns]
     finite = [r for r in agents if r is not None]
-    iqm = estimate(_counted(agents)).as_dict() if finite else None
+    iqm = estimate(counted(agents)).as_dict() if finite else None
     return {"iqm": iqm, "failed": len(agents) - len(finite), "agents": agents}
-
-
-def _counted(agents: Sequence[float | None]) -> list[float]:
-    worst = min(r for r in agents if r is not None)
-    return [worst if r is None else r for r in agents]
 
 
 def differences(entries: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
@@ -232,7 +237,7 @@ def differences(entries: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
         for actions in ACTIONS:
             both = [pair[kind][actions] for kind in BANDITS]
             if all(x["iqm"] is not None for x in both):
-                ours, theirs = (_counted(x["agents"]) for x in both)
+                ours, theirs = (counted(x["agents"]) for x in both)
                 row[actions] = paired_difference(ours, theirs).as_dict()
         rows.append(row)
     return rows
@@ -252,7 +257,7 @@ EXPERIMENT = Experiment(
     "The bandits, by environment and algorithm",
     measure,
     facts=facts,
-    draw=figure,
+    draw=figures,
     options=Options,
 )
 

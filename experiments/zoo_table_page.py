@@ -4,6 +4,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
@@ -12,6 +13,7 @@ from scb import plotting
 from scb.agents.spec import ALGORITHMS
 from scb.environments.registry import environment_spec
 from scb.errors import UserError
+from scb.statistics import Estimate, normalized_score, stratified_estimate
 
 ACTIONS = {"mode_actions": "most likely actions", "sampled_actions": "sampled actions"}
 BANDITS = ("ours", "published")
@@ -68,6 +70,9 @@ def facts(report: Mapping[str, Any]) -> dict[str, Any]:
             for actions, text in ACTIONS.items()
             if x[actions]["failed"]
         ],
+        "scores": brax_scores(entries),
+        "expert": _best_of_the_paper,
+        "both": BOTH,
         "published": bool(published),
         "moved": any(x not in (None, "generalized") for x in published),
     }
@@ -89,6 +94,78 @@ def _target(pair: Mapping[str, Mapping[str, Any]]) -> tuple[float | None, list[s
     return target, ["yes" if iqm and iqm["value"] >= target else "no" for iqm in iqms]
 
 
+def counted(agents: Sequence[float | None]) -> list[float]:
+    """Every agent's return; one without a finite return counts as the worst."""
+    worst = min(r for r in agents if r is not None)
+    return [worst if r is None else r for r in agents]
+
+
+BOTH = "all that have both"
+
+
+def brax_scores(
+    entries: Sequence[Mapping[str, Any]], actions: str = "mode_actions"
+) -> dict[str, dict[str, Estimate]]:
+    """{environment: {"ours": score, "published": score}} over all algorithms, on the physics of the paper.
+
+    A score is 0 for random actions and 1 for the best of the agents that the paper trained in the environment itself.
+    `BOTH` is over the environments that have a bandit of either kind.
+    """
+    groups: dict[str, dict[str, list[Any]]] = {}
+    for entry in sorted(entries, key=place):
+        agents, name = entry[actions]["agents"], entry["environment"]
+        expert = _best_of_the_paper(name)
+        if entry["backend"] != "generalized" or expert is None or entry[actions]["iqm"] is None:
+            continue
+        random = environment_spec(name).random_return(entry["backend"])
+        score = normalized_score(counted(agents), random, expert)
+        groups.setdefault(name, {}).setdefault(entry["bandit"], []).append(score)
+    both = [kinds for kinds in groups.values() if len(kinds) == len(BANDITS)]
+    if both:
+        groups[BOTH] = {kind: [x for kinds in both for x in kinds[kind]] for kind in BANDITS}
+    return {
+        name: {kind: stratified_estimate(x) for kind, x in kinds.items()}
+        for name, kinds in groups.items()
+    }
+
+
+def _best_of_the_paper(environment: str) -> float | None:
+    """What the best of the paper's agents earn that were trained in a Brax environment itself."""
+    stated = [paper_return(environment, algorithm, "generalized") for algorithm in ALGORITHMS]
+    return max((x for x in stated if x is not None), default=None)
+
+
+def figures(report: Mapping[str, Any]) -> dict[str, Figure]:
+    """{file: figure}: returns, and where Brax was measured its scores."""
+    drawn = {"zoo_table": figure(report)}
+    scores = brax_scores(report["entries"])
+    if scores:
+        drawn["zoo_table_brax"] = brax_figure(scores)
+    return drawn
+
+
+def brax_figure(scores: Mapping[str, Mapping[str, Estimate]]) -> Figure:
+    """The paper's figure 1 (2): a line an environment, ours above the published."""
+    drawn = Figure(figsize=(plotting.WIDTH, 1.3 + 0.4 * len(scores)))
+    axes = drawn.subplots()
+    for position, found in enumerate(scores.values()):
+        if position % 2 == 0:
+            axes.axhspan(position - 0.5, position + 0.5, color="#F4F4F4", linewidth=0)
+        for (kind, color), offset in zip(_COLORS.items(), (-0.15, 0.15), strict=True):
+            if kind in found:
+                plotting.estimate_row(axes, position + offset, np.array([]), found[kind], color)
+    axes.axvline(1.0, **_EXPERT)
+    axes.set_yticks(range(len(scores)), list(scores))
+    axes.set_ylim(len(scores) - 0.5, -0.5)
+    axes.set_xlim(left=0.0)
+    axes.grid(axis="y", visible=False)
+    axes.set_xlabel("score: 0 random actions, 1 the paper's best agents trained in the environment")
+    plotting.figure_title(drawn, "Agents of four algorithms, trained in Brax bandits: mean of IQMs")
+    shown = {kind: {"color": color, "marker": "o"} for kind, color in _COLORS.items()}
+    plotting.legend_of(drawn, shown, columns=2)
+    return drawn
+
+
 def figure(report: Mapping[str, Any]) -> Figure:
     """One panel an environment: every algorithm's interquartile mean and interval, ours and published."""
     entries = report["entries"]
@@ -103,9 +180,7 @@ def figure(report: Mapping[str, Any]) -> Figure:
             "markerfacecolor": color if actions == "mode_actions" else "white",
             "markeredgewidth": 1.4,
         }
-        for kind, color, marker in zip(
-            BANDITS, (plotting.VERMILLION, plotting.BLUE), "os", strict=True
-        )
+        for (kind, color), marker in zip(_COLORS.items(), "os", strict=True)
         for actions in ACTIONS
     }
     experts = {x: value for x in environments if (value := _paper_expert(x)) is not None}
@@ -158,6 +233,7 @@ def figure(report: Mapping[str, Any]) -> Figure:
     return drawn
 
 
+_COLORS = dict(zip(BANDITS, (plotting.VERMILLION, plotting.BLUE), strict=True))
 _EXPERT: dict[str, Any] = {"color": plotting.BLACK, "linewidth": 1.4, "linestyle": ":"}
 
 

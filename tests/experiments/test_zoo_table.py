@@ -121,6 +121,32 @@ def test_the_figure_draws_what_the_table_says():
     assert [expected["mode_actions"]["iqm"][end] for end in ("low", "high")] in ends
 
 
+def test_brax_is_scored_between_random_actions_and_the_papers_best():
+    spec = environment_spec("hopper")
+    random, best = spec.random_return("generalized"), 3325.8  # TD3's
+    half, brax = (random + best) / 2, {"backend": "generalized"}
+    entries = [
+        entry("hopper", "ppo", "ours", [random] * 3, [0] * 3, **brax),
+        entry("hopper", "td3", "ours", [best] * 3, [0] * 3, **brax),
+        entry("hopper", "td3", "published", [half] * 3, [0] * 3, **brax),
+        entry("swimmer", "td3", "published", [0, None, 9], [0] * 3, **brax),
+        entry("hopper", "td3", "ours", [9e9] * 3, [0] * 3, backend="spring"),
+        *PENDULUM["entries"],
+    ]
+    found = zoo_table_page.brax_scores(entries)
+    values = {(name, kind): x.value for name, kinds in found.items() for kind, x in kinds.items()}
+    # The swimmer has no bandit of ours: it is left out of the last row.
+    assert list(found) == ["hopper", "swimmer", zoo_table_page.BOTH]
+    for name in ("hopper", zoo_table_page.BOTH):
+        assert [values[name, kind] for kind in zoo_table_page.BANDITS] == pytest.approx([0.5] * 2)
+    drawn = zoo_table.EXPERIMENT.figures(report(*entries))["zoo_table_brax"]
+    (axes,) = drawn.axes
+    assert [x.get_text() for x in axes.get_yticklabels()] == list(found)
+    page = zoo_table.EXPERIMENT.page(report(*entries))
+    assert "| hopper | 0.50 [0.50, 0.50] | 0.50 [0.50, 0.50] | 3326 |" in page
+    assert "zoo_table_brax" not in zoo_table.EXPERIMENT.figures(PENDULUM)
+
+
 def test_an_algorithm_that_is_not_registered_has_its_place_after_the_others():
     entry = {"environment": "CartPole-v1", "backend": None, "bandit": "ours"}
     names = ("mpo", "td3", "ppo", "ddqn", "dqn")
