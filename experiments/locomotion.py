@@ -72,7 +72,7 @@ def parts(options: Options, report: dict[str, Any]) -> Iterator[Part]:
         if options.tuning_agents:
             seeds = validation(options.tuning_agents)
             yield from _of(environment, CLIPS, seeds, options, report, "sweep")
-            best = tuned(report.get("environments", {}).get(environment, {}))
+            best = tuned(swept(report.get("environments", {}).get(environment, {})))
             names = (*names, best) if best and best not in names else names
         yield from _of(environment, names, reporting(options.seeds), options, report, "agents")
 
@@ -107,9 +107,8 @@ def swept(entry: Report) -> dict[str, float]:
     return {curve.objective: float(iqm(curve.late)) for curve in curves}
 
 
-def tuned(entry: Report) -> str | None:
-    """The clip that earns most of them."""
-    sweep = swept(entry)
+def tuned(sweep: Mapping[str, float]) -> str | None:
+    """The clip that earns most; None where not all have been measured."""
     return max(sweep, key=lambda clip: sweep[clip]) if sweep else None
 
 
@@ -195,7 +194,7 @@ def facts(report: Report) -> dict[str, Any]:
         },
         "deciding": DECIDING,
         "sweeps": {
-            name: (sweep, len(entry["sweep"][REFERENCE]), tuned(entry))
+            name: (sweep, len(entry["sweep"][REFERENCE]), tuned(sweep))
             for name, entry in report["environments"].items()
             if (sweep := swept(entry))
         },

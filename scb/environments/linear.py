@@ -104,7 +104,7 @@ def fitted(
     """
     states = np.asarray(observations, np.float64)
     center, covariance = moments(states)
-    spread = np.sqrt(np.diag(covariance)) + 1e-6
+    spread = _spread(covariance)
     shares = (np.asarray(actions, np.float64) - (low + high) / 2) / ((high - low) / 2)
     inputs = np.column_stack([(states - center) / spread, np.ones(len(states))])
     solution = _censored(inputs, np.arctanh(np.clip(shares, -SATURATED, SATURATED)))
@@ -138,13 +138,17 @@ def moments(states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return states.mean(axis=0), np.cov(states.T).reshape(states.shape[1], -1)
 
 
+def _spread(covariance: np.ndarray) -> np.ndarray:
+    """[O] deviations, of which none is zero."""
+    return np.sqrt(np.diag(covariance)) + 1e-6
+
+
 def _weights(
     center: np.ndarray, covariance: np.ndarray, reward: Mapping[str, Any]
 ) -> dict[str, Any]:
     """A bandit's, of the [O] mean and [O, O] covariance of its contexts and of its reward."""
     # Entries that the others determine make a covariance singular.
-    spread = np.sqrt(np.diag(covariance)) + 1e-6
-    root = np.linalg.cholesky(covariance + np.diag(1e-6 * spread**2))
+    root = np.linalg.cholesky(covariance + np.diag(1e-6 * _spread(covariance) ** 2))
     contexts = {"Dense_0": {"kernel": root.T, "bias": center}}
     weights = {"initial_state": contexts, "reward": dict(reward)}
     return jax.tree.map(lambda x: np.asarray(x, np.float32), weights)
