@@ -209,26 +209,38 @@ def parts(options: Options, report: dict[str, Any]) -> Iterator[Part]:
         *((name, NO_SEARCH) for name in REFERENCES),
         *((name, seed) for seed in seeds for name in options.variations),
     ):
-        there = report.get("objectives", {}).get(name, {}).get("returns", {})
+        entry = report.get("objectives", {}).get(name, {})
+        there = entry.get("returns", {})
         lacking = [at for at in EVALUATIONS if seed not in there.get(at.name, {})]
         names = tuple(("returns", at.name, seed) for at in lacking)
-        yield Part(("objectives", name), partial(_judged, name, seed, lacking, options), names)
+        digest = entry.get("digests", {}).get(seed)
+        yield Part(
+            ("objectives", name), partial(_judged, name, seed, lacking, digest, options), names
+        )
 
 
 measure = InParts(parts)
 
 
 def _judged(
-    name: str, seed: str, evaluations: Sequence[Evaluation], options: Options
+    name: str, seed: str, lacking: Sequence[Evaluation], digest: str | None, options: Options
 ) -> dict[str, Any]:
-    """What an objective earns, and of one that was learned what that took."""
+    """What an objective earns, and of one that was learned what that took.
+
+    A search of an earlier version may have found another: what the report holds of that is measured again.
+
+    Args:
+      lacking: the evaluations that the report lacks.
+      digest: of the objective whose evaluations it has.
+    """
     if name in REFERENCES:
         entry: dict[str, Any] = {}
         objective = load_objective(name)
     else:
         objective, entry = _learned(name, int(seed), options)
+    same = entry.get("digests", {}).get(seed) == digest
     returns = {}
-    for at in evaluations:
+    for at in lacking if same else EVALUATIONS:
         each = [_earned(objective, environment, at, options) for environment in at.environments]
         earned = np.mean(each, axis=0)
         returns[at.name] = {seed: np.round(earned, 4 if at.normalized else 2).tolist()}
@@ -257,7 +269,11 @@ def _learned(name: str, seed: int, options: Options) -> tuple[Objective, dict[st
     settings = settings_of(name, seed, options.generations, options.population_size)
     objective = objective_of_run(settings, options.runs / f"{name.replace(' ', '-')}-{seed}")
     cost = objective.metadata["cost"]
-    entry = {"command": meta_training({**settings, "seed": 0}).command, "seconds": cost["seconds"]}
+    entry = {
+        "command": meta_training({**settings, "seed": 0}).command,
+        "seconds": cost["seconds"],
+        "digests": {str(seed): objective.metadata["sha256"]},
+    }
     if "generation" in cost:
         entry["stopped_at"] = {str(seed): cost["generation"]}
     return replace(objective, name=f"{name}-{seed}"), entry

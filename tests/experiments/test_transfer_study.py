@@ -3,6 +3,7 @@
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from experiments import transfer_study as module
@@ -71,6 +72,32 @@ def test_one_search_decides_nothing_and_several_do(report):
     for returns in entries["no gate"]["returns"].values():
         returns["1"] = [-9000.0] * 4
     assert any(x.startswith("no gate (Pendulum") for x in module.facts(report)["worse"])
+
+
+def test_what_an_earlier_search_found_is_measured_again(tmp_path, monkeypatch, report):
+    # As after a change of the library: seed 0 finds another objective than the report's, and seed 1 the same.
+    asked = []
+    entry = report["objectives"]["default"] | {"digests": {"0": "before", "1": "now"}}
+    report["objectives"]["default"] = entry
+    del entry["returns"]["Pendulum"]
+    learned = {"command": "lpo meta-train", "seconds": 1.0}
+    monkeypatch.setattr(
+        module,
+        "_learned",
+        lambda name, seed, _: (None, {**learned, "digests": {str(seed): "now"}}),
+    )
+    monkeypatch.setattr(
+        module, "_earned", lambda objective, place, at, _: asked.append(at.name) or np.zeros(2)
+    )
+    monkeypatch.setattr(module, "REFERENCES", ())
+    options = module.Options(variations=("default",), meta_seeds=(0, 1))
+    for part in module.parts(options, report):
+        part.add(part.measured(), report)
+    everywhere = [e.name for e in module.EVALUATIONS for _ in e.environments]
+    assert asked == [*everywhere, "Pendulum"]
+    small = entry["returns"]["Pendulum, small last layer"]
+    assert small["0"] == [0.0, 0.0] and small["1"][0] == -220.0
+    assert entry["digests"] == {"0": "now", "1": "now"}
 
 
 def test_a_references_agents_are_one_set_however_many_searches_it_is_compared_with():
