@@ -24,7 +24,6 @@ from experiments.rendering import plain
 from experiments.searches import judgements, read_log
 from experiments.zoo_table_page import TARGETS, label, rank
 from scb import plotting
-from scb.discovery import DiscoveryConfig
 from scb.environments.registry import environment_spec
 from scb.errors import UserError
 from scb.runs import read_config
@@ -79,13 +78,15 @@ def collect(folders: Sequence[Path]) -> dict[str, Any]:
 
 def _run(folder: Path) -> dict[str, Any] | str:
     """A run's part of the report, or why it has none."""
-    config = read_config(folder)
-    if config.get("from_bandit") or config.get("start"):
+    config = read_config(folder).get("config")
+    if config is None or "parameterization" not in config:
+        return "no search for a bandit of this version started it"
+    if config["start"]:
         return "it continues from another bandit"
-    if config.get("parameterization") not in (None, "I"):
+    if config["parameterization"] != "I":
         return "it searches for no bandit but for a synthetic MDP"
-    start = {"expert": "warm", "random": "random"}[config.get("init") or DiscoveryConfig.init]
-    environment = config.get("environment") or DiscoveryConfig.environment
+    start = {"expert": "warm", "random": "random"}[config["init"]]
+    environment, evolution = config["environment"], config["evolution"]
     rows, seconds = read_log(folder)
     warm = _warm_start(folder, environment)
     # Before every generation, and after the last.
@@ -97,16 +98,16 @@ def _run(folder: Path) -> dict[str, Any] | str:
         return "it has not been judged yet"
     target = TARGETS.get(environment)
     at_target = next((p for p in points if target is not None and p[3] >= target), None)
-    evolution = config.get("evolution", config)
+    settings = {name: config.get(name, evolution.get(name)) for name in SETTINGS}
     return {
         "name": folder.resolve().name,
         # Brax with its physics, without which its return says nothing.
-        "environment": label({"environment": environment, "backend": config.get("backend")}),
+        "environment": label({"environment": environment, "backend": config["backend"]}),
         "start": start,
-        "seed": evolution.get("seed") or 0,
-        "settings": {name: config.get(name, evolution.get(name)) for name in SETTINGS},
+        "seed": evolution["seed"],
+        "settings": {**settings, "algorithms": ",".join(config["algorithms"])},
         "generations": len(rows),
-        "planned_generations": evolution.get("generations", evolution.get("num_generations")),
+        "planned_generations": evolution["num_generations"],
         "minutes": round(minutes[-1], 3),
         "steps": {
             "warm_start": warm["steps"] if start == "warm" else 0,
@@ -136,11 +137,16 @@ def _judged(found: Mapping[str, Any]) -> float:
 
 
 def _warm_start(folder: Path, environment: str) -> dict[str, Any]:
-    """What the warm start took, as the run's bandit says it; None where that is unknown."""
+    """What expert, fit and refinement took, as the run's bandit says it; None where that is unknown."""
     path = folder / f"{environment_spec(environment).bandit}.json"
     cost = json.loads(path.read_text()).get("cost", {}) if path.is_file() else {}
-    warm = cost.get("warm_start") or {}
-    steps, seconds = warm.get("environment_steps"), warm.get("seconds")
+    stages = [cost[name] for name in ("warm_start", "refinement") if cost.get(name)]
+
+    def total(name: str) -> float | None:
+        known = [stage.get(name) for stage in stages]
+        return None if not known or None in known else sum(known)
+
+    steps, seconds = total("environment_steps"), total("seconds")
     return {
         "steps": None if steps is None else int(steps),
         "minutes": None if seconds is None else seconds / 60,

@@ -1,11 +1,15 @@
 """What the page on costs says must be what the run folders hold."""
 
 import json
+from dataclasses import replace
 
 import pytest
 
 from experiments import discovery_cost
+from scb.discovery import DiscoveryConfig
 from scb.errors import UserError
+from scb.evolution import EvolutionConfig
+from scb.runs import config_dict
 
 # Seconds and returns by generation: judged before the generations 0 and 2, and after 3.
 SECONDS = [60.0, 30.0, 30.0, 120.0]
@@ -14,13 +18,18 @@ FINAL = -150.0
 
 
 def run_folder(
-    folder, init=None, environment="Pendulum-v1", judged=None, final=FINAL, rows=4, **config
+    folder, init="expert", environment="Pendulum-v1", judged=None, final=FINAL, rows=4, **config
 ):
     """A run folder of 100 training and 10 evaluation steps a generation."""
     folder.mkdir()
-    settings = {"command": "discover", "environment": environment, "seed": 3, "init": init}
-    settings |= {"generations": 4, "population_size": 32, "from_bandit": None, **config}
-    (folder / "config.json").write_text(json.dumps(settings))
+    evolution = {"seed": config.pop("seed", 3), "num_generations": 4}
+    evolution["population_size"] = config.pop("population_size", 32)
+    settings = replace(
+        DiscoveryConfig(environment=environment, init=init, **config),
+        evolution=EvolutionConfig(**evolution),
+    )
+    stored = {"command": "scb discover", "config": config_dict(settings)}
+    (folder / "config.json").write_text(json.dumps(stored))
     lines = []
     for generation in range(rows):
         done = generation + 1
@@ -40,9 +49,9 @@ def run_folder(
     return folder
 
 
-def bandit_file(folder, **warm_start):
+def bandit_file(folder, refinement=None, **warm_start):
     machine = {"cores": 2, "processor": "AMD EPYC", "accelerator": "none"}
-    cost = {"warm_start": warm_start, "machine": machine}
+    cost = {"warm_start": warm_start, "refinement": refinement, "machine": machine}
     (folder / "Synthetic-Pendulum-v1.json").write_text(json.dumps({"cost": cost}))
 
 
@@ -101,26 +110,35 @@ def test_a_warm_start_is_paid_for_where_it_is_recorded(tmp_path):
     assert "leave out the warm start's own" in text
 
 
+def test_a_refinement_is_paid_for_with_the_warm_start(tmp_path):
+    folder = run_folder(tmp_path / "a")
+    refinement = {"environment_steps": 500, "seconds": 60.0}
+    bandit_file(folder, refinement, environment_steps=1000, seconds=30.0)
+    [run] = discovery_cost.collect([folder])["runs"]
+    assert run["points"][0] == [0, 1.5, 1500, -400.0]
+    assert (run["settings"]["algorithms"], run["planned_generations"]) == ("ppo", 4)
+
+
 def test_a_start_is_warm_unless_it_is_said_to_be_random(tmp_path):
     folders = [
-        run_folder(tmp_path / name, init)
-        for name, init in (("a", None), ("b", "expert"), ("c", "random"))
+        run_folder(tmp_path / name, init) for name, init in (("a", "expert"), ("b", "random"))
     ]
     report = discovery_cost.collect(folders)
     assert {run["name"]: run["start"] for run in report["runs"]} == {
         "a": "warm",
-        "b": "warm",
-        "c": "random",
+        "b": "random",
     }
 
 
 def test_runs_that_start_elsewhere_are_left_out_and_named(tmp_path):
     kept = run_folder(tmp_path / "kept")
-    continued = run_folder(tmp_path / "continued", from_bandit="runs/x/Synthetic-Pendulum-v1.npz")
+    continued = run_folder(tmp_path / "continued", start="Synthetic-Pendulum-v1")
     mdp = run_folder(tmp_path / "mdp", "random", parameterization="TI")
-    report = discovery_cost.collect([kept, continued, mdp])
+    (tmp_path / "old").mkdir()
+    (tmp_path / "old" / "config.json").write_text('{"environment": "Pendulum-v1"}')
+    report = discovery_cost.collect([kept, continued, mdp, tmp_path / "old"])
     assert [run["name"] for run in report["runs"]] == ["kept"]
-    assert [x["name"] for x in report["left_out"]] == ["continued", "mdp"]
+    assert [x["name"] for x in report["left_out"]] == ["continued", "mdp", "old"]
     assert "continued, since it continues from another bandit" in discovery_cost.EXPERIMENT.page(
         report
     )
