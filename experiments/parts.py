@@ -185,7 +185,9 @@ def elsewhere(
       UserError: some of them failed; what the others found is in the report.
     """
     make_folder(folder)
-    kept = {part: folder / f"{_digest(part)}.json" for part in parts if not part.there(report)}
+    # Two that stand in one place are one: its job would only wait for the other's.
+    lacking = {part.name: part for part in parts if not part.there(report)}
+    kept = {part: folder / f"{_digest(part)}.json" for part in lacking.values()}
 
     def taken(part: Part) -> bool:
         if kept[part].exists():

@@ -94,6 +94,14 @@ def test_what_an_earlier_start_found_is_taken(tmp_path, monkeypatch):
     assert not (tmp_path / "kept.json").exists()
 
 
+def test_what_is_named_twice_is_one_job(tmp_path):
+    report, told = {}, []
+    parts = [*parts_of(tmp_path, "a"), *parts_of(tmp_path, "a")]
+    elsewhere(parts, report, lambda: None, Jobs("local"), tmp_path, told.append, every=0.1)
+    assert report["found"]["a"]["number"] == 1
+    assert sum(": job " in line for line in told) == 1
+
+
 def test_a_part_that_another_job_measures_is_waited_for(tmp_path):
     began, may_end = threading.Event(), threading.Event()
 
