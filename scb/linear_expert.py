@@ -5,6 +5,7 @@ networks of an agent that earns as much. What an environment pays for not fallin
 search's fitness: else it finds to stand still.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -15,8 +16,10 @@ import numpy as np
 import optax
 from evosax.algorithms import ARS
 from gymnax.environments import environment, spaces
+from jax.tree_util import Partial
 
-from scb.agents.agent import clip_to_space
+from scb.agents.agent import AgentConfig, clip_to_space
+from scb.agents.networks import MLP
 from scb.agents.normalization import RunningStatistics, merge_statistics, normalize
 from scb.console import Progress, progress_console
 from scb.errors import UserError, at_least, positive
@@ -26,8 +29,10 @@ from scb.experts import EPISODES, Expert, judged
 from scb.keys import key_at, named_key, split_key
 from scb.neuroevolution import network_action
 from scb.runs import Stopwatch
+from scb.strategies import paired_ranks
 
 Linear = dict[str, jax.Array]  # {"matrix": [O, A], "bias": [A]}
+Worth = Callable[[Partial, jax.Array], tuple[float, int]]
 
 
 @dataclass(frozen=True)
@@ -43,6 +48,10 @@ class LinearSearchConfig:
       action_noise: standard deviation of Gaussian noise on the actions of all episodes but those of the
         expert's return, as a share of half their range. Under it a policy is found that bears errors,
         such as those of an agent that learned from it.
+      action_errors: the largest scale of errors that are a function of the observation (`erring`), in the
+        same episodes: each has a function and a scale of its own. An agent errs so: what it did not
+        learn it gets wrong whenever it is there. By how much the two ways of a direction differ is
+        ranked then, since an episode of small errors earns more whichever way it goes.
       episode_steps: at which the search's episodes are cut; the environment's own limit where None. Where
         nothing ends an episode early a gait shows in a fraction of it. Judgements are of whole episodes.
       judge_every: generations between judgements of the unperturbed policy, of 20 episodes each; the
@@ -55,12 +64,13 @@ class LinearSearchConfig:
     sigma: float = 0.03
     learning_rate: float = 0.02
     action_noise: float = 0.0
+    action_errors: float = 0.0
     episode_steps: int | None = None
     judge_every: int = 10
 
     def __post_init__(self) -> None:
         at_least(1, self, "generations", "directions", "best", "episode_steps", "judge_every")
-        at_least(0, self, "action_noise")
+        at_least(0, self, "action_noise", "action_errors")
         positive(self, "sigma", "learning_rate")
         if self.best > self.directions:
             raise UserError(f"best is {self.best} of {self.directions} directions: take no more.")
@@ -73,6 +83,7 @@ def search_linear_expert(
     config: LinearSearchConfig | None = None,
     bonus: float = 0.0,
     quiet: bool = True,
+    worth: Worth | None = None,
 ) -> Expert:
     """The best unperturbed policy of an augmented random search; its return is one on fresh start states.
 
@@ -82,6 +93,8 @@ def search_linear_expert(
       config: of the search.
       bonus: what every step pays without falling, which the fitness leaves out.
       quiet: no progress on the terminal.
+      worth: (a policy, a key) -> what it is judged by, and the environment steps that took; what it earns
+        under the noise and errors of the search where None.
     """
     config = config or LinearSearchConfig()
     space = env.action_space(env_params)
@@ -97,9 +110,19 @@ def search_linear_expert(
     search.elite_ratio = config.best / config.directions
     params = search.default_params
 
+    def act(policy: Linear, seen: RunningStatistics, observation: jax.Array) -> jax.Array:
+        outputs = normalize(seen, observation) @ policy["matrix"] + policy["bias"]
+        return network_action(jnp.tanh(outputs), space)
+
+    def rolled(
+        policy: Linear, seen: RunningStatistics, key: jax.Array, number: int, **more: Any
+    ) -> Episodes:
+        off = erring(Partial(act, policy, seen), observations, space, config.action_errors, key)
+        off_each_step = noisy(off, space, config.action_noise)
+        return evaluate(env, env_params, off_each_step, key, number, **more)
+
     def one(policy: Linear, seen: RunningStatistics, key: jax.Array) -> Episodes:
-        act = noisy(_policy(policy, seen, space), space, config.action_noise)
-        return evaluate(env, env_params, act, key, 1, config.episode_steps, moments=True)
+        return rolled(policy, seen, key, 1, horizon=config.episode_steps, moments=True)
 
     roll = map_population(one, 2 * config.directions, (0, None, 0))
 
@@ -115,14 +138,18 @@ def search_linear_expert(
         state: Any, population: Any, episodes: Episodes, seen: RunningStatistics, key: jax.Array
     ) -> Any:
         fitness = (episodes.returns - bonus * episodes.lengths)[:, 0]
+        if config.action_errors:
+            fitness = paired_ranks(fitness)
         state, _ = search.tell(key, population, -fitness, state, params)
         assert episodes.observations is not None
         return state, merge_statistics(seen, episodes.observations), episodes.lengths.sum()
 
     @jax.jit
     def mean_return(policy: Linear, seen: RunningStatistics, key: jax.Array) -> Any:
-        act = noisy(_policy(policy, seen, space), space, config.action_noise)
-        episodes = evaluate(env, env_params, act, key, EPISODES)
+        # Errors are an episode's own.
+        keys = split_key(key, EPISODES) if config.action_errors else key[None]
+        each = EPISODES // len(keys)
+        episodes = jax.vmap(lambda key: rolled(policy, seen, key, each))(keys)
         return episodes.returns.mean(), episodes.lengths.sum()
 
     state = search.init(named_key(key, "start"), zero, params)
@@ -141,13 +168,17 @@ def search_linear_expert(
             if number % config.judge_every == 0 or number == config.generations:
                 mean = search.get_mean(state)
                 # The same start states for all, so that judgements are compared in pairs.
-                earned, taken = mean_return(mean, seen, key_judge)
+                earned, taken = (
+                    worth(Partial(act, mean, seen), key_judge)
+                    if worth
+                    else mean_return(mean, seen, key_judge)
+                )
                 steps += float(taken)
                 metrics["mean/fitness"] = float(earned)
                 if earned > best:
                     expert, best = (mean, seen), float(earned)
             advance(metrics, watch.lap())
-    return judged(_policy(*expert, space), env, env_params, named_key(key, "return"), int(steps))
+    return judged(Partial(act, *expert), env, env_params, named_key(key, "return"), int(steps))
 
 
 def noisy(policy: Callable[[jax.Array], jax.Array], space: spaces.Box, noise: float) -> Policy:
@@ -167,11 +198,32 @@ def noisy(policy: Callable[[jax.Array], jax.Array], space: spaces.Box, noise: fl
     return act
 
 
-def _policy(
-    policy: Linear, seen: RunningStatistics, space: spaces.Box
+def erring(
+    policy: Callable[[jax.Array], jax.Array],
+    size: int,
+    space: spaces.Box,
+    largest: float,
+    key: jax.Array,
 ) -> Callable[[jax.Array], jax.Array]:
+    """A policy of flattened observations whose errors are a function of the observation, like an agent's.
+
+    They are the outputs of an untrained network of an agent's size, times a scale.
+
+    Args:
+      size: of the observations.
+      largest: of the scales, as a share of half the actions' range; actions stay within their bounds.
+      key: decides the network and, uniformly up to the largest, the scale.
+    """
+    if largest == 0:
+        return policy
+    key_network, key_scale = split_key(named_key(key, "errors"))
+    network = MLP(AgentConfig.hidden_sizes, math.prod(space.shape), AgentConfig.activation)
+    variables = network.init(key_network, jnp.zeros(size))
+    scale = largest * jax.random.uniform(key_scale) * (space.high - space.low) / 2
+
     def act(observation: jax.Array) -> jax.Array:
-        outputs = normalize(seen, observation) @ policy["matrix"] + policy["bias"]
-        return network_action(jnp.tanh(outputs), space)
+        errors = jnp.reshape(jnp.asarray(network.apply(variables, observation)), space.shape)
+        action = jnp.reshape(policy(observation), space.shape)
+        return clip_to_space(action + scale * errors, space)
 
     return act

@@ -5,14 +5,16 @@ expert's states, has the expert's policy as its optimum. Regression finds such a
 what it cannot know is which of them *trains* well, and that is what evolution is for.
 """
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from gymnax.environments import spaces
+from jax.tree_util import Partial
 
 from scb.agents.spec import (
     ALGORITHMS,
@@ -32,12 +34,16 @@ from scb.errors import UserError, at_least, one_of, positive
 from scb.experts import Expert, PolicySearchConfig, evolve_expert, train_expert
 from scb.fitting import CONSTRUCTIONS, ExpertDataset, fit_bandit
 from scb.keys import named_key, split_key
-from scb.linear_expert import LinearSearchConfig, noisy, search_linear_expert
+from scb.linear_expert import LinearSearchConfig, Worth, erring, noisy, search_linear_expert
 from scb.measurement import Place
 from scb.runs import Stopwatch
 
+PUPILS_EPISODES = 3  # by which each of an expert's pupils is judged
 
-def _evolved(place: Place, key: jax.Array, config: "WarmStartConfig", quiet: bool) -> Expert:
+
+def _evolved(
+    place: Place, key: jax.Array, config: "WarmStartConfig", quiet: bool, _: Worth | None
+) -> Expert:
     search, generations = PolicySearchConfig(), config.expert_generations
     search = replace(
         search,
@@ -47,30 +53,34 @@ def _evolved(place: Place, key: jax.Array, config: "WarmStartConfig", quiet: boo
     return evolve_expert(place.env, place.params, search, key, quiet)
 
 
-def _linear(place: Place, key: jax.Array, config: "WarmStartConfig", quiet: bool) -> Expert:
+def _linear(
+    place: Place, key: jax.Array, config: "WarmStartConfig", quiet: bool, worth: Worth | None
+) -> Expert:
     standing = environment_spec(place.name).standing_still(place.backend) or 0.0
     bonus = standing / place.params.max_steps_in_episode
     search = LinearSearchConfig(
         config.expert_generations, episode_steps=config.expert_episode_steps
     )
-    if config.expert_noise:
+    if config.erring:
         # Where actions err anyway a larger step is no more noise, and finds gains that bear errors.
-        search = replace(search, sigma=0.15, learning_rate=0.09, action_noise=config.expert_noise)
-    return search_linear_expert(place.env, place.params, key, search, bonus, quiet)
+        search = replace(search, sigma=0.15, learning_rate=0.09)
+        search = replace(
+            search, action_noise=config.expert_noise, action_errors=config.expert_errors
+        )
+    return search_linear_expert(place.env, place.params, key, search, bonus, quiet, worth)
 
 
 class _Search(NamedTuple):
     """What finds experts that are no agents: in words, how, and what it needs and knows."""
 
     what: str
-    find: Callable[[Place, jax.Array, "WarmStartConfig", bool], Expert]
-    continuous: bool = False  # actions, which it needs
-    cuts: bool = False  # episodes, where told to
+    find: Callable[[Place, jax.Array, "WarmStartConfig", bool, Worth | None], Expert]
+    linear: bool = False  # for continuous actions; cuts episodes and asks pupils where told to
 
 
 SEARCHES = {
     "evolution": _Search("evolution", _evolved),
-    "linear": _Search("a linear search", _linear, continuous=True, cuts=True),
+    "linear": _Search("a linear search", _linear, linear=True),
 }
 
 
@@ -93,6 +103,13 @@ class WarmStartConfig:
         range: where a linear search looks for it, so that it bears the errors of agents that learn
         from the bandit, and on the trajectories whose states the bandit's contexts are fitted to. With 0
         those mix expert and random actions.
+      expert_errors: the largest scale of errors that are a function of the observation, as a share of half
+        the actions' range: where a linear search looks for the expert, and on the same trajectories. Each
+        episode has a function of its own, an untrained network of an agent's size, and a scale of its own.
+        An agent that learned too little errs so, and not anew at every step.
+      expert_pupils: agents of each algorithm of the inner loop that train in a bandit fitted to each policy
+        which the linear search judges: the expert is then the one whose agents earn most on average. With 0
+        it is the one that earns most itself, under its noise and errors.
       expert_episode_steps: at which a linear search cuts its episodes; the environment's own limit where None.
       min_spread: entries of the observation whose standard deviation is smaller are stretched about
         their mean until they have it, and the expert says what it does there; 0 for the states as
@@ -101,6 +118,9 @@ class WarmStartConfig:
       stretch: factor on the states' deviations from their mean, after that; the expert says what it does
         there. Agents that meet more than they need learn better what they need. For
         "action_distance" only.
+      jitter: standard deviation of independent noise on every entry of the states, in deviations of the
+        entry, after that; the expert says what it does there. Entries hang together along the expert's
+        trajectories, and agents that err leave these. For "action_distance" only.
       discount: of the Q-function.
       num_states: states that the dataset holds.
       num_actions: actions that are tried in each of them, uniform but for the expert's.
@@ -120,9 +140,12 @@ class WarmStartConfig:
     expert_steps: int | None = None
     expert_generations: int = 80
     expert_noise: float = 0.0
+    expert_errors: float = 0.0
+    expert_pupils: int = 0
     expert_episode_steps: int | None = None
     min_spread: float = 0.0
     stretch: float = 1.0
+    jitter: float = 0.0
     discount: float = 0.95
     num_states: int = 4096
     num_actions: int = 16
@@ -136,11 +159,12 @@ class WarmStartConfig:
         one_of("warm-start construction", self.construction, CONSTRUCTIONS)
         experts = ("auto", *SEARCHES, *ALGORITHMS)
         one_of("expert", self.expert, experts)
-        at_least(0, self, "min_spread", "expert_noise", "near_actions", "aggregation_rounds")
+        at_least(0, self, "min_spread", "jitter", "expert_noise", "expert_errors")
+        at_least(0, self, "expert_pupils", "near_actions", "aggregation_rounds")
         if not 0 <= self.discount <= 1:
             raise UserError(f"discount is {self.discount}: it must be between 0 and 1.")
         positive(self, "stretch")
-        for field, none in (("min_spread", 0), ("stretch", 1)):
+        for field, none in (("min_spread", 0), ("stretch", 1), ("jitter", 0)):
             value = getattr(self, field)
             if value != none and self.construction != "action_distance":
                 raise UserError(
@@ -156,6 +180,11 @@ class WarmStartConfig:
                 f"at most {self.num_actions - 1}."
             )
 
+    @property
+    def erring(self) -> bool:
+        """Whether the expert's trajectories are of its own actions with errors."""
+        return self.expert_noise > 0 or self.expert_errors > 0
+
 
 def expert_agent(
     name: str, space: spaces.Box | spaces.Discrete, config: WarmStartConfig
@@ -165,19 +194,25 @@ def expert_agent(
     Raises:
       UserError: an expert that doesn't fit the action space, or steps that it can't be trained for.
     """
-    if isinstance(space, spaces.Discrete) and (config.expert_noise or config.near_actions):
+    if isinstance(space, spaces.Discrete) and (config.erring or config.near_actions):
         raise UserError(
-            f"expert_noise and near_actions are of continuous actions, and {name} has discrete ones: leave them out."
+            "expert_noise, expert_errors and near_actions are of continuous actions, and "
+            f"{name} has discrete ones: leave them out."
         )
     algorithm = _chosen(name, config)
-    if config.expert_episode_steps and not (algorithm in SEARCHES and SEARCHES[algorithm].cuts):
-        raise UserError(
-            f"expert_episode_steps is {config.expert_episode_steps}, and the expert of {name} is found by {algorithm}, "
-            "which has whole episodes: leave it out, or choose linear."
-        )
+    for field, instead in (
+        ("expert_episode_steps", "has whole episodes"),
+        ("expert_pupils", "asks no pupils"),
+    ):
+        value = getattr(config, field)
+        if value and not (algorithm in SEARCHES and SEARCHES[algorithm].linear):
+            raise UserError(
+                f"{field} is {value}, and the expert of {name} is found by {algorithm}, which {instead}: leave it out, "
+                "or choose linear."
+            )
     if algorithm in SEARCHES:
         search = SEARCHES[algorithm]
-        if search.continuous and isinstance(space, spaces.Discrete):
+        if search.linear and isinstance(space, spaces.Discrete):
             raise UserError(
                 f"the expert of {search.what} has continuous actions and {name} discrete ones: choose evolution, or "
                 "an algorithm."
@@ -222,7 +257,18 @@ def warm_start(
     """
     watch = Stopwatch()
     key_expert, key_data, key_fit = split_key(key, 3)
-    expert = find_expert(place, key_expert, config, quiet)
+    fit = partial(fit_bandit, bandit, construction=config.construction, steps=config.fit_steps)
+    worth = None
+    if config.expert_pupils:
+        pupils = Learners(bandit, specs, place, config.expert_pupils, PUPILS_EPISODES)
+
+        def worth(policy: Partial, key: jax.Array) -> tuple[float, int]:
+            key_data, key_fit, key_agents = split_key(key, 3)
+            dataset, steps = expert_dataset(Expert(policy, 0.0, 0), place, key_data, config)
+            earned, *_ = pupils(fit(dataset, key_fit)[0], key_agents)
+            return earned, steps + pupils.steps
+
+    expert = find_expert(place, key_expert, config, quiet, worth)
     random = environment_spec(place.name).random_return(place.backend)
     if expert.mean_return < random:
         raise UserError(
@@ -230,7 +276,6 @@ def warm_start(
             "steps or generations, or choose another expert."
         )
     dataset, steps = expert_dataset(expert, place, key_data, config)
-    fit = partial(fit_bandit, bandit, construction=config.construction, steps=config.fit_steps)
     found = fit(dataset, key_fit)
     if config.aggregation_rounds:
 
@@ -257,14 +302,18 @@ def warm_start(
 
 
 def find_expert(
-    place: Place, key: jax.Array, config: WarmStartConfig, quiet: bool = True
+    place: Place,
+    key: jax.Array,
+    config: WarmStartConfig,
+    quiet: bool = True,
+    worth: Worth | None = None,
 ) -> Expert:
-    """An expert for an environment of the registry."""
+    """An expert for an environment of the registry; `worth` is what a linear search judges its policies by."""
     spec = expert_agent(place.name, place.env.action_space(place.params), config)
     if spec is None:
         search = SEARCHES[_chosen(place.name, config)]
         progress_console(quiet).print(f"looking for an expert of {place.name} by {search.what}")
-        return search.find(place, key, config, quiet)
+        return search.find(place, key, config, quiet, worth)
     progress_console(quiet).print(f"training {config.num_experts} experts of {place.name}")
     return train_expert(place.env, place.params, spec, key, config.num_experts)
 
@@ -275,32 +324,43 @@ def expert_dataset(
     """What an expert does, and what actions are worth, in states of trajectories that it takes part in.
 
     They mix expert and random actions, each with its own proportion, so that they cover what an agent
-    meets on its way to becoming an expert, or are the expert's with `expert_noise`.
+    meets on its way to becoming an expert, or are the expert's with its noise and errors.
 
     Returns:
       (the dataset, environment steps it took).
     """
-    space, noise = place.env.action_space(place.params), config.expert_noise
     key_roll, key_pick, _, key_label = split_key(key, 4)
+    policy = expert.policy if isinstance(expert.policy, Partial) else Partial(expert.policy)
+    visited = _trajectories(place, config)(policy, split_key(key_roll, TRAJECTORIES))
+    return labelled(expert, place, visited, key_pick, key_label, config)
 
-    def roll(key: jax.Array) -> Visited:
+
+@lru_cache(maxsize=2)  # physics take long to compile, and a search asks it of many policies
+def _trajectories(place: Place, config: WarmStartConfig) -> Callable[[Partial, jax.Array], Visited]:
+    """(policy, [N] keys) -> [N, T, ...] states that it takes part in visiting."""
+    space = place.env.action_space(place.params)
+    size = math.prod(place.env.observation_space(place.params).shape)
+
+    def roll(policy: Partial, key: jax.Array) -> Visited:
         key_reset, key_skill, key_steps = split_key(key, 3)
         skill = jax.random.uniform(key_skill)
+        if config.erring:
+            assert not isinstance(space, spaces.Discrete)
+            off = erring(policy, size, space, config.expert_errors, key)
+            off_each_step = noisy(off, space, config.expert_noise)
 
         def act(observation: jax.Array, keys: jax.Array) -> jax.Array:
-            if noise:
-                assert not isinstance(space, spaces.Discrete)
-                return noisy(expert.policy, space, noise)(observation, keys[0])
+            if config.erring:
+                return off_each_step(observation, keys[0])
             return jnp.where(
                 jax.random.uniform(keys[1]) < skill,
-                expert.policy(jnp.ravel(observation)),
+                policy(jnp.ravel(observation)),
                 space.sample(keys[0]),
             )
 
         return trajectory(place, act, key_reset, key_steps)
 
-    visited = jax.jit(jax.vmap(roll))(split_key(key_roll, TRAJECTORIES))
-    return labelled(expert, place, visited, key_pick, key_label, config)
+    return jax.jit(jax.vmap(roll, in_axes=(None, 0)))
 
 
 def labelled(
@@ -366,8 +426,9 @@ def labelled(
 
     actions, q, best = label(*states, split_key(key_label, number))
     observations = states.observation
-    if config.min_spread > 0 or config.stretch != 1:
-        observations, best = _stretched(observations, config, expert_policy)
+    if config.min_spread > 0 or config.stretch != 1 or config.jitter > 0:
+        key_jitter = named_key(key_label, "jitter")
+        observations, best = _stretched(observations, key_jitter, config, expert_policy)
         best = jnp.reshape(best, (number, *space.shape))
         if not isinstance(space, spaces.Discrete):
             actions = actions.at[:, 0].set(best)
@@ -378,11 +439,16 @@ def labelled(
 
 
 def _stretched(
-    observations: jax.Array, config: WarmStartConfig, policy: Callable[[jax.Array], jax.Array]
+    observations: jax.Array,
+    key: jax.Array,
+    config: WarmStartConfig,
+    policy: Callable[[jax.Array], jax.Array],
 ) -> tuple[jax.Array, jax.Array]:
-    """[S, O] states whose every entry has at least the least deviation, stretched; and what the expert does there."""
+    """[S, O] states whose every entry has the least deviation, stretched and jittered; what the expert does there."""
     flat = jnp.reshape(observations, (observations.shape[0], -1))
     mean, std = flat.mean(axis=0), flat.std(axis=0)
     factors = config.stretch * jnp.maximum(1.0, config.min_spread / (std + 1e-8))
     stretched = mean + (flat - mean) * factors
+    if config.jitter:
+        stretched += config.jitter * std * jax.random.normal(key, flat.shape)
     return stretched, jax.jit(jax.vmap(policy))(stretched)

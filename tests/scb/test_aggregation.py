@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.tree_util import Partial
 
 from scb import aggregation, warm_start
 from scb.agents.ppo import PPOConfig, PPOHyperparameters
@@ -109,6 +110,28 @@ def test_the_fit_whose_agents_earn_most_is_kept(
     assert capsys.readouterr().err.splitlines()[-1] == "round 2/2: agents earn -4"
     second, _ = warm_start.fit_bandit(bandit, datasets[1], jax.random.key(0))
     jax.tree.map(np.testing.assert_array_equal, weights, second)
+
+
+def test_a_search_for_an_expert_is_told_what_its_pupils_earn(bandit, place, monkeypatch):
+    """Of two policies the second has the better pupils, whatever it earns itself."""
+    monkeypatch.setattr(warm_start, "Learners", Fake)
+
+    def find(place, key, config, quiet, worth):
+        turned = Partial(lambda sign, observation: sign * turning(observation))
+        policies = [Partial(turned, sign) for sign in (-1.0, 1.0)]
+        earned, steps = zip(*(worth(policy, key) for policy in policies), strict=True)
+        assert earned == (-5.0, -3.0) and steps == (256 * 200, 256 * 200)
+        return Expert(policies[int(np.argmax(earned))], -1000.0, sum(steps))
+
+    monkeypatch.setattr(warm_start, "find_expert", find)
+    config = WarmStartConfig(expert="linear", expert_pupils=2, num_states=STATES, num_actions=2)
+    weights, report = warm_start.warm_start(bandit, SPECS, place, jax.random.key(1), config)
+    assert report["environment_steps"] == 3 * 256 * 200 and report["action_r2"] > 0.99
+    # Its policy is the second: to the right of the top, towards it.
+    reward = weights["reward"]
+    observation = jnp.array([0.0, 1.0, 0.0])
+    best = jnp.tanh((observation - reward["center"]) @ reward["kernel"] + reward["bias"])
+    assert float(best[0]) == pytest.approx(float(turning(observation)[0]) / 2, abs=0.05)
 
 
 def test_agents_whose_training_breaks_are_the_worst(bandit, place, monkeypatch):

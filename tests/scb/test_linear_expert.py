@@ -79,6 +79,26 @@ def test_a_policy_that_bears_errors_is_found_and_chosen_under_noise(monkeypatch)
     assert best(0.3) < -0.2 < 0.3 < best(0.0) <= 0.5
 
 
+def test_what_policies_are_worth_decides_where_that_is_told():
+    seen = []
+
+    def worth(policy, key):
+        seen.append(np.asarray(jax.vmap(policy)(jnp.eye(2))))
+        return [1.0, 3.0, 2.0][len(seen) - 1], 7
+
+    config = replace(SEARCH, generations=3, judge_every=1)
+    env = ContinuousCorridor(cells=2)
+    found = search_linear_expert(env, TWO_TARGETS, jax.random.key(0), config, worth=worth)
+    np.testing.assert_array_equal(jax.vmap(found.policy)(jnp.eye(2)), seen[1])
+    assert (seen[1] != seen[2]).any()
+    # Three generations of 16 episodes of 2 steps, what the three judgements took, and 20 episodes for its return.
+    assert found.environment_steps == 3 * 16 * 2 + 3 * 7 + 20 * 2
+
+
+def test_under_errors_of_its_own_in_each_episode_a_corridor_is_solved():
+    assert_solves_two_targets(search(action_errors=0.2))
+
+
 class Ledge(ContinuousCorridor):
     """Every step pays 1; an action a above 0.5 ends the episode, and pays 2 a more."""
 
@@ -122,7 +142,12 @@ def test_a_warm_start_takes_a_linear_expert():
         (
             "Pendulum-v1",
             {"expert": "td3", "expert_episode_steps": 9},
-            "expert_episode_steps is 9, and the expert of Pendulum-v1 is found by td3",
+            "expert_episode_steps is 9, and the expert of Pendulum-v1 is found by td3, which has whole episodes",
+        ),
+        (
+            "Pendulum-v1",
+            {"expert": "evolution", "expert_pupils": 4},
+            "expert_pupils is 4, and the expert of Pendulum-v1 is found by evolution, which asks no pupils",
         ),
     ],
 )

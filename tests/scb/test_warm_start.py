@@ -16,6 +16,7 @@ from scb.environments.synthetic import BanditConfig, BanditParams, SyntheticBand
 from scb.errors import UserError
 from scb.experts import Expert, judged, train_expert
 from scb.fitting import ExpertDataset, energy_distance, fit_bandit, reward_targets
+from scb.linear_expert import erring
 from scb.measurement import Place
 from scb.warm_start import WarmStartConfig, expert_agent, expert_dataset, find_expert
 from tests.scb.probes import ContinuousCorridor, Corridor, CorridorParams, context_bandit
@@ -202,6 +203,41 @@ def test_states_are_those_that_the_expert_visits_under_noise():
     assert np.std(dataset.observation) == pytest.approx(0.3, rel=0.1)
 
 
+def test_an_episodes_errors_are_a_function_of_where_it_is():
+    env = Echo(cells=1)
+    params = env.default_params.replace(max_steps_in_episode=50)
+    config = WarmStartConfig(expert_errors=0.5, num_states=256 * 50)
+    place = Place(env.name, env, params)
+    dataset, _ = expert_dataset(idle(env.action_space(params)), place, jax.random.key(3), config)
+    seen = np.asarray(dataset.observation)[:, 0]
+    # Every episode starts in one place, and errs there by its own function: 256 numbers after the first step.
+    # The expert says 0 wherever that leads.
+    start, counts = np.unique(seen, return_counts=True)
+    assert counts.max() >= 256 and len(start) > 256
+    np.testing.assert_array_equal(dataset.expert_action, 0.0)
+    spread = np.std(seen)
+    assert 0.02 < spread < 0.5
+
+
+def test_errors_grow_with_the_scale_and_stay_the_same_in_a_place():
+    space = make("Pendulum-v1")[0].action_space()  # -2 to 2
+    places = jax.random.normal(jax.random.key(0), (100, 3))
+
+    def errors(largest, key):
+        policy = erring(lambda observation: jnp.zeros(1), 3, space, largest, key)
+        return np.asarray(jax.vmap(policy)(places))
+
+    small, again, large, other = (
+        errors(largest, jax.random.key(key))
+        for largest, key in ((0.1, 1), (0.1, 1), (0.2, 1), (0.1, 2))
+    )
+    np.testing.assert_array_equal(small, again)
+    np.testing.assert_allclose(large, 2 * small, rtol=1e-4, atol=1e-6)
+    # Not a factor of the others: another function, not only another scale.
+    assert abs(np.corrcoef(small[:, 0], other[:, 0])[0, 1]) < 0.99
+    assert (np.abs(errors(100.0, jax.random.key(1))) <= 2).all()
+
+
 def test_the_horizon_cuts_the_return():
     # Two steps: Q(0, .) = 1 + 2/2 = 2 and 10 + 1 = 11; Q(1, .) = 2 + 4/2 = 4 and 22.
     params = CorridorParams(rewards=jnp.array([[1.0, 10], [2, 20], [4, 40]]))
@@ -247,9 +283,10 @@ def follow_the_context(observation):
 
 
 @cache
-def contexts(min_spread):
+def contexts(min_spread, **more):
     bandit = context_bandit()
-    config = WarmStartConfig(num_states=256, num_actions=4, horizon=1, min_spread=min_spread)
+    size = {"num_states": 256, "num_actions": 4, "horizon": 1}
+    config = WarmStartConfig(**size, min_spread=min_spread, **more)
     expert = judged(follow_the_context, bandit, bandit.default_params, jax.random.key(0))
     key = jax.random.key(2)
     return expert_dataset(expert, Place(bandit.name, bandit, bandit.default_params), key, config)[0]
@@ -282,6 +319,16 @@ def test_the_label_of_a_state_is_the_experts_action_in_that_very_state(min_sprea
     np.testing.assert_array_equal(dataset.action[:, 0], dataset.expert_action)
     target = np.asarray(reward_targets(dataset, "action_distance", discrete=False))
     np.testing.assert_array_equal(target.argmax(axis=1), 0)
+
+
+def test_jitter_widens_entries_by_noise_of_their_own():
+    plain, jittered = contexts(0.0), contexts(0.0, jitter=2.0)
+    before, after = (np.asarray(x.observation) for x in (plain, jittered))
+    # The same states: what was added has twice their deviation, and hangs together with nothing.
+    added = (after - before)[:, 0]
+    assert added.std() == pytest.approx(2 * before.std(), rel=0.1)
+    assert abs(np.corrcoef(added, before[:, 0])[0, 1]) < 0.2
+    np.testing.assert_allclose(jittered.expert_action, np.clip(after, -1, 2), atol=1e-6)
 
 
 def test_discrete_labels_follow_the_stretched_state_too():
@@ -476,6 +523,9 @@ def test_evolution_gets_the_papers_curriculum_at_its_own_length(monkeypatch):
             "near_actions is 16 of 16 actions, one of them the expert's: take at most 15",
         ),
         ({"expert_noise": -0.1}, "expert_noise is -0.1: it must be 0 or larger"),
+        ({"expert_errors": -0.1}, "expert_errors is -0.1: it must be 0 or larger"),
+        ({"jitter": -1.0}, "jitter is -1.0: it must be 0 or larger"),
+        ({"jitter": 1.0, "construction": "q"}, "which the construction q cannot use"),
         ({"horizon": 0}, "horizon is 0"),
         ({"fit_steps": 0}, "fit_steps is 0"),
         ({"expert_generations": 0}, "expert_generations is 0"),
