@@ -29,7 +29,6 @@ from scb.experts import EPISODES, Expert, judged
 from scb.keys import key_at, named_key, split_key
 from scb.neuroevolution import network_action
 from scb.runs import Stopwatch
-from scb.strategies import paired_ranks
 
 Linear = dict[str, jax.Array]  # {"matrix": [O, A], "bias": [A]}
 Worth = Callable[[Partial, jax.Array], tuple[float, int]]
@@ -48,10 +47,9 @@ class LinearSearchConfig:
       action_noise: standard deviation of Gaussian noise on the actions of all episodes but those of the
         expert's return, as a share of half their range. Under it a policy is found that bears errors,
         such as those of an agent that learned from it.
-      action_errors: the largest scale of errors that are a function of the observation (`erring`), in the
-        same episodes: each has a function and a scale of its own. An agent errs so: what it did not
-        learn it gets wrong whenever it is there. By how much the two ways of a direction differ is
-        ranked then, since an episode of small errors earns more whichever way it goes.
+      action_errors: the scale of errors that are a function of the observation (`erring`), in the same
+        episodes, each of which has a function of its own. An agent errs so: what it did not learn it
+        gets wrong whenever it is there.
       episode_steps: at which the search's episodes are cut; the environment's own limit where None. Where
         nothing ends an episode early a gait shows in a fraction of it. Judgements are of whole episodes.
       judge_every: generations between judgements of the unperturbed policy, of 20 episodes each; the
@@ -138,8 +136,6 @@ def search_linear_expert(
         state: Any, population: Any, episodes: Episodes, seen: RunningStatistics, key: jax.Array
     ) -> Any:
         fitness = (episodes.returns - bonus * episodes.lengths)[:, 0]
-        if config.action_errors:
-            fitness = paired_ranks(fitness)
         state, _ = search.tell(key, population, -fitness, state, params)
         assert episodes.observations is not None
         return state, merge_statistics(seen, episodes.observations), episodes.lengths.sum()
@@ -202,28 +198,27 @@ def erring(
     policy: Callable[[jax.Array], jax.Array],
     size: int,
     space: spaces.Box,
-    largest: float,
+    scale: float,
     key: jax.Array,
 ) -> Callable[[jax.Array], jax.Array]:
     """A policy of flattened observations whose errors are a function of the observation, like an agent's.
 
-    They are the outputs of an untrained network of an agent's size, times a scale.
+    They are the outputs of an untrained network of an agent's size, times the scale: on Hopper's states half of that.
 
     Args:
       size: of the observations.
-      largest: of the scales, as a share of half the actions' range; actions stay within their bounds.
-      key: decides the network and, uniformly up to the largest, the scale.
+      scale: as a share of half the actions' range; actions stay within their bounds.
+      key: decides the network.
     """
-    if largest == 0:
+    if scale == 0:
         return policy
-    key_network, key_scale = split_key(named_key(key, "errors"))
     network = MLP(AgentConfig.hidden_sizes, math.prod(space.shape), AgentConfig.activation)
-    variables = network.init(key_network, jnp.zeros(size))
-    scale = largest * jax.random.uniform(key_scale) * (space.high - space.low) / 2
+    variables = network.init(named_key(key, "errors"), jnp.zeros(size))
+    half = scale * (space.high - space.low) / 2
 
     def act(observation: jax.Array) -> jax.Array:
         errors = jnp.reshape(jnp.asarray(network.apply(variables, observation)), space.shape)
         action = jnp.reshape(policy(observation), space.shape)
-        return clip_to_space(action + scale * errors, space)
+        return clip_to_space(action + half * errors, space)
 
     return act

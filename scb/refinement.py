@@ -29,7 +29,6 @@ from scb.evolution import map_population
 from scb.keys import key_at, split_key
 from scb.measurement import Place
 from scb.runs import Stopwatch
-from scb.strategies import paired_ranks
 
 DIRECTIONS = 32  # perturbations of a generation, each tried both ways for one episode
 SIGMA = 0.1  # of the perturbations, in the weights' units
@@ -194,3 +193,15 @@ class Refinement:
             steps += int(lengths.sum())
         change: Any = search.get_mean(state)
         return jax.tree.map(np.asarray, moved(weights, change)), steps
+
+
+def paired_ranks(returns: np.ndarray) -> np.ndarray:
+    """[2 D] the rank of how much one way earns more than the other, the sign with it; -1 to 1.
+
+    Agents differ by more than what they follow does: by their returns alone the best agents would decide.
+    """
+    ahead, back = np.split(np.nan_to_num(np.asarray(returns, float), neginf=0.0), 2)
+    difference = ahead - back
+    ranks = np.argsort(np.argsort(np.abs(difference))) + 1
+    signed = np.sign(difference) * ranks / len(ranks)
+    return np.concatenate([signed, -signed])

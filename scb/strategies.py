@@ -9,7 +9,6 @@ import jax.flatten_util
 import jax.numpy as jnp
 import numpy as np
 import optax
-from jax.typing import ArrayLike
 
 from scb.errors import UserError
 from scb.keys import split_key
@@ -137,16 +136,3 @@ def strategy_for(config: "EvolutionConfig", solution: Any) -> Strategy:
 @lru_cache(maxsize=8)
 def _shared_strategy(config: "EvolutionConfig", structure: Any, shapes: Any) -> Strategy:
     return Strategy(config, jax.tree.unflatten(structure, [jnp.zeros(*x) for x in shapes]))
-
-
-def paired_ranks(returns: ArrayLike) -> jax.Array:
-    """[2 D] the rank of how much one way earns more than the other, the sign with it; -1 to 1.
-
-    Agents differ by more than what they follow does, as do episodes of different errors: by their returns alone
-    the best of them would decide.
-    """
-    ahead, back = jnp.split(jnp.nan_to_num(jnp.asarray(returns), neginf=0.0), 2)
-    difference = ahead - back
-    ranks = jnp.argsort(jnp.argsort(jnp.abs(difference))) + 1
-    signed = jnp.sign(difference) * ranks / len(ranks)
-    return jnp.concatenate([signed, -signed])

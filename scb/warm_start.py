@@ -103,10 +103,10 @@ class WarmStartConfig:
         range: where a linear search looks for it, so that it bears the errors of agents that learn
         from the bandit, and on the trajectories whose states the bandit's contexts are fitted to. With 0
         those mix expert and random actions.
-      expert_errors: the largest scale of errors that are a function of the observation, as a share of half
-        the actions' range: where a linear search looks for the expert, and on the same trajectories. Each
-        episode has a function of its own, an untrained network of an agent's size, and a scale of its own.
-        An agent that learned too little errs so, and not anew at every step.
+      expert_errors: the scale of errors that are a function of the observation, as a share of half the
+        actions' range: where a linear search looks for the expert, and on the same trajectories. Each
+        episode has a function of its own, an untrained network of an agent's size. An agent that learned
+        too little errs so, and not anew at every step.
       expert_pupils: agents of each algorithm of the inner loop that train in a bandit fitted to each policy
         which the linear search judges: the expert is then the one whose agents earn most on average. With 0
         it is the one that earns most itself, under its noise and errors.

@@ -16,9 +16,8 @@ from scb.environments.zoo import load_bandit, save_bandit
 from scb.errors import UserError
 from scb.evolution import EvolutionConfig
 from scb.measurement import Place
-from scb.refinement import Refinement, RefinementConfig, refined
+from scb.refinement import Refinement, RefinementConfig, paired_ranks, refined
 from scb.runs import Run, config_dict
-from scb.strategies import paired_ranks
 from tests.scb.probes import TWO_TARGETS, ContinuousCorridor
 
 CORRIDOR = Place("corridor", ContinuousCorridor(cells=2), TWO_TARGETS)

@@ -223,13 +223,13 @@ def test_errors_grow_with_the_scale_and_stay_the_same_in_a_place():
     space = make("Pendulum-v1")[0].action_space()  # -2 to 2
     places = jax.random.normal(jax.random.key(0), (100, 3))
 
-    def errors(largest, key):
-        policy = erring(lambda observation: jnp.zeros(1), 3, space, largest, key)
+    def errors(scale, key):
+        policy = erring(lambda observation: jnp.zeros(1), 3, space, scale, key)
         return np.asarray(jax.vmap(policy)(places))
 
     small, again, large, other = (
-        errors(largest, jax.random.key(key))
-        for largest, key in ((0.1, 1), (0.1, 1), (0.2, 1), (0.1, 2))
+        errors(scale, jax.random.key(key))
+        for scale, key in ((0.1, 1), (0.1, 1), (0.2, 1), (0.1, 2))
     )
     np.testing.assert_array_equal(small, again)
     np.testing.assert_allclose(large, 2 * small, rtol=1e-4, atol=1e-6)
