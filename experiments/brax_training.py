@@ -5,10 +5,9 @@
 Learning curves of agents in bandits (ours and the published ones, each said) and of agents with the
 paper's expert hyperparameters in the environments, the final returns, and the steps that the latter
 need to match the former. Published bandits are read from --published DIRECTORY; without it ours are
-measured alone.
+measured alone. PPO's agents in environments are those of experiments.locomotion, where it has them at this length.
 """
 
-import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -22,6 +21,7 @@ from experiments import zoo_table, zoo_table_page
 from experiments.claims import Claim
 from experiments.harness import Experiment, Preset, Report, bandit_of
 from experiments.parts import InParts, Part
+from lpo.full_size import full_size
 from scb import measurement, plotting
 from scb.agents.spec import AgentSpec, bandit_agent, environment_agent
 from scb.environments.registry import environment_spec
@@ -77,8 +77,8 @@ def parts(plan: Mapping[str, Any], report: dict[str, Any]) -> Iterator[Part]:
         for algorithm in plan["bandit_algorithms"]:
             curve = partial(_in_bandit, kind, environment, backend, plan, algorithm)
             yield Part(("bandits", task(kind, environment, backend), algorithm), curve)
-    for _, environment, backend in measured:
-        for algorithm in plan["environment_algorithms"]:
+    for environment, backend in dict.fromkeys((x[1], x[2]) for x in measured):
+        for algorithm in plan["environment_steps"][environment]:
             curve = partial(_in_environment, environment, backend, plan, algorithm)
             yield Part(("environments", place(environment, backend), algorithm), curve)
 
@@ -106,9 +106,23 @@ def _in_bandit(
 def _in_environment(
     environment: str, backend: str | None, plan: Mapping[str, Any], algorithm: str
 ) -> dict[str, Any]:
-    spec = environment_agent(algorithm, environment).with_steps(plan["environment_steps"])
+    steps = plan["environment_steps"][environment][algorithm]
+    if algorithm == "ppo" and (known := known_of_ppo(environment, backend, steps)):
+        return known
+    spec = environment_agent(algorithm, environment).with_steps(steps)
     place = measurement.Place.named(environment, backend)
     return _curves(spec, place, place, plan["environment_agents"], plan)
+
+
+def known_of_ppo(environment: str, backend: str | None, steps: int) -> dict[str, Any] | None:
+    """The curves of PPO's agents that were trained for so long to compare objectives; None where there are none."""
+    comparison = full_size(environment)
+    if comparison is None:
+        return None
+    curves = comparison.curves[0]
+    if (curves.objective, curves.backend, int(curves.steps[-1])) != ("ppo", backend, steps):
+        return None
+    return {"steps": curves.steps.tolist(), "returns": curves.returns.tolist()}
 
 
 def _curves(
@@ -118,16 +132,12 @@ def _curves(
     number: int,
     plan: Mapping[str, Any],
 ) -> dict[str, Any]:
-    """{"steps": [P + 1], "returns": [N, P + 1], "seconds"}: `number` agents, most likely actions."""
-    start = time.monotonic()
+    """{"steps": [P + 1], "returns": [N, P + 1], "failed"}: `number` agents, most likely actions."""
     agents = measurement.Agents.drawn_from(spec, REPORTING.start, number)
     size = {"points": plan["points"], "episodes": plan["episodes"]}
     folder = plan.get("rows")
     kept = Rows(folder and folder / f"{train_in.name}, {spec.algorithm}.jsonl")
-    known = len(kept.rows)
     rows = measurement.measure(spec, train_in, judge_in, agents, **size, rows=kept)
-    # Of a measurement that was killed, those agents tell the time that it did not keep.
-    seconds = (time.monotonic() - start) * len(rows) / max(1, len(kept.rows) - known)
     returns = pivot(rows, "agent", "step")
     # What is no number counts as the agent before its training.
     usable = np.isfinite(returns)
@@ -135,7 +145,6 @@ def _curves(
         "steps": list(dict.fromkeys(row["step"] for row in rows)),
         "returns": np.round(np.where(usable, returns, returns[:, :1]), 1).tolist(),
         "failed": int((~usable).any(axis=1).sum()),
-        "seconds": round(seconds, 1),
     }
 
 

@@ -3,13 +3,14 @@ import pytest
 
 from experiments import brax_training as experiment
 from experiments.brax_training import OURS, PUBLISHED, task
+from lpo.full_size import full_size
 from scb import measurement
 
 NAMES = (task(OURS, "hopper", "spring"), task(PUBLISHED, "hopper", "generalized"))
 
 
 def curves(steps, *agents):
-    return {"steps": steps, "returns": [list(x) for x in agents], "seconds": 30.0}
+    return {"steps": steps, "returns": [list(x) for x in agents]}
 
 
 @pytest.fixture
@@ -39,9 +40,8 @@ def test_agents_are_followed_in_a_bandit_and_in_an_environment(tmp_path, monkeyp
         "bandits": [[OURS, "Pendulum-v1", None]],
         "bandit_algorithms": ["ppo"],
         "bandit_agents": 2,
-        "environment_algorithms": ["ppo"],
         "environment_agents": 2,
-        "environment_steps": 32,
+        "environment_steps": {"Pendulum-v1": {"ppo": 32}},
         "episodes": 2,
         "points": 2,
         "rows": tmp_path / "kept",
@@ -71,7 +71,7 @@ def test_published_bandits_that_are_in_the_report_need_no_folder(monkeypatch):
         "published": None,
         "bandits": [published],
         "bandit_algorithms": ["ppo", "sac"],
-        "environment_algorithms": ["ppo"],
+        "environment_steps": {"Pendulum-v1": {"ppo": 32}},
     }
     name = task(*published)
     whole = curves([0, 10_000], [0.0, 1.0])
@@ -131,6 +131,23 @@ def test_the_page_and_the_figure_show_bandits_environments_and_the_paper(report)
     np.testing.assert_array_equal(ppo.lines[0].get_xdata(), [5000, 10_000])
 
 
+def test_ppo_is_not_trained_again_where_objectives_were_compared_at_this_length(monkeypatch):
+    monkeypatch.setattr(experiment, "_curves", lambda *_: "trained")
+    plan = {
+        "environment_agents": 4,
+        "environment_steps": {"hopper": {"ppo": 5_242_880, "sac": 1_000_000}},
+    }
+    kept = full_size("hopper").curves[0]
+    found = experiment._in_environment("hopper", "generalized", plan, "ppo")
+    np.testing.assert_array_equal(found["returns"], kept.returns)
+    assert found["steps"][-1] == 5_242_880 and len(found["returns"]) >= 10
+    # Other physics, another algorithm, fewer steps.
+    assert experiment._in_environment("hopper", "spring", plan, "ppo") == "trained"
+    assert experiment._in_environment("hopper", "generalized", plan, "sac") == "trained"
+    shorter = {**plan, "environment_steps": {"hopper": {"ppo": 1_000_000}}}
+    assert experiment._in_environment("hopper", "generalized", shorter, "ppo") == "trained"
+
+
 def test_published_bandits_count_only_where_their_folder_is_named(monkeypatch, tmp_path):
     # Such a folder beside the checkout, or in a variable, changes nothing.
     (tmp_path / "shared" / "published_scbs").mkdir(parents=True)
@@ -140,7 +157,7 @@ def test_published_bandits_count_only_where_their_folder_is_named(monkeypatch, t
     plan = {
         "bandits": [[PUBLISHED, "hopper", "generalized"]],
         "bandit_algorithms": ["ppo"],
-        "environment_algorithms": ["ppo"],
+        "environment_steps": {"hopper": {"ppo": 32}},
         "published": None,
     }
     found = {}

@@ -1,0 +1,211 @@
+"""What must a linear expert bear for agents to learn from the bandit that is fitted to it?
+
+    python -m experiments.linear_fits
+
+A linear policy of an environment is searched for without errors, under noise on its actions, and under errors that are
+a function of the observation; a bandit is fitted to each on contexts as they were visited, stretched, and jittered
+too; agents train in it and are judged in the environment. No evolution is involved. With more `--seeds` the same
+command adds searches.
+"""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import cache, partial
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from experiments.claims import Claim
+from experiments.harness import Experiment, Report, packed, unpacked
+from experiments.parts import InParts, Part
+from scb import plotting
+from scb.agents.spec import bandit_agent
+from scb.environments.registry import environment_spec
+from scb.environments.synthetic import BanditConfig, SyntheticBandit, bandit_for
+from scb.errors import at_least
+from scb.fitting import fit_bandit
+from scb.keys import root_key, split_key
+from scb.measurement import Agents, Place, measure
+from scb.rows import pivot
+from scb.seeds import REPORTING
+from scb.statistics import pooled_estimate
+from scb.warm_start import WarmStartConfig, expert_dataset, find_expert
+
+BACKEND = "generalized"
+EXPERTS: dict[str, dict[str, Any]] = {
+    "no errors": {},
+    "noise": {"expert_noise": 0.4},
+    "errors": {"expert_errors": 0.45},
+}
+CONTEXTS: dict[str, dict[str, Any]] = {
+    "as visited": {},
+    "stretched": {"stretch": 1.5},
+    "stretched and jittered": {"stretch": 1.5, "jitter": 1.0},
+}
+BEFORE, NOW = ("noise", "stretched"), ("errors", "stretched and jittered")
+COLORS = dict(zip(CONTEXTS, (plotting.GREY, plotting.BLUE, plotting.VERMILLION), strict=True))
+
+
+@dataclass(frozen=True)
+class Options:
+    """Where, and how much."""
+
+    environments: tuple[str, ...] = ("hopper",)
+    """of Brax"""
+    seeds: int = 3
+    """searches of each kind"""
+    first_seed: int = 20
+    """of the searches"""
+    generations: int = 40
+    """of a search"""
+    ppo: int = 24
+    """agents of PPO in every bandit"""
+    td3: int = 8
+    """agents of TD3"""
+    episodes: int = 3
+    """of an agent"""
+
+    def __post_init__(self) -> None:
+        at_least(1, self, "seeds", "generations", "ppo", "td3", "episodes")
+
+
+def parts(options: Options, report: dict[str, Any]) -> Iterator[Part]:
+    """One search of every kind after the other: all have as many wherever it ends."""
+    for environment in options.environments:
+        for seed in range(options.first_seed, options.first_seed + options.seeds):
+            for name in EXPERTS:
+                path = ("environments", environment, name, str(seed))
+                yield Part(path, partial(_searched, environment, name, seed, options))
+
+
+@cache
+def _bandit(environment: str) -> tuple[Place, SyntheticBandit]:
+    place = Place.named(environment, BACKEND)
+    return place, bandit_for(place.env, place.params, BanditConfig(form="linear"), environment)
+
+
+def _searched(environment: str, name: str, seed: int, options: Options) -> dict[str, Any]:
+    place, bandit = _bandit(environment)
+    key_expert, key_data, key_fit = split_key(root_key(seed), 3)
+    common = {"expert": "linear", "expert_generations": options.generations, **EXPERTS[name]}
+    expert = find_expert(place, key_expert, WarmStartConfig(**common))
+    found: dict[str, Any] = {
+        "expert": round(expert.mean_return, 1),
+        "steps": expert.environment_steps,
+        "returns": {},
+    }
+    for contexts, fields in CONTEXTS.items():
+        dataset, _ = expert_dataset(expert, place, key_data, WarmStartConfig(**common, **fields))
+        weights, _ = fit_bandit(bandit, dataset, key_fit)
+        trained_in = Place(f"{name}, {contexts}", bandit, bandit.params(weights))
+        found["returns"][contexts] = {}
+        for algorithm in ("ppo", "td3"):
+            spec = bandit_agent(algorithm, environment)
+            agents = Agents.drawn_from(spec, REPORTING.start, getattr(options, algorithm))
+            rows = measure(
+                spec,
+                trained_in,
+                place,
+                agents,
+                episodes=options.episodes,
+                side_by_side=getattr(options, algorithm),
+            )
+            returns = pivot(rows, "agent")
+            found["returns"][contexts][algorithm] = packed([np.nan_to_num(returns)])[0]
+    print(f"{environment}, {name}, seed {seed}: {found}", flush=True)
+    return found
+
+
+def earned(entry: Mapping[str, Any], expert: str, contexts: str, algorithm: str) -> np.ndarray:
+    """[searches, agents] returns."""
+    return unpacked([found["returns"][contexts][algorithm] for found in entry[expert].values()])
+
+
+def claims(report: Report) -> list[Claim]:
+    """Errors and jitter are worth it, together and each, to PPO's agents."""
+    found = []
+    for environment, entry in report["environments"].items():
+        for (expert, contexts), (other, others), text in (
+            (NOW, BEFORE, "errors and jitter earn PPO's agents more than noise"),
+            (NOW, (BEFORE[0], NOW[1]), "errors earn them more than noise in jittered contexts"),
+            (NOW, (NOW[0], BEFORE[1]), "under errors jitter earns them more"),
+        ):
+            groups = (earned(entry, expert, contexts, "ppo"), earned(entry, other, others, "ppo"))
+            same = len(groups[0]) == len(groups[1])
+            if len(groups[0]) < 3 or not same:
+                found.append(Claim(f"{environment}: {text}", None, places=0))
+                continue
+            evidence = partial(pooled_estimate, *groups, paired_groups=True)
+            found.append(Claim(f"{environment}: {text}", evidence, places=0))
+    return found
+
+
+def facts(report: Report) -> dict[str, Any]:
+    """A row for every kind of expert and contexts."""
+    tables = {}
+    for environment, entry in report["environments"].items():
+        tables[environment] = {
+            "standing": environment_spec(environment).standing_still(BACKEND),
+            "rows": [
+                {
+                    "expert": expert,
+                    "contexts": contexts,
+                    "own": np.mean([found["expert"] for found in entry[expert].values()]),
+                    **{
+                        algorithm: pooled_estimate(earned(entry, expert, contexts, algorithm))
+                        for algorithm in ("ppo", "td3")
+                    },
+                    "searches": len(entry[expert]),
+                }
+                for expert in EXPERTS
+                for contexts in CONTEXTS
+            ],
+        }
+    return {"tables": tables, "options": Options()}
+
+
+def draw(report: Mapping[str, Any]) -> Figure:
+    """A row an environment, a panel an algorithm: each agent a dot, the estimate with its interval."""
+    number = len(report["environments"])
+    figure = Figure(figsize=(8, 3.6 * number + 0.4))
+    panels: Any = figure.subplots(number, 2, squeeze=False, sharey="row")
+    for row, (environment, entry) in zip(panels, report["environments"].items(), strict=True):
+        standing = environment_spec(environment).standing_still(BACKEND)
+        for axes, algorithm in zip(row, ("ppo", "td3"), strict=True):
+            for i, expert in enumerate(EXPERTS):
+                for j, contexts in enumerate(CONTEXTS):
+                    returns = earned(entry, expert, contexts, algorithm)
+                    x, found = i + 0.27 * (j - 1), pooled_estimate(returns)
+                    near = np.linspace(-0.08, 0.08, returns.size)
+                    look = {"color": COLORS[contexts]}
+                    axes.plot(x + near, returns.ravel(), ".", alpha=0.35, markersize=3, **look)
+                    if found.low is not None:
+                        axes.plot([x, x], [found.low, found.high], linewidth=3, **look)
+                    axes.plot([x], [found.value], "s", markersize=6, **look)
+            if standing:
+                axes.axhline(standing, color=plotting.GREY, linestyle=":")
+            axes.set_xticks(range(len(EXPERTS)), [f"under {name}" for name in EXPERTS])
+            axes.set_title(f"{environment}: {algorithm.upper()}'s agents")
+        row[0].set_ylabel("return in the environment")
+    plotting.legend_of(
+        figure, {f"contexts {name}": {"color": color} for name, color in COLORS.items()}, 3
+    )
+    plotting.figure_title(figure, "Agents of bandits that were fitted to a linear expert")
+    return figure
+
+
+EXPERIMENT = Experiment(
+    "linear_fits",
+    "What must a linear expert bear for agents to learn from its bandit?",
+    InParts(parts),
+    draw=draw,
+    claims=claims,
+    facts=facts,
+    options=Options,
+    keys=("environments",),
+)
+
+
+if __name__ == "__main__":
+    raise SystemExit(EXPERIMENT.main())

@@ -1,0 +1,77 @@
+"""Searches under errors, noise and neither are told apart by what agents of their fits earn."""
+
+import numpy as np
+import pytest
+
+from experiments import linear_fits as module
+from experiments.claims import FAILS, HOLDS, UNTESTED
+from experiments.harness import packed
+
+
+def entry(seeds, **ppo):
+    """Searches whose PPO agents earn this in jittered contexts, give or take a little, and half of it in others."""
+    little = np.linspace(-20.0, 20.0, 12)
+
+    def found(level):
+        return {
+            "expert": 3000.0,
+            "steps": 9,
+            "returns": {
+                contexts: {
+                    "ppo": packed([level * share + little])[0],
+                    "td3": packed([2500 + little[:4]])[0],
+                }
+                for contexts, share in zip(module.CONTEXTS, (0.5, 0.5, 1.0), strict=True)
+            },
+        }
+
+    return {name.replace("_", " "): {str(s): found(x) for s in seeds} for name, x in ppo.items()}
+
+
+def report(*seeds, **ppo):
+    levels = {"no_errors": 200.0, "noise": 600.0, "errors": 1500.0, **ppo}
+    machine = {"cores": 1, "processor": "a processor"}
+    return {"environments": {"hopper": entry(seeds, **levels)}, "machine": machine}
+
+
+def outcomes(found):
+    return [x.outcome for x in module.EXPERIMENT.judged(found)]
+
+
+def test_what_earns_agents_more_is_shown_by_three_searches():
+    assert outcomes(report(1, 2, 3)) == [HOLDS] * 3
+    # Errors earn less than noise in the same contexts, but more than noise had in contexts without jitter.
+    assert outcomes(report(1, 2, 3, errors=500.0)) == [HOLDS, FAILS, HOLDS]
+    assert outcomes(report(1, 2)) == [UNTESTED] * 3
+
+
+def test_the_page_has_a_row_for_every_expert_and_contexts():
+    page = module.EXPERIMENT.page(report(1, 2, 3))
+    assert "| errors | stretched and jittered | 3000 | 1500 [" in page and page.count("| 3 |") == 9
+    assert "Standing still earns 1000 on hopper." in page
+    assert "Shown: hopper: errors and jitter earn PPO's agents more than noise" in page
+    few = module.EXPERIMENT.page(report(1))
+    assert "Not shown yet" in few
+
+
+def test_the_figure_has_an_interval_for_every_expert_and_contexts():
+    (figure,) = module.EXPERIMENT.figures(report(1, 2, 3)).values()
+    ppo, td3 = figure.axes
+    # Agents, an interval and an estimate each; and what standing still earns.
+    assert len(ppo.lines) == len(td3.lines) == 9 * 3 + 1
+
+
+@pytest.mark.slow
+def test_experts_are_found_and_agents_of_their_fits_judged(monkeypatch, small_agents):
+    # Pendulum stands in for Brax, whose physics compile for long.
+    monkeypatch.setattr(module, "BACKEND", None)
+    monkeypatch.setattr(module, "EXPERTS", {"errors": module.EXPERTS["errors"]})
+    options = module.Options(("Pendulum-v1",), seeds=1, generations=1, ppo=2, td3=1, episodes=1)
+    found = {}
+    module.EXPERIMENT.measure(options, found, lambda: None)
+    (one,) = found["environments"]["Pendulum-v1"]["errors"].values()
+    assert set(one["returns"]) == set(module.CONTEXTS)
+    assert all(len(x["ppo"].split()) == 2 for x in one["returns"].values())
+    again = {"environments": {"Pendulum-v1": {"errors": {"20": one}}}}
+    monkeypatch.setattr(module, "_searched", None)
+    module.EXPERIMENT.measure(options, again, lambda: None)
