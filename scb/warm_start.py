@@ -63,9 +63,12 @@ def _linear(
     )
     if config.erring:
         # Where actions err anyway a larger step is no more noise, and finds gains that bear errors.
-        search = replace(search, sigma=0.15, learning_rate=0.09)
         search = replace(
-            search, action_noise=config.expert_noise, action_errors=config.expert_errors
+            search,
+            sigma=0.15,
+            learning_rate=0.09,
+            action_noise=config.expert_noise,
+            action_errors=config.expert_errors,
         )
     return search_linear_expert(place.env, place.params, key, search, bonus, quiet, worth)
 
