@@ -24,13 +24,14 @@ from scb.agents.spec import bandit_agent
 from scb.environments.registry import environment_spec
 from scb.environments.synthetic import BanditConfig, SyntheticBandit, bandit_for
 from scb.errors import at_least
+from scb.expert_data import expert_dataset
 from scb.fitting import fit_bandit
 from scb.keys import root_key, split_key
 from scb.measurement import Agents, Place, measure
 from scb.rows import pivot
 from scb.seeds import REPORTING
 from scb.statistics import pooled_estimate
-from scb.warm_start import WarmStartConfig, expert_dataset, find_expert
+from scb.warm_start import WarmStartConfig, find_expert
 
 BACKEND = "generalized"
 EXPERTS: dict[str, dict[str, Any]] = {

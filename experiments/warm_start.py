@@ -21,12 +21,13 @@ from experiments.harness import Experiment, Save
 from experiments.rendering import number, text
 from scb.agents.spec import algorithms_for, bandit_agent
 from scb.environments.synthetic import BanditConfig, bandit_for
+from scb.expert_data import expert_dataset
 from scb.fitting import fit_bandit
 from scb.judgement import judge
 from scb.keys import root_key, split_key
 from scb.measurement import Place
 from scb.statistics import estimate
-from scb.warm_start import WarmStartConfig, expert_dataset, find_expert
+from scb.warm_start import WarmStartConfig, find_expert
 
 # Not the seeds that results are reported on.
 SEED = 7_000

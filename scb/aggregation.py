@@ -57,10 +57,12 @@ class Learned(NamedTuple):
     Attributes:
       returns: [N] what each earns; what is not finite counts as -inf.
       states: of the agents, every leaf [N], to act with; keys are left as numbers.
+      keys: [N] that decided them.
     """
 
     returns: np.ndarray
     states: Any
+    keys: jax.Array
 
 
 class Learners:
@@ -87,46 +89,53 @@ class Learners:
         judge = Judge(place.env, place.params, episodes, mode=True)
         each = -(-TRAJECTORIES // (number * len(specs)))
 
-        def program(agent: Agent) -> Any:
+        def training(agent: Agent) -> Any:
             def one(hyperparameters: Any, key: jax.Array, params: Any) -> Any:
                 state, earned = train_and_judge(
                     agent, hyperparameters, key, params, {"return": judge}
                 )
+                return earned["return"].returns.mean(), jax.tree.map(_as_number, state)
 
+            return map_population(one, number, (0, 0, None))
+
+        def visiting(agent: Agent) -> Any:
+            def one(state: Any, key: jax.Array, params: Any) -> Visited:
                 def act(observation: jax.Array, keys: jax.Array) -> jax.Array:
                     return agent.act(state, observation, keys[0], params, mode=True)
 
                 def roll(key: jax.Array) -> Visited:
                     return trajectory(place, act, *split_key(key))
 
-                visited = jax.vmap(roll)(split_key(named_key(key, "visits"), each))
-                return earned["return"].returns.mean(), visited, jax.tree.map(_as_number, state)
+                return jax.vmap(roll)(split_key(named_key(key, "visits"), each))
 
             return map_population(one, number, (0, 0, None))
 
-        self._programs = {name: program(agent) for name, agent in self.agents.items()}
+        self._training = {name: training(agent) for name, agent in self.agents.items()}
+        self._visiting = {name: visiting(agent) for name, agent in self.agents.items()}
         limit = int(place.params.max_steps_in_episode)
         self.steps = number * len(specs) * episodes * limit
 
-    def __call__(
-        self, weights: Weights, key: jax.Array
-    ) -> tuple[float, Visited, dict[str, Learned]]:
-        """(mean return of all agents, [N, T, ...] states that they visit, the agents by algorithm)."""
-        params, visits, learned = self._bandit.params(weights), [], {}
+    def __call__(self, weights: Weights, key: jax.Array) -> tuple[float, dict[str, Learned]]:
+        """(mean return of all agents, the agents by algorithm)."""
+        params, learned = self._bandit.params(weights), {}
         for name, spec in self._specs.items():
             key_draw, key_agents = split_key(named_key(key, name))
-            drawn = spec.sample(key_draw, self._number)
-            earned, visited, states = self._programs[name](
-                drawn, split_key(key_agents, self._number), params
-            )
-            learned[name] = Learned(np.where(np.isfinite(earned), earned, -np.inf), states)
-            visits.append(jax.tree.map(lambda x: jnp.reshape(x, (-1, *x.shape[2:])), visited))
+            drawn, keys = spec.sample(key_draw, self._number), split_key(key_agents, self._number)
+            earned, states = self._training[name](drawn, keys, params)
+            learned[name] = Learned(np.where(np.isfinite(earned), earned, -np.inf), states, keys)
         mean = np.concatenate([of.returns for of in learned.values()]).mean()
-        return float(mean), jax.tree.map(lambda *x: jnp.concatenate(x), *visits), learned
+        return float(mean), learned
+
+    def visits(self, weights: Weights, learned: Mapping[str, Learned]) -> Visited:
+        """[N, T, ...] states that agents of a bandit visit in the environment; as many of each."""
+        params = self._bandit.params(weights)
+        visits = [self._visiting[name](of.states, of.keys, params) for name, of in learned.items()]
+        flat = jax.tree.map(lambda x: jnp.reshape(x, (-1, *x.shape[2:])), visits)
+        return jax.tree.map(lambda *x: jnp.concatenate(x), *flat)
 
 
 Fit = tuple[Weights, dict[str, float]]  # a bandit's weights, and how they came about
-Improve = Callable[[Weights, Visited, dict[str, Learned], jax.Array], tuple[Fit, int]]
+Improve = Callable[[Weights, dict[str, Learned], jax.Array], tuple[Fit, int]]
 
 
 def best_round(
@@ -141,8 +150,8 @@ def best_round(
 
     Args:
       rounds: how often the latest is made a better one.
-      improve: takes its weights, what its agents visit, these, and a key; returns the next fit and the
-        environment steps that it took.
+      improve: takes its weights, its agents and a key; returns the next fit and the environment steps
+        that it took.
       quiet: nothing on the terminal.
 
     Returns:
@@ -152,13 +161,13 @@ def best_round(
     (latest, report), best, kept, steps = start, -np.inf, start, 0
     for number, key_round in enumerate(split_key(key, rounds + 1)):
         key_agents, key_improve = split_key(key_round)
-        earned, visited, learned = learners(latest, key_agents)
+        earned, learned = learners(latest, key_agents)
         steps += learners.steps
         console.print(f"round {number}/{rounds}: agents earn {earned:.4g}")
         if number == 0 or earned > best:
             kept, best = (latest, {**report, "round": number, "agents_return": earned}), earned
         if number < rounds:
-            (latest, report), taken = improve(latest, visited, learned, key_improve)
+            (latest, report), taken = improve(latest, learned, key_improve)
             steps += taken
     return kept, steps
 

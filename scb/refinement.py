@@ -19,7 +19,7 @@ from evosax.algorithms import ARS
 
 from scb.agents.agent import Agent
 from scb.agents.spec import AgentSpec
-from scb.aggregation import Fit, Learned, Learners, Visited, best_round
+from scb.aggregation import Fit, Learned, Learners, best_round
 from scb.console import progress_console
 from scb.environments.linear import PolicyDistanceParts, units, with_states
 from scb.environments.synthetic import SyntheticBandit, Weights
@@ -81,11 +81,9 @@ def refined(
     learners = Learners(bandit, specs, place, config.agents, EPISODES)
     refine = Refinement(bandit, learners.agents, place, config.generations)
 
-    def improve(
-        latest: Weights, visited: Visited, learned: Mapping[str, Learned], key: jax.Array
-    ) -> Any:
+    def improve(latest: Weights, learned: Mapping[str, Learned], key: jax.Array) -> Any:
+        states = learners.visits(latest, learned).observation
         latest, taken = refine(latest, learned, key)
-        states = visited.observation
         went = np.reshape(states, (states.shape[0] * states.shape[1], -1))
         return (with_states(latest, went), {}), taken + len(went)
 

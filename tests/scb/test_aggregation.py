@@ -97,8 +97,12 @@ class Fake:
         self.returns = iter([-5.0, -3.0, -4.0])
 
     def __call__(self, weights, key):
-        observation = jnp.tile(jnp.array([1.0, 0.0, 0.5 * jax.random.uniform(key)]), (2, 3, 1))
-        return next(self.returns), Visited(jnp.zeros((2, 3)), observation), {}
+        return next(self.returns), {"key": key}
+
+    def visits(self, weights, learned):
+        speed = 0.5 * jax.random.uniform(learned["key"])
+        observation = jnp.tile(jnp.array([1.0, 0.0, speed]), (2, 3, 1))
+        return Visited(jnp.zeros((2, 3)), observation)
 
 
 def test_the_fit_whose_agents_earn_most_is_kept(
@@ -137,9 +141,10 @@ def test_a_search_for_an_expert_is_told_what_its_pupils_earn(bandit, place, monk
 def test_agents_whose_training_breaks_are_the_worst(bandit, place, monkeypatch):
     monkeypatch.setattr(aggregation, "TRAJECTORIES", 2)
     broken = jax.tree.map(lambda x: x * np.nan, bandit.init_weights(jax.random.key(0)))
-    earned, visited, learned = Learners(bandit, SPECS, place, 2)(broken, jax.random.key(1))
-    assert earned == -np.inf and visited.observation.shape == (2, 200, 3)
-    assert (learned["ppo"].returns == -np.inf).all()
+    learners = Learners(bandit, SPECS, place, 2)
+    earned, learned = learners(broken, jax.random.key(1))
+    assert earned == -np.inf and (learned["ppo"].returns == -np.inf).all()
+    assert learners.visits(broken, learned).observation.shape == (2, 200, 3)
 
 
 def test_an_expert_below_random_actions_is_refused(bandit, place, monkeypatch):

@@ -15,6 +15,7 @@ from scb.environments.synthetic import BanditConfig, bandit_for
 from scb.environments.zoo import load_bandit, save_bandit
 from scb.errors import UserError
 from scb.evolution import EvolutionConfig
+from scb.keys import split_key
 from scb.measurement import Place
 from scb.refinement import Refinement, RefinementConfig, paired_ranks, refined
 from scb.runs import Run, config_dict
@@ -52,7 +53,7 @@ def test_a_policy_makes_up_for_what_all_its_agents_do_wrong():
     weights = {"initial_state": eye, "reward": zero["reward"]}
     # Alike but for a little, one of them better off by far.
     errors = jnp.array([[0.4], [0.3], [0.5]])
-    learned = {"off": Learned(np.zeros(3), errors)}
+    learned = {"off": Learned(np.zeros(3), errors, split_key(jax.random.key(0), 3))}
     refine = Refinement(bandit, {"off": Off(bandit, weights)}, CORRIDOR, generations=100)
     found, steps = refine(weights, learned, jax.random.key(1))
     assert steps == 100 * 64 * 2
@@ -88,7 +89,10 @@ def test_the_round_whose_agents_earn_most_is_kept(bandit, monkeypatch):
 
         def __call__(self, weights, key):
             seen.append(weights)
-            return next(returns), Visited(None, 0.5 * np.ones((2, 3, 3))), {}
+            return next(returns), {}
+
+        def visits(self, weights, learned):
+            return Visited(None, 0.5 * np.ones((2, 3, 3)))
 
     def moving(bandit, agents, place, generations):
         assert generations == 6

@@ -14,11 +14,12 @@ from scb.curriculum import CurriculumConfig
 from scb.environments.registry import make
 from scb.environments.synthetic import BanditConfig, BanditParams, SyntheticBandit, bandit_for
 from scb.errors import UserError
+from scb.expert_data import expert_dataset
 from scb.experts import Expert, judged, train_expert
 from scb.fitting import ExpertDataset, energy_distance, fit_bandit, reward_targets
 from scb.linear_expert import erring
 from scb.measurement import Place
-from scb.warm_start import WarmStartConfig, expert_agent, expert_dataset, find_expert
+from scb.warm_start import WarmStartConfig, expert_agent, find_expert
 from tests.scb.probes import ContinuousCorridor, Corridor, CorridorParams, context_bandit
 
 TINY = PPOConfig(
