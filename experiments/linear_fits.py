@@ -8,7 +8,7 @@ too; agents train in it and are judged in the environment. No evolution is invol
 command adds searches.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache, partial
 from typing import Any
@@ -94,6 +94,8 @@ def _searched(environment: str, name: str, seed: int, options: Options) -> dict[
     found: dict[str, Any] = {
         "expert": round(expert.mean_return, 1),
         "steps": expert.environment_steps,
+        "generations": options.generations,
+        "episodes": options.episodes,
         "returns": {},
     }
     for contexts, fields in CONTEXTS.items():
@@ -144,9 +146,16 @@ def claims(report: Report) -> list[Claim]:
 
 def facts(report: Report) -> dict[str, Any]:
     """A row for every kind of expert and contexts."""
-    tables = {}
+    tables: dict[str, Any] = {}
     for environment, entry in report["environments"].items():
+        searches = [found for kind in entry.values() for found in kind.values()]
+        arms = [arm for found in searches for arm in found["returns"].values()]
         tables[environment] = {
+            **{
+                key: _listed(found[key] for found in searches)
+                for key in ("generations", "episodes")
+            },
+            **{key: _listed(len(arm[key].split()) for arm in arms) for key in ("ppo", "td3")},
             "standing": environment_spec(environment).standing_still(BACKEND),
             "rows": [
                 {
@@ -163,7 +172,11 @@ def facts(report: Report) -> dict[str, Any]:
                 for contexts in CONTEXTS
             ],
         }
-    return {"tables": tables, "options": Options()}
+    return {"tables": tables}
+
+
+def _listed(sizes: Iterable[int]) -> str:
+    return " or ".join(str(size) for size in sorted(set(sizes)))
 
 
 def draw(report: Mapping[str, Any]) -> Figure:

@@ -16,6 +16,8 @@ def entry(seeds, **ppo):
         return {
             "expert": 3000.0,
             "steps": 9,
+            "generations": 40 if level > 300 else 30,
+            "episodes": 3,
             "returns": {
                 contexts: {
                     "ppo": packed([level * share + little])[0],
@@ -48,7 +50,10 @@ def test_what_earns_agents_more_is_shown_by_three_searches():
 def test_the_page_has_a_row_for_every_expert_and_contexts():
     page = module.EXPERIMENT.page(report(1, 2, 3))
     assert "| errors | stretched and jittered | 3000 | 1500 [" in page and page.count("| 3 |") == 9
-    assert "Standing still earns 1000 on hopper." in page
+    assert (
+        "hopper: a search has 30 or 40 generations" in page and "12 agents of PPO and 4 of" in page
+    )
+    assert "Standing still earns 1000." in page
     assert "Shown: hopper: errors and jitter earn PPO's agents more than noise" in page
     few = module.EXPERIMENT.page(report(1))
     assert "Not shown yet" in few
