@@ -20,6 +20,7 @@ CONFIG = DiscoveryConfig(
 )
 
 
+@pytest.mark.slow
 def test_a_search_that_has_ended_is_read_and_not_run_again(tmp_path, small_agents):
     _, first = searches.search(CONFIG, tmp_path / "run")
     _, again = searches.search(CONFIG, tmp_path / "run")

@@ -159,6 +159,7 @@ def test_long_trainings_are_kept_as_they_come(copy, measured, file):
     )
 
 
+@pytest.mark.slow
 def test_with_physics_different_drifts_share_a_program(bandit, monkeypatch):
     def square(parameters, log_ratio, advantage, progress):
         return parameters["factor"] * log_ratio**2

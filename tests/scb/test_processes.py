@@ -121,6 +121,7 @@ def reached(process, folder, step):
     return newest
 
 
+@pytest.mark.slow
 def test_when_one_is_lost_the_others_say_so(tmp_path):
     first, second = started(2, 1, f"--out={tmp_path / 'run'}", config=LONG)
     reached(first, tmp_path / "run", 10)
