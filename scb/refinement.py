@@ -42,15 +42,18 @@ class RefinementConfig:
     """Refinement of a linear bandit's policy before the evolution.
 
     Attributes:
-      rounds: in each of which agents train in the bandit, the linear search goes on under their errors, and
-        half of the contexts come to be where they went. The round whose agents earn most is kept.
+      rounds: in each of which agents train in the bandit, and the linear search goes on under their errors. The
+        round whose agents earn most is kept.
       generations: of the search in each round.
       agents: of each algorithm of the inner loop, in every round and after the last.
+      visits: whether half of the contexts come to be where the agents went, in every round. It undoes what
+        stretching and jittering the contexts did.
     """
 
     rounds: Annotated[int, tyro.conf.arg(name="refinement-rounds")] = 0
     generations: Annotated[int, tyro.conf.arg(name="refinement-generations")] = 20
     agents: Annotated[int, tyro.conf.arg(name="refinement-agents")] = 16
+    visits: Annotated[bool, tyro.conf.arg(name="refinement-visits")] = True
 
     def __post_init__(self) -> None:
         at_least(0, self, "rounds")
@@ -82,10 +85,12 @@ def refined(
     refine = Refinement(bandit, learners.agents, place, config.generations)
 
     def improve(latest: Weights, learned: Mapping[str, Learned], key: jax.Array) -> Any:
+        better, taken = refine(latest, learned, key)
+        if not config.visits:
+            return (better, {}), taken
         states = learners.visits(latest, learned).observation
-        latest, taken = refine(latest, learned, key)
         went = np.reshape(states, (states.shape[0] * states.shape[1], -1))
-        return (with_states(latest, went), {}), taken + len(went)
+        return (with_states(better, went), {}), taken + len(went)
 
     progress_console(quiet).print(
         f"refining the policy of a bandit for {place.name}, what its agents earn:"

@@ -193,7 +193,7 @@ EVERY_FLAG = """--preset=paper --environment=MountainCar-v0 --backend=spring --m
 --expert-episode-steps=5 --near-actions=2 --num-experts=3
 --expert-steps=9 --expert-generations=8 --discount=0.5 --num-states=7 --num-actions=6 --horizon=4 --fit-steps=3
 --aggregation-rounds=2 --aggregation-agents=3
---refinement-rounds=1 --refinement-generations=2 --refinement-agents=4
+--refinement-rounds=1 --refinement-generations=2 --refinement-agents=4 --no-refinement-visits
 --strategy=Open_ES --population-size=6 --generations=9 --sigma=0.2 --sigma-decay=0.9 --sigma-limit=0.1
 --learning-rate=0.3 --learning-rate-decay=0.8 --learning-rate-limit=0.2 --combine=ranks --mean-evaluations=5
 --evaluate-mean-every=4 --checkpoint-every=3 --seed=8"""

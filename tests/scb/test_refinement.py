@@ -78,7 +78,8 @@ def bandit():
     return bandit_of(PENDULUM)
 
 
-def test_the_round_whose_agents_earn_most_is_kept(bandit, monkeypatch):
+@pytest.mark.parametrize("visits", [True, False])
+def test_the_round_whose_agents_earn_most_is_kept(visits, bandit, monkeypatch):
     seen, returns = [], iter([-5.0, -3.0, -4.0])
 
     class Fake:
@@ -92,6 +93,7 @@ def test_the_round_whose_agents_earn_most_is_kept(bandit, monkeypatch):
             return next(returns), {}
 
         def visits(self, weights, learned):
+            assert visits
             return Visited(None, 0.5 * np.ones((2, 3, 3)))
 
     def moving(bandit, agents, place, generations):
@@ -106,19 +108,19 @@ def test_the_round_whose_agents_earn_most_is_kept(bandit, monkeypatch):
     monkeypatch.setattr(refinement, "Learners", Fake)
     monkeypatch.setattr(refinement, "Refinement", moving)
     start = bandit.init_weights(jax.random.key(0))
-    config = RefinementConfig(rounds=2, generations=6, agents=3)
+    config = RefinementConfig(rounds=2, generations=6, agents=3, visits=visits)
     weights, report = refined(bandit, start, {}, PENDULUM, jax.random.key(1), config)
     assert (report["refinement"], report["refined_return"]) == (1, -3.0)
     jax.tree.map(np.testing.assert_array_equal, weights, seen[1])
     # Three times the agents', two searches and what the agents visited in two rounds.
-    assert report["environment_steps"] == 3 * 10 + 2 * 100 + 2 * 6
+    assert report["environment_steps"] == 3 * 10 + 2 * 100 + (2 * 6 if visits else 0)
     for before, after in pairwise(seen):
         difference = after["reward"]["kernel"] - before["reward"]["kernel"]
         np.testing.assert_allclose(difference, 1.0, atol=1e-5)
-    # Half of the contexts lie where the agents were, all in one place.
+    # Half of the contexts lie where the agents were, all in one place; or all where they were.
     means = [w["initial_state"]["Dense_0"]["bias"] for w in seen]
     for before, after in pairwise(means):
-        np.testing.assert_allclose(after, (before + 0.5) / 2, rtol=1e-5)
+        np.testing.assert_allclose(after, (before + 0.5) / 2 if visits else before, rtol=1e-5)
 
 
 def test_new_contexts_leave_the_policy_and_have_the_moments_of_both(bandit):
