@@ -235,9 +235,16 @@ def test_the_command_of_every_zoo_entry_asks_for_what_its_json_holds(name):
     config = config_dict(asked_for(*found[2:]))
     assert config["evolution"] == stored["evolution"]
     assert config["bandit"] == {"form": "networks", **stored["bandit"]}
+    assert config["refinement"] == {
+        **config["refinement"],
+        "visits": True,
+        **stored.get("refinement", {}),
+    }
     # What has another name by now, or was not there then, kept its default.
     different = {k for k in config.keys() & stored.keys() if config[k] != stored[k]}
-    assert different <= {"warm_start", "bandit"} and not config["fixed_hyperparameters"]
+    assert (
+        different <= {"warm_start", "refinement", "bandit"} and not config["fixed_hyperparameters"]
+    )
 
 
 # Tables "Hyperparameters for meta-training", "Number of generations for each environment" and
