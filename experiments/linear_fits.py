@@ -8,7 +8,7 @@ too; agents train in it and are judged in the environment. No evolution is invol
 command adds searches.
 """
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache, partial
 from typing import Any
@@ -19,6 +19,7 @@ from matplotlib.figure import Figure
 from experiments.claims import Claim
 from experiments.harness import Experiment, Report, packed, unpacked
 from experiments.parts import InParts, Part
+from experiments.rendering import either
 from scb import plotting
 from scb.agents.spec import bandit_agent
 from scb.environments.registry import environment_spec
@@ -44,6 +45,7 @@ CONTEXTS: dict[str, dict[str, Any]] = {
     "stretched": {"stretch": 1.5},
     "stretched and jittered": {"stretch": 1.5, "jitter": 1.0},
 }
+ALGORITHMS = ("ppo", "td3")
 BEFORE, NOW = ("noise", "stretched"), ("errors", "stretched and jittered")
 COLORS = dict(zip(CONTEXTS, (plotting.GREY, plotting.BLUE, plotting.VERMILLION), strict=True))
 
@@ -103,18 +105,12 @@ def _searched(environment: str, name: str, seed: int, options: Options) -> dict[
         weights, _ = fit_bandit(bandit, dataset, key_fit)
         trained_in = Place(f"{name}, {contexts}", bandit, bandit.params(weights))
         found["returns"][contexts] = {}
-        for algorithm in ("ppo", "td3"):
+        for algorithm in ALGORITHMS:
             spec = bandit_agent(algorithm, environment)
-            agents = Agents.drawn_from(spec, REPORTING.start, getattr(options, algorithm))
-            rows = measure(
-                spec,
-                trained_in,
-                place,
-                agents,
-                episodes=options.episodes,
-                side_by_side=getattr(options, algorithm),
-            )
-            returns = pivot(rows, "agent")
+            number = getattr(options, algorithm)
+            agents = Agents.drawn_from(spec, REPORTING.start, number)
+            size = {"episodes": options.episodes, "side_by_side": number}
+            returns = pivot(measure(spec, trained_in, place, agents, **size), "agent")
             found["returns"][contexts][algorithm] = packed([np.nan_to_num(returns)])[0]
     print(f"{environment}, {name}, seed {seed}: {found}", flush=True)
     return found
@@ -152,10 +148,9 @@ def facts(report: Report) -> dict[str, Any]:
         arms = [arm for found in searches for arm in found["returns"].values()]
         tables[environment] = {
             **{
-                key: _listed(found[key] for found in searches)
-                for key in ("generations", "episodes")
+                key: either(found[key] for found in searches) for key in ("generations", "episodes")
             },
-            **{key: _listed(len(arm[key].split()) for arm in arms) for key in ("ppo", "td3")},
+            **{key: either(len(arm[key].split()) for arm in arms) for key in ALGORITHMS},
             "standing": environment_spec(environment).standing_still(BACKEND),
             "rows": [
                 {
@@ -164,7 +159,7 @@ def facts(report: Report) -> dict[str, Any]:
                     "own": np.mean([found["expert"] for found in entry[expert].values()]),
                     **{
                         algorithm: pooled_estimate(earned(entry, expert, contexts, algorithm))
-                        for algorithm in ("ppo", "td3")
+                        for algorithm in ALGORITHMS
                     },
                     "searches": len(entry[expert]),
                 }
@@ -175,10 +170,6 @@ def facts(report: Report) -> dict[str, Any]:
     return {"tables": tables}
 
 
-def _listed(sizes: Iterable[int]) -> str:
-    return " or ".join(str(size) for size in sorted(set(sizes)))
-
-
 def draw(report: Mapping[str, Any]) -> Figure:
     """A row an environment, a panel an algorithm: each agent a dot, the estimate with its interval."""
     number = len(report["environments"])
@@ -186,7 +177,7 @@ def draw(report: Mapping[str, Any]) -> Figure:
     panels: Any = figure.subplots(number, 2, squeeze=False, sharey="row")
     for row, (environment, entry) in zip(panels, report["environments"].items(), strict=True):
         standing = environment_spec(environment).standing_still(BACKEND)
-        for axes, algorithm in zip(row, ("ppo", "td3"), strict=True):
+        for axes, algorithm in zip(row, ALGORITHMS, strict=True):
             for i, expert in enumerate(EXPERTS):
                 for j, contexts in enumerate(CONTEXTS):
                     returns = earned(entry, expert, contexts, algorithm)

@@ -66,6 +66,11 @@ def span(numbers: Iterable[int]) -> str:
     return str(low) if low == high else f"{low} to {high}"
 
 
+def either(numbers: Iterable[int]) -> str:
+    """Such as "30 or 60", each once, or "30" where all are alike."""
+    return " or ".join(str(number) for number in sorted(set(numbers)))
+
+
 def mean_known(values: NDArray[np.floating], places: int) -> str:
     """The mean of those that are numbers, and nothing where none is."""
     known = np.asarray(values)[np.isfinite(values)]

@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from experiments.harness import plan_of
+from experiments.rendering import either
 from scb import plotting
 from scb.agents.spec import ALGORITHMS
 from scb.environments.registry import environment_spec
@@ -224,7 +225,7 @@ def figure(report: Mapping[str, Any]) -> Figure:
     }
     if experts:
         shown["SAC trained on the environment (paper)"] = _EXPERT
-    agents = " or ".join(str(n) for n in sorted({entry["agents"] for entry in entries}))
+    agents = either(entry["agents"] for entry in entries)
     plotting.figure_title(
         drawn,
         f"Agents trained in a bandit, in its environment: IQM of {agents} agents, 95 % intervals",
@@ -253,5 +254,5 @@ def _panel_title(environment: str, entries: Sequence[Mapping[str, Any]]) -> str:
     of_it = [entry for entry in entries if label(entry) == environment]
     if of_it[0]["backend"] is None:
         return environment
-    episodes = " or ".join(str(n) for n in sorted({entry["episodes"] for entry in of_it}))
+    episodes = either(entry["episodes"] for entry in of_it)
     return f"{environment.removesuffix(')')}, {episodes} episodes)"

@@ -78,5 +78,5 @@ def test_experts_are_found_and_agents_of_their_fits_judged(monkeypatch, small_ag
     assert set(one["returns"]) == set(module.CONTEXTS)
     assert all(len(x["ppo"].split()) == 2 for x in one["returns"].values())
     again = {"environments": {"Pendulum-v1": {"errors": {"20": one}}}}
-    monkeypatch.setattr(module, "_searched", None)
+    monkeypatch.setattr(module, "_searched", lambda *_: pytest.fail("it is measured already"))
     module.EXPERIMENT.measure(options, again, lambda: None)
