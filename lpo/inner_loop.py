@@ -99,6 +99,7 @@ class MetaTrainingConfig:
     def __post_init__(self) -> None:
         if self.fitness not in FITNESSES:
             raise unknown_name("fitness", self.fitness, FITNESSES)
+        at_least(1, self.evolution, "num_generations")
         if not self.tasks:
             raise UserError("the list of tasks is empty: give at least one bandit or environment.")
         for name in self.tasks:

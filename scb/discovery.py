@@ -106,7 +106,7 @@ class DiscoveryConfig:
       bandit: the networks and the latent.
       warm_start: how the expert is found and the bandit fitted to it.
       refinement: of the bandit that the search starts from.
-      evolution: of the candidates.
+      evolution: of the candidates; without generations the fit, or what was refined, is the result.
     """
 
     environment: str = "Pendulum-v1"
@@ -163,6 +163,11 @@ class DiscoveryConfig:
         if self.lists and self.fixed_hyperparameters:
             raise UserError(
                 "fixed hyperparameters are not drawn from lists: leave out the lists, or draw."
+            )
+        if not self.evolution.num_generations and not (fitted or self.refinement.rounds):
+            raise UserError(
+                "there are 0 generations, and nothing is found before them: choose init expert or refinement rounds, "
+                "or at least 1."
             )
         positive(self, "reward_std")
         if self.reward_std is not None and self.parameterization != "I":

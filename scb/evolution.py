@@ -39,7 +39,7 @@ class EvolutionConfig:
     Attributes:
       strategy: any of evosax's, by name (SNES, Open_ES, CMA_ES, ...).
       population_size: candidates a generation.
-      num_generations: how many of them.
+      num_generations: how many of them; with 0 what the search would start from is what it ends with.
       sigma: initial standard deviation of the search distribution.
       sigma_decay: factor on it a generation, for strategies with a schedule (Open_ES).
       sigma_limit: what it decays down to.
@@ -80,8 +80,8 @@ class EvolutionConfig:
             raise UserError(
                 f"population_size is {self.population_size}: Open_ES samples antithetic pairs, so it must be even."
             )
-        counts = ("num_generations", "mean_evaluations", "evaluate_mean_every", "checkpoint_every")
-        at_least(1, self, *counts)
+        at_least(0, self, "num_generations")
+        at_least(1, self, "mean_evaluations", "evaluate_mean_every", "checkpoint_every")
         searching(self.seed)
         positive(self, "sigma", "sigma_decay", "learning_rate", "learning_rate_decay")
         at_least(0, self, "sigma_limit", "learning_rate_limit")
@@ -158,7 +158,7 @@ class Outcome:
         steps, evaluations = problem.steps(), config.num_generations * config.population_size
         # The last mean is judged too; a strategy that keeps a population has none to begin with.
         judgements = -(-config.num_generations // config.evaluate_mean_every) + has_mean(config)
-        agents = judgements * config.mean_evaluations
+        agents = judgements * config.mean_evaluations if evaluations else 0
         return {
             "environment_steps_training": evaluations * steps.training,
             "environment_steps_evaluation": evaluations * steps.evaluation,
@@ -267,6 +267,17 @@ def evolve(
     key = root_key(config.seed) if key is None else key
     key_solution, key_strategy, key_generations, key_mean = split_key(key, 4)
     solution = problem.initial_solution(key_solution)
+    evaluate_mean = map_population(problem.evaluate_mean, config.mean_evaluations, (None, 0))
+
+    def judged(solution: Any, key: jax.Array) -> dict[str, np.ndarray]:
+        return dict(evaluate_mean(solution, split_key(key, config.mean_evaluations)))
+
+    def validate(solution: Any) -> dict[str, np.ndarray]:
+        return judged(solution, root_key(VALIDATING.start))
+
+    if not config.num_generations:
+        start = jax.device_get(solution)
+        return Outcome(start, start, 0, [], 0.0, validate)
     strategy = strategy_for(config, solution)
     state = {
         "strategy": strategy.start(
@@ -308,13 +319,9 @@ def evolve(
         return f"{run.folder} is saved after {generation} generations, and continues with --resume."
 
     evaluate = map_population(problem.evaluate, config.population_size, (0, None, None))
-    evaluate_mean = map_population(problem.evaluate_mean, config.mean_evaluations, (None, 0))
     steps = problem.steps()
     history, total_seconds = (run.metrics(), run.seconds()) if run else ([], 0.0)
     watch = Stopwatch()
-
-    def judged(solution: Any, key: jax.Array) -> dict[str, np.ndarray]:
-        return dict(evaluate_mean(solution, split_key(key, config.mean_evaluations)))
 
     def judge_mean(generation: int) -> dict[str, float]:
         mean = strategy.mean(state["strategy"])
@@ -396,5 +403,5 @@ def evolve(
         best_mean_generation=int(state["best_mean_generation"]),
         metrics=history,
         seconds=total_seconds,
-        validate=lambda solution: judged(solution, root_key(VALIDATING.start)),
+        validate=validate,
     )

@@ -2,7 +2,8 @@
 
 A linear policy of normalised observations hops, and a bandit's small networks hold it better than the
 networks of an agent that earns as much. What an environment pays for not falling is left out of the
-search's fitness: else it finds to stand still.
+search's fitness: else it finds to stand still. The same search finds the one action that is best held
+throughout, which is all that humanoidstandup asks for.
 """
 
 import math
@@ -30,7 +31,9 @@ from scb.keys import key_at, named_key, split_key
 from scb.neuroevolution import network_action
 from scb.runs import Stopwatch
 
-Linear = dict[str, jax.Array]  # {"matrix": [O, A], "bias": [A]}
+Linear = dict[
+    str, jax.Array
+]  # {"matrix": [O, A], "bias": [A]}; of a constant action the bias alone
 Worth = Callable[[Partial, jax.Array], tuple[float, int]]
 
 
@@ -44,6 +47,7 @@ class LinearSearchConfig:
       best: of the directions, those that the step is made of.
       sigma: standard deviation of the perturbations.
       learning_rate: of the step.
+      decay: factor on both a generation: a wide search finds a gait, a narrow one makes it steady.
       action_noise: standard deviation of Gaussian noise on the actions of all episodes but those of the
         expert's return, as a share of half their range. Under it a policy is found that bears errors,
         such as those of an agent that learned from it.
@@ -54,6 +58,8 @@ class LinearSearchConfig:
         nothing ends an episode early a gait shows in a fraction of it. Judgements are of whole episodes.
       judge_every: generations between judgements of the unperturbed policy, of 20 episodes each; the
         policy that was judged best is the expert.
+      constant: one action instead of a linear policy, each entry at an end of its range: what agents
+        overshoot there they cannot get wrong.
     """
 
     generations: int = 200
@@ -61,15 +67,17 @@ class LinearSearchConfig:
     best: int = 8
     sigma: float = 0.03
     learning_rate: float = 0.02
+    decay: float = 1.0
     action_noise: float = 0.0
     action_errors: float = 0.0
     episode_steps: int | None = None
     judge_every: int = 10
+    constant: bool = False
 
     def __post_init__(self) -> None:
         at_least(1, self, "generations", "directions", "best", "episode_steps", "judge_every")
         at_least(0, self, "action_noise", "action_errors")
-        positive(self, "sigma", "learning_rate")
+        positive(self, "sigma", "learning_rate", "decay")
         if self.best > self.directions:
             raise UserError(f"best is {self.best} of {self.directions} directions: take no more.")
 
@@ -98,17 +106,21 @@ def search_linear_expert(
     space = env.action_space(env_params)
     observations = int(np.prod(env.observation_space(env_params).shape))
     actions = int(np.prod(space.shape))
-    zero = {"matrix": jnp.zeros((observations, actions)), "bias": jnp.zeros(actions)}
+    zero = {"bias": jnp.zeros(actions)}
+    if not config.constant:
+        zero["matrix"] = jnp.zeros((observations, actions))
     search = ARS(
         2 * config.directions,
         zero,
-        optimizer=optax.sgd(config.learning_rate),
-        std_schedule=optax.constant_schedule(config.sigma),
+        optimizer=optax.sgd(optax.exponential_decay(config.learning_rate, 1, config.decay)),
+        std_schedule=optax.exponential_decay(config.sigma, 1, config.decay),
     )
     search.elite_ratio = config.best / config.directions
     params = search.default_params
 
     def act(policy: Linear, seen: RunningStatistics, observation: jax.Array) -> jax.Array:
+        if config.constant:
+            return network_action(jnp.where(policy["bias"] > 0, 1.0, -1.0), space)
         outputs = normalize(seen, observation) @ policy["matrix"] + policy["bias"]
         return network_action(jnp.tanh(outputs), space)
 

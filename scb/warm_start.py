@@ -29,7 +29,7 @@ from scb.console import progress_console
 from scb.curriculum import paper_curriculum
 from scb.environments.registry import environment_spec
 from scb.environments.synthetic import SyntheticBandit, Weights
-from scb.errors import UserError, at_least, one_of
+from scb.errors import UserError, at_least, one_of, positive
 from scb.expert_data import DatasetConfig, expert_dataset, labelled
 from scb.experts import Expert, PolicySearchConfig, evolve_expert, train_expert
 from scb.fitting import fit_bandit
@@ -54,22 +54,29 @@ def _evolved(
 
 
 def _linear(
-    place: Place, key: jax.Array, config: "WarmStartConfig", quiet: bool, worth: Worth | None
+    place: Place,
+    key: jax.Array,
+    config: "WarmStartConfig",
+    quiet: bool,
+    worth: Worth | None,
+    constant: bool = False,
 ) -> Expert:
     standing = environment_spec(place.name).standing_still(place.backend) or 0.0
     bonus = standing / place.params.max_steps_in_episode
+    # Where actions err anyway a larger step is no more noise, and finds gains that bear errors.
+    sigma, learning_rate = (0.15, 0.09) if config.erring else (0.03, 0.02)
     search = LinearSearchConfig(
-        config.expert_generations, episode_steps=config.expert_episode_steps
+        config.expert_generations,
+        sigma=sigma if config.expert_sigma is None else config.expert_sigma,
+        learning_rate=learning_rate
+        if config.expert_learning_rate is None
+        else config.expert_learning_rate,
+        decay=config.expert_decay,
+        episode_steps=config.expert_episode_steps,
+        action_noise=config.expert_noise,
+        action_errors=config.expert_errors,
+        constant=constant,
     )
-    if config.erring:
-        # Where actions err anyway a larger step is no more noise, and finds gains that bear errors.
-        search = replace(
-            search,
-            sigma=0.15,
-            learning_rate=0.09,
-            action_noise=config.expert_noise,
-            action_errors=config.expert_errors,
-        )
     return search_linear_expert(place.env, place.params, key, search, bonus, quiet, worth)
 
 
@@ -84,6 +91,7 @@ class _Search(NamedTuple):
 SEARCHES = {
     "evolution": _Search("evolution", _evolved),
     "linear": _Search("a linear search", _linear, linear=True),
+    "constant": _Search("a search for one action", partial(_linear, constant=True), linear=True),
 }
 
 
@@ -93,12 +101,17 @@ class WarmStartConfig(DatasetConfig):
 
     Attributes:
       expert: the algorithm that finds it: one of the agents' ("ppo", "sac", ...), "evolution" of a
-        small policy network, or "linear", augmented random search for a linear policy, which a bandit
-        holds better than a network. "auto" takes PPO where the environment has a setting of its own
-        for it, and evolution elsewhere.
+        small policy network, "linear", augmented random search for a linear policy, which a bandit
+        holds better than a network, or "constant", the same for one action, each entry at an end of its
+        range. "auto" takes PPO where the environment has a setting of its own for it, and evolution
+        elsewhere.
       num_experts: agents trained on the environment; the best of them is the expert.
       expert_steps: environment steps of each; the environment's own setting where None.
       expert_generations: of the evolution or the linear search, where that finds the expert.
+      expert_sigma: standard deviation of a linear search's perturbations; 0.03 where None, and 0.15 under noise or
+        errors.
+      expert_learning_rate: of a linear search; 0.02 where None, and 0.09 under noise or errors.
+      expert_decay: factor on both a generation.
       expert_pupils: agents of each algorithm of the inner loop that train in a bandit fitted to each policy
         which the linear search judges: the expert is then the one whose agents earn most on average. With 0
         it is the one that earns most itself, under its noise and errors.
@@ -114,6 +127,9 @@ class WarmStartConfig(DatasetConfig):
     num_experts: int = 8
     expert_steps: int | None = None
     expert_generations: int = 80
+    expert_sigma: float | None = None
+    expert_learning_rate: float | None = None
+    expert_decay: float = 1.0
     expert_pupils: int = 0
     expert_episode_steps: int | None = None
     fit_steps: int = 4000
@@ -126,6 +142,7 @@ class WarmStartConfig(DatasetConfig):
         at_least(0, self, "expert_pupils", "aggregation_rounds")
         at_least(1, self, "num_experts", "expert_generations", "expert_episode_steps")
         at_least(1, self, "fit_steps", "aggregation_agents")
+        positive(self, "expert_sigma", "expert_learning_rate", "expert_decay")
 
 
 def expert_agent(
@@ -142,12 +159,16 @@ def expert_agent(
             f"{name} has discrete ones: leave them out."
         )
     algorithm = _chosen(name, config)
+    linear = algorithm in SEARCHES and SEARCHES[algorithm].linear
     for field, instead in (
         ("expert_episode_steps", "has whole episodes"),
         ("expert_pupils", "asks no pupils"),
+        ("expert_sigma", "has its own"),
+        ("expert_learning_rate", "has its own"),
+        ("expert_decay", "has none"),
     ):
         value = getattr(config, field)
-        if value and not (algorithm in SEARCHES and SEARCHES[algorithm].linear):
+        if not linear and value != getattr(WarmStartConfig, field):
             raise UserError(
                 f"{field} is {value}, and the expert of {name} is found by {algorithm}, which {instead}: leave it out, "
                 "or choose linear."

@@ -63,6 +63,19 @@ def test_strategies_find_the_maximum(strategy):
     assert distance(outcome.best_mean) < START / 6
 
 
+def test_without_generations_a_search_ends_with_its_start():
+    problem, config = Parabola(noise=0.5), replace(CONFIG, num_generations=0)
+    outcome = evolve(problem, config, quiet=True)
+    for solution in (outcome.mean, outcome.best_mean):
+        np.testing.assert_array_equal(
+            solution["x"], problem.initial_solution(jax.random.key(0))["x"]
+        )
+    assert outcome.validate(outcome.mean)["fitness"].shape == (config.mean_evaluations,)
+    cost = outcome.cost(problem, config, best=True)
+    assert cost["generation"] == 0
+    assert {cost[name] for name in cost if name.startswith("environment_steps")} == {0}
+
+
 class Wide(Parabola):
     """Of 20 numbers."""
 
@@ -592,7 +605,7 @@ def test_progress_says_fitness_failures_and_time_left(capsys):
         ({"combine": "rank"}, "unknown combination of tasks 'rank': did you mean ranks"),
         ({"population_size": 1}, "population_size is 1: .* at least 2"),
         ({"population_size": 5, "strategy": "Open_ES"}, "population_size is 5: .* must be even"),
-        ({"num_generations": 0}, "num_generations is 0: it must be at least 1"),
+        ({"num_generations": -1}, "num_generations is -1: it must be 0 or larger"),
         ({"mean_evaluations": 0}, "mean_evaluations is 0: it must be at least 1"),
         ({"evaluate_mean_every": 0}, "evaluate_mean_every is 0: it must be at least 1"),
         ({"checkpoint_every": 0}, "checkpoint_every is 0: it must be at least 1"),

@@ -95,6 +95,30 @@ def test_what_policies_are_worth_decides_where_that_is_told():
     assert found.environment_steps == 3 * 16 * 2 + 3 * 7 + 20 * 2
 
 
+def test_the_one_action_that_is_best_held_is_found():
+    # Of the ends of [-1, 2], 2 pays 1 - 0.5^2 and 1 - 1^2, and -1 pays 1 - 2.5^2 and 1 - 2^2.
+    params = TWO_TARGETS.replace(rewards=jnp.array([[1.0, 1.0, 1.5], [1.0, 1.0, 1.0]]))
+    config = replace(SEARCH, generations=5, constant=True)
+    found = search_linear_expert(ContinuousCorridor(cells=2), params, jax.random.key(0), config)
+    np.testing.assert_array_equal(jax.vmap(found.policy)(jnp.eye(2)), [[2.0], [2.0]])
+    assert found.mean_return == pytest.approx(0.75)
+
+
+def test_a_search_that_decays_comes_to_rest():
+    biases = []
+
+    def worth(policy, key):
+        biases.append(float(policy.args[0]["bias"][0]))
+        return 0.0, 0
+
+    config = replace(SEARCH, generations=3, judge_every=1, decay=1e-6)
+    env = ContinuousCorridor(cells=2)
+    search_linear_expert(env, TWO_TARGETS, jax.random.key(0), config, worth=worth)
+    # The first step is a whole one, the next a millionth of it.
+    assert abs(biases[0]) > 1e-3
+    assert biases[1:] == pytest.approx([biases[0]] * 2, abs=1e-5)
+
+
 def test_under_errors_of_its_own_in_each_episode_a_corridor_is_solved():
     assert_solves_two_targets(search(action_errors=0.2))
 
@@ -130,6 +154,33 @@ def test_a_warm_start_takes_a_linear_expert():
     assert expert.environment_steps == (64 + 20 + 20) * 200
 
 
+def test_a_warm_starts_settings_reach_the_search(monkeypatch):
+    searched = []
+    monkeypatch.setattr(
+        "scb.warm_start.search_linear_expert", lambda *arguments: searched.append(arguments[3])
+    )
+    for settings in (
+        {"expert": "linear"},
+        {"expert": "linear", "expert_noise": 0.2},
+        {
+            "expert": "constant",
+            "expert_errors": 0.3,
+            "expert_sigma": 0.5,
+            "expert_learning_rate": 0.4,
+            "expert_decay": 0.99,
+        },
+    ):
+        find_expert(
+            Place.named("Pendulum-v1"), jax.random.key(0), WarmStartConfig(**settings), quiet=True
+        )
+    plain = LinearSearchConfig(generations=80)
+    assert searched == [
+        plain,
+        replace(plain, sigma=0.15, learning_rate=0.09, action_noise=0.2),
+        replace(plain, sigma=0.5, learning_rate=0.4, decay=0.99, action_errors=0.3, constant=True),
+    ]
+
+
 @pytest.mark.parametrize(
     ("name", "arguments", "message"),
     [
@@ -148,6 +199,21 @@ def test_a_warm_start_takes_a_linear_expert():
             "Pendulum-v1",
             {"expert": "evolution", "expert_pupils": 4},
             "expert_pupils is 4, and the expert of Pendulum-v1 is found by evolution, which asks no pupils",
+        ),
+        (
+            "Pendulum-v1",
+            {"expert": "ppo", "expert_sigma": 0.1},
+            "expert_sigma is 0.1, and the expert of Pendulum-v1 is found by ppo, which has its own",
+        ),
+        (
+            "Pendulum-v1",
+            {"expert": "td3", "expert_decay": 0.9},
+            "expert_decay is 0.9, and the expert of Pendulum-v1 is found by td3, which has none",
+        ),
+        (
+            "CartPole-v1",
+            {"expert": "constant"},
+            "the expert of a search for one action has continuous actions and CartPole-v1 discrete ones",
         ),
     ],
 )
