@@ -127,8 +127,9 @@ def _fit_linear(
     low, high = bandit.bounds
     weights = fitted(states, best, low, high)
     parts = PolicyDistanceParts.of(weights["reward"], low, high, np)
-    errors = parts.action(parts.best(states)) - best
-    return weights, {"action_r2": float(1.0 - errors.var() / best.var(axis=0).mean())}
+    errors, variance = parts.action(parts.best(states)) - best, best.var(axis=0).mean()
+    # Of one action that is held throughout there is nothing to explain.
+    return weights, {"action_r2": float(1.0 - errors.var() / variance) if variance else 1.0}
 
 
 def energy_distance(a: jax.Array, b: jax.Array) -> jax.Array:

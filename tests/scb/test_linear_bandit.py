@@ -109,6 +109,28 @@ def test_a_file_gives_back_the_same_bandit(bandit, tmp_path):
     assert same[0] == same[1]
 
 
+def test_one_action_that_is_held_is_fitted_too(states):
+    held = np.tile(np.array([1.0, 0.0], np.float32), (len(states), 1))
+    dataset = ExpertDataset(jnp.asarray(states), held[:, None], jnp.zeros((len(states), 1)), held)
+    bandit = SyntheticBandit(2, SPACE, LINEAR)
+    weights, report = fit_bandit(bandit, dataset, jax.random.key(0))
+    assert report == {"action_r2": 1.0}  # there is nothing to explain
+    reward = jax.vmap(bandit.mean_reward, in_axes=(0, None, None))
+    # Nearly 0 there in every context; at the other end of the second action, 2 halves of its range away, -2.
+    for action, worth in (([1.0, 0.0], 0.0), ([1.0, 4.0], -2.0)):
+        earned = reward(states, jnp.array(action), bandit.params(weights))
+        np.testing.assert_allclose(earned, worth, atol=0.02)
+
+
+@pytest.mark.slow
+def test_without_generations_the_fit_is_the_result():
+    config = pendulum_config(num_generations=0)
+    problem, outcome = discover(config, quiet=True)
+    start = problem.initial_solution(jax.random.key(0))
+    jax.tree.map(np.testing.assert_array_equal, outcome.mean, start)
+    assert outcome.cost(problem, config.evolution, False)["environment_steps_training"] == 0
+
+
 def test_its_reward_can_be_given_another_scale(bandit):
     weights = standardize_reward(bandit, bandit.default_params.weights, 3.0)
     rewards = bandit.sample_rewards(bandit.params(weights), jax.random.key(5), 4000)
@@ -124,10 +146,9 @@ def pendulum_config(**changes):
         warm_start=WarmStartConfig(expert="linear", expert_generations=2, num_states=256),
         evolution=EvolutionConfig(
             population_size=4,
-            num_generations=2,
             sigma=0.1,
             mean_evaluations=2,
-            **{"strategy": "SNES", **changes},
+            **{"strategy": "SNES", "num_generations": 2, **changes},
         ),
     )
 
