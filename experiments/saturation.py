@@ -1,0 +1,185 @@
+"""How agents of PPO act that learned from a bandit: within the actions' range, or beyond its ends, where errors vanish.
+
+    python -m experiments.saturation --published DIRECTORY
+
+PPO's Gaussian has a mean of any size, and the environment clips the action. Agents train in a bandit; in states that
+they visit in its environment, this takes the mean that each of them would act by, and asks how far agents are from
+each other before and after the clip, and how many directions what they all do has.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from matplotlib.figure import Figure
+
+from experiments.harness import Experiment, Report, Save
+from scb.agents.spec import bandit_agent
+from scb.aggregation import Learners
+from scb.environments.registry import environment_spec
+from scb.environments.synthetic import SyntheticBandit
+from scb.environments.zoo import open_bandit, zoo_names
+from scb.errors import UserError, at_least, one_of
+from scb.importer import PUBLISHED_BANDITS, published_bandit
+from scb.keys import named_key, root_key
+from scb.measurement import Place
+from scb.statistics import estimate
+
+BACKEND = "generalized"
+SEED = 1  # nothing is chosen by it
+STATES = 2048
+KINDS = ("ours", "published")
+
+
+@dataclass(frozen=True)
+class Options:
+    """Which bandits, and how many agents."""
+
+    environments: tuple[str, ...] = ("hopper", "walker2d", "halfcheetah")
+    """of Brax"""
+    published: Path | None = None
+    """folder with the published bandits' .npz files"""
+    agents: int = 24
+    """of PPO in every bandit"""
+    episodes: int = 2
+    """of each agent"""
+
+    def __post_init__(self) -> None:
+        at_least(2, self, "agents")
+        at_least(1, self, "episodes")
+        for name in self.environments:
+            one_of("environment of a published bandit", name, PUBLISHED_BANDITS.values())
+
+
+def bandits(environment: str, published: Path | None) -> dict[str, SyntheticBandit]:
+    """{kind: the bandit of this environment}, of the kinds that there are."""
+    found = {}
+    if (name := environment_spec(environment).bandit) in zoo_names():
+        found["ours"] = open_bandit(name)
+    if published is not None:
+        file = {home: name for name, home in PUBLISHED_BANDITS.items()}[environment]
+        found["published"] = published_bandit(published / f"{file}.npz")
+    return found
+
+
+def spread(means: np.ndarray) -> dict[str, float]:
+    """What [N, S, A] means of N agents in the same S states are like, in halves of the actions' range.
+
+    Returns:
+      beyond: share of them that lie beyond the ends of the range.
+      apart: root mean square distance of an agent's mean to that of all, and `clipped`: of the actions.
+      directions: of what all agents do, the mean of the clipped actions, how many the variance over states has
+        (its participation ratio, (sum of eigenvalues)^2 / sum of their squares).
+    """
+    actions = np.clip(means, -1, 1)
+    together = actions.mean(axis=0)
+    variances = np.linalg.svd(together - together.mean(axis=0), compute_uv=False) ** 2
+    return {
+        "beyond": float((np.abs(means) > 1).mean()),
+        "apart": float(np.sqrt(((means - means.mean(axis=0)) ** 2).mean())),
+        "clipped": float(np.sqrt(((actions - together) ** 2).mean())),
+        "directions": float(variances.sum() ** 2 / (variances**2).sum()),
+    }
+
+
+def measured(bandit: SyntheticBandit, environment: str, options: Options) -> dict[str, Any]:
+    """What agents earn, and how they act in states that they visit."""
+    place = Place.named(environment, BACKEND)
+    specs = {"ppo": bandit_agent("ppo", environment)}
+    learners = Learners(bandit, specs, place, options.agents, options.episodes)
+    weights, key = bandit.default_params.weights, named_key(root_key(SEED), "saturation")
+    _, learned = learners(weights, key)
+    visited = learners.visits(weights, learned).observation
+    visited = jnp.reshape(visited, (-1, visited.shape[-1]))
+    states = visited[jax.random.choice(named_key(key, "states"), len(visited), (STATES,))]
+    agent, params = learners.agents["ppo"], bandit.params(weights)
+    space = place.env.action_space(place.params)
+
+    @jax.jit
+    @jax.vmap
+    def means(state: Any) -> jax.Array:
+        return jax.vmap(lambda o: agent.choose(state, o, key, params, mode=True))(states)
+
+    low, high = np.asarray(space.low), np.asarray(space.high)
+    shares = (np.asarray(means(learned["ppo"].states)) - (low + high) / 2) / ((high - low) / 2)
+    found = {name: round(value, 4) for name, value in spread(shares).items()}
+    returns = np.maximum(
+        learned["ppo"].returns, environment_spec(environment).random_return(BACKEND)
+    )
+    return {**found, "returns": np.round(returns, 1).tolist(), "actions": shares.shape[-1]}
+
+
+def measure(options: Options, report: dict[str, Any], save: Save) -> None:
+    """A bandit at a time; what the report holds of as many agents is not measured again."""
+    size = {"agents": options.agents, "episodes": options.episodes}
+    if report.setdefault("size", size) != size:
+        raise UserError(f"the report is of {report['size']}, not {size}: choose another --out.")
+    found = report.setdefault("environments", {})
+    for environment in options.environments:
+        entry = found.setdefault(environment, {})
+        for kind, bandit in bandits(environment, options.published).items():
+            if kind not in entry:
+                entry[kind] = measured(bandit, environment, options)
+                print(environment, kind, entry[kind], flush=True)
+                save()
+
+
+def facts(report: Report) -> dict[str, Any]:
+    """A row a bandit."""
+    return {
+        "rows": [
+            {
+                "environment": environment,
+                "kind": kind,
+                **entry[kind],
+                "earned": estimate(entry[kind]["returns"]),
+            }
+            for environment, entry in report["environments"].items()
+            for kind in KINDS
+            if kind in entry
+        ]
+    }
+
+
+def draw(report: Mapping[str, Any]) -> Figure:
+    """A row a bandit: how far agents are apart before the clip and after it."""
+    rows = facts(report)["rows"]
+    figure = Figure(figsize=(7, 0.5 * len(rows) + 1.3))
+    axes = figure.subplots()
+    for place, row in enumerate(rows):
+        axes.plot([row["clipped"], row["apart"]], [place, place], color="0.7", zorder=1)
+        axes.plot(row["apart"], place, "o", color="C1", label="" if place else "before the clip")
+        axes.plot(row["clipped"], place, "o", color="C0", label="" if place else "after it")
+        axes.annotate(
+            f"{100 * row['beyond']:.0f} % beyond the ends",
+            (row["apart"], place),
+            xytext=(8, 0),
+            textcoords="offset points",
+            va="center",
+            fontsize=8,
+        )
+    axes.set_yticks(range(len(rows)), [f"{row['environment']}, {row['kind']}" for row in rows])
+    axes.invert_yaxis()
+    axes.set_xlim(0, max(row["apart"] for row in rows) * 1.35)
+    axes.set_xlabel("PPO's agents apart from each other, in halves of the actions' range")
+    axes.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=2, frameon=False)
+    return figure
+
+
+EXPERIMENT = Experiment(
+    "saturation",
+    "How do PPO's agents act that learned from a bandit?",
+    measure,
+    draw,
+    facts=facts,
+    options=Options,
+    keys=("environments", "size"),
+)
+
+
+if __name__ == "__main__":
+    raise SystemExit(EXPERIMENT.main())
