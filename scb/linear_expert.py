@@ -47,7 +47,7 @@ class LinearSearchConfig:
       best: of the directions, those that the step is made of.
       sigma: standard deviation of the perturbations.
       learning_rate: of the step.
-      decay: factor on both a generation: a wide search finds a gait, a narrow one makes it steady.
+      decay: factor on sigma and learning rate a generation.
       action_noise: standard deviation of Gaussian noise on the actions of all episodes but those of the
         expert's return, as a share of half their range. Under it a policy is found that bears errors,
         such as those of an agent that learned from it.
