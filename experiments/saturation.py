@@ -17,14 +17,15 @@ import jax.numpy as jnp
 import numpy as np
 from matplotlib.figure import Figure
 
-from experiments.harness import Experiment, Report, Save
+from experiments.harness import Experiment, Report, Save, finite, packed, unpacked
+from experiments.zoo_table import Candidate, candidates
+from experiments.zoo_table_page import BANDITS
+from scb import plotting
 from scb.agents.spec import bandit_agent
 from scb.aggregation import Learners
 from scb.environments.registry import environment_spec
-from scb.environments.synthetic import SyntheticBandit
-from scb.environments.zoo import open_bandit, zoo_names
 from scb.errors import UserError, at_least, one_of
-from scb.importer import PUBLISHED_BANDITS, published_bandit
+from scb.importer import PUBLISHED_BANDITS
 from scb.keys import named_key, root_key
 from scb.measurement import Place
 from scb.statistics import estimate
@@ -32,7 +33,6 @@ from scb.statistics import estimate
 BACKEND = "generalized"
 SEED = 1  # nothing is chosen by it
 STATES = 2048
-KINDS = ("ours", "published")
 
 
 @dataclass(frozen=True)
@@ -55,15 +55,9 @@ class Options:
             one_of("environment of a published bandit", name, PUBLISHED_BANDITS.values())
 
 
-def bandits(environment: str, published: Path | None) -> dict[str, SyntheticBandit]:
+def bandits(environment: str, published: Path | None) -> dict[str, Candidate]:
     """{kind: the bandit of this environment}, of the kinds that there are."""
-    found = {}
-    if (name := environment_spec(environment).bandit) in zoo_names():
-        found["ours"] = open_bandit(name)
-    if published is not None:
-        file = {home: name for name, home in PUBLISHED_BANDITS.items()}[environment]
-        found["published"] = published_bandit(published / f"{file}.npz")
-    return found
+    return {x.kind: x for x in candidates(None, published) if x.environment == environment}
 
 
 def spread(means: np.ndarray) -> dict[str, float]:
@@ -86,10 +80,10 @@ def spread(means: np.ndarray) -> dict[str, float]:
     }
 
 
-def measured(bandit: SyntheticBandit, environment: str, options: Options) -> dict[str, Any]:
+def measured(candidate: Candidate, options: Options) -> dict[str, Any]:
     """What agents earn, and how they act in states that they visit."""
-    place = Place.named(environment, BACKEND)
-    specs = {"ppo": bandit_agent("ppo", environment)}
+    bandit, place = candidate.bandit, Place.named(candidate.environment, BACKEND)
+    specs = {"ppo": bandit_agent("ppo", candidate.environment)}
     learners = Learners(bandit, specs, place, options.agents, options.episodes)
     weights, key = bandit.default_params.weights, named_key(root_key(SEED), "saturation")
     _, learned = learners(weights, key)
@@ -107,23 +101,23 @@ def measured(bandit: SyntheticBandit, environment: str, options: Options) -> dic
     low, high = np.asarray(space.low), np.asarray(space.high)
     shares = (np.asarray(means(learned["ppo"].states)) - (low + high) / 2) / ((high - low) / 2)
     found = {name: round(value, 4) for name, value in spread(shares).items()}
-    returns = np.maximum(
-        learned["ppo"].returns, environment_spec(environment).random_return(BACKEND)
-    )
-    return {**found, "returns": np.round(returns, 1).tolist(), "actions": shares.shape[-1]}
+    random = environment_spec(candidate.environment).random_return(BACKEND)
+    returns, _ = finite(learned["ppo"].returns, random)
+    said = {"bandit": candidate.kind, "sha256": candidate.sha256, "actions": shares.shape[-1]}
+    return {**said, **found, "returns": packed([returns])[0]}
 
 
 def measure(options: Options, report: dict[str, Any], save: Save) -> None:
-    """A bandit at a time; what the report holds of as many agents is not measured again."""
+    """A bandit at a time; what the report holds of the same one is not measured again."""
     size = {"agents": options.agents, "episodes": options.episodes}
     if report.setdefault("size", size) != size:
         raise UserError(f"the report is of {report['size']}, not {size}: choose another --out.")
     found = report.setdefault("environments", {})
     for environment in options.environments:
         entry = found.setdefault(environment, {})
-        for kind, bandit in bandits(environment, options.published).items():
-            if kind not in entry:
-                entry[kind] = measured(bandit, environment, options)
+        for kind, candidate in bandits(environment, options.published).items():
+            if entry.get(kind, {}).get("sha256") != candidate.sha256:
+                entry[kind] = measured(candidate, options)
                 print(environment, kind, entry[kind], flush=True)
                 save()
 
@@ -136,10 +130,10 @@ def facts(report: Report) -> dict[str, Any]:
                 "environment": environment,
                 "kind": kind,
                 **entry[kind],
-                "earned": estimate(entry[kind]["returns"]),
+                "earned": estimate(unpacked([entry[kind]["returns"]])[0]),
             }
             for environment, entry in report["environments"].items()
-            for kind in KINDS
+            for kind in BANDITS
             if kind in entry
         ]
     }
@@ -151,9 +145,17 @@ def draw(report: Mapping[str, Any]) -> Figure:
     figure = Figure(figsize=(7, 0.5 * len(rows) + 1.3))
     axes = figure.subplots()
     for place, row in enumerate(rows):
-        axes.plot([row["clipped"], row["apart"]], [place, place], color="0.7", zorder=1)
-        axes.plot(row["apart"], place, "o", color="C1", label="" if place else "before the clip")
-        axes.plot(row["clipped"], place, "o", color="C0", label="" if place else "after it")
+        axes.plot([row["clipped"], row["apart"]], [place, place], color=plotting.GREY, zorder=1)
+        axes.plot(
+            row["apart"],
+            place,
+            "o",
+            color=plotting.VERMILLION,
+            label="" if place else "before the clip",
+        )
+        axes.plot(
+            row["clipped"], place, "o", color=plotting.BLUE, label="" if place else "after it"
+        )
         axes.annotate(
             f"{100 * row['beyond']:.0f} % beyond the ends",
             (row["apart"], place),

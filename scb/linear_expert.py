@@ -31,9 +31,8 @@ from scb.keys import key_at, named_key, split_key
 from scb.neuroevolution import network_action
 from scb.runs import Stopwatch
 
-Linear = dict[
-    str, jax.Array
-]  # {"matrix": [O, A], "bias": [A]}; of a constant action the bias alone
+# {"matrix": [O, A], "bias": [A]}; of a constant action the bias alone.
+Linear = dict[str, jax.Array]
 Worth = Callable[[Partial, jax.Array], tuple[float, int]]
 
 

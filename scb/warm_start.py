@@ -67,10 +67,8 @@ def _linear(
     sigma, learning_rate = (0.15, 0.09) if config.erring else (0.03, 0.02)
     search = LinearSearchConfig(
         config.expert_generations,
-        sigma=sigma if config.expert_sigma is None else config.expert_sigma,
-        learning_rate=learning_rate
-        if config.expert_learning_rate is None
-        else config.expert_learning_rate,
+        sigma=config.expert_sigma or sigma,
+        learning_rate=config.expert_learning_rate or learning_rate,
         decay=config.expert_decay,
         episode_steps=config.expert_episode_steps,
         action_noise=config.expert_noise,

@@ -31,7 +31,7 @@ def test_a_bandit_of_ours_is_taken_where_there_is_one():
 
 def entry(beyond, apart, clipped):
     means = {"beyond": beyond, "apart": apart, "clipped": clipped, "directions": 2.0}
-    return {**means, "returns": [100.0, 200.0, 300.0, 400.0], "actions": 6}
+    return {**means, "returns": "100 200 300 400", "actions": 6}
 
 
 def test_the_page_says_where_the_clip_takes_most():
