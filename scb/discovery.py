@@ -271,7 +271,8 @@ class BanditDiscovery:
     def _fit(self, key: jax.Array) -> tuple[Weights, dict[str, float]]:
         assert isinstance(self.bandit, SyntheticBandit)
         config = self.config.warm_start
-        return warm_start(self.bandit, self.specs, self.place, key, config, self._quiet)
+        folder = None if self._folder is None else self._folder / "expert"
+        return warm_start(self.bandit, self.specs, self.place, key, config, self._quiet, folder)
 
     def _refine(self, weights: Weights, key: jax.Array) -> tuple[Weights, dict[str, float]]:
         assert isinstance(self.bandit, SyntheticBandit)

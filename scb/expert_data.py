@@ -104,7 +104,8 @@ def expert_dataset(
       (the dataset, environment steps it took).
     """
     key_roll, key_pick, _, key_label = split_key(key, 4)
-    policy = expert.policy if isinstance(expert.policy, Partial) else Partial(expert.policy)
+    acting = expert.reaching if config.erring and expert.reaching else expert.policy
+    policy = acting if isinstance(acting, Partial) else Partial(acting)
     visited = _trajectories(place, config)(policy, split_key(key_roll, TRAJECTORIES))
     return labelled(expert, place, visited, key_pick, key_label, config)
 
@@ -121,7 +122,9 @@ def _trajectories(place: Place, config: DatasetConfig) -> Callable[[Partial, jax
         if config.erring:
             assert not isinstance(space, spaces.Discrete)
             off = erring(policy, size, space, config.expert_errors, key)
-            off_each_step = noisy(off, space, config.expert_noise)
+            off_each_step = noisy(
+                off if config.expert_errors else policy, space, config.expert_noise
+            )
 
         def act(observation: jax.Array, keys: jax.Array) -> jax.Array:
             if config.erring:

@@ -37,11 +37,15 @@ class Expert(NamedTuple):
       mean_return: over 20 episodes in the environment.
       environment_steps: taken to find it, evaluation included; an upper bound where episodes end
         early.
+      reaching: what errors are added to, where that goes beyond the bounds; of shape [...] as the actions'.
+      earlier_seconds: of a search that went on from what was kept of it, those until then.
     """
 
     policy: Callable[[jax.Array], jax.Array]
     mean_return: float
     environment_steps: int
+    reaching: Callable[[jax.Array], jax.Array] | None = None
+    earlier_seconds: float = 0.0
 
 
 def judged(

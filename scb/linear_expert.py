@@ -9,6 +9,7 @@ throughout, which is all that humanoidstandup asks for.
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -18,8 +19,10 @@ import optax
 from evosax.algorithms import ARS
 from gymnax.environments import environment, spaces
 from jax.tree_util import Partial
+from jax.typing import ArrayLike
 
-from scb.agents.agent import AgentConfig, clip_to_space
+from scb import processes
+from scb.agents.agent import AgentConfig, clip_to_space, scale_to_space
 from scb.agents.networks import MLP
 from scb.agents.normalization import RunningStatistics, merge_statistics, normalize
 from scb.console import Progress, progress_console
@@ -28,12 +31,11 @@ from scb.evaluation import Episodes, Policy, evaluate
 from scb.evolution import map_population
 from scb.experts import EPISODES, Expert, judged
 from scb.keys import key_at, named_key, split_key
-from scb.neuroevolution import network_action
-from scb.runs import Stopwatch
+from scb.runs import Checkpoints, Stopwatch
 
 # {"matrix": [O, A], "bias": [A]}; of a constant action the bias alone.
 Linear = dict[str, jax.Array]
-Worth = Callable[[Partial, jax.Array], tuple[float, int]]
+Worth = Callable[[Expert, jax.Array], tuple[float, int]]
 
 
 @dataclass(frozen=True)
@@ -53,10 +55,16 @@ class LinearSearchConfig:
       action_errors: the scale of errors that are a function of the observation (`erring`), in the same
         episodes, each of which has a function of its own. An agent errs so: what it did not learn it
         gets wrong whenever it is there.
+      error_warmup: generations over which the scale of these errors grows linearly to its end; 0 for all of it
+        from the start, under which a gait is found late or never. Judgements are under all of it.
       episode_steps: at which the search's episodes are cut; the environment's own limit where None. Where
         nothing ends an episode early a gait shows in a fraction of it. Judgements are of whole episodes.
       judge_every: generations between judgements of the unperturbed policy, of 20 episodes each; the
         policy that was judged best is the expert.
+      reach: how far a policy goes where it errs, in halves of the actions' range: reach * tanh(outputs), which is
+        clipped after the errors. Above 1 they vanish far enough beyond an end, as those of an agent do
+        whose mean action lies there, and what bears them switches between the ends. The expert is
+        tanh(reach * outputs), which is as steep where it switches.
       constant: one action instead of a linear policy, each entry at an end of its range: what agents
         overshoot there they cannot get wrong.
     """
@@ -69,13 +77,17 @@ class LinearSearchConfig:
     decay: float = 1.0
     action_noise: float = 0.0
     action_errors: float = 0.0
+    error_warmup: int = 0
     episode_steps: int | None = None
     judge_every: int = 10
+    reach: float = 1.0
     constant: bool = False
 
     def __post_init__(self) -> None:
-        at_least(1, self, "generations", "directions", "best", "episode_steps", "judge_every")
-        at_least(0, self, "action_noise", "action_errors")
+        at_least(
+            1, self, "generations", "directions", "best", "episode_steps", "judge_every", "reach"
+        )
+        at_least(0, self, "action_noise", "action_errors", "error_warmup")
         positive(self, "sigma", "learning_rate", "decay")
         if self.best > self.directions:
             raise UserError(f"best is {self.best} of {self.directions} directions: take no more.")
@@ -89,6 +101,7 @@ def search_linear_expert(
     bonus: float = 0.0,
     quiet: bool = True,
     worth: Worth | None = None,
+    folder: Path | None = None,
 ) -> Expert:
     """The best unperturbed policy of an augmented random search; its return is one on fresh start states.
 
@@ -98,8 +111,10 @@ def search_linear_expert(
       config: of the search.
       bonus: what every step pays without falling, which the fitness leaves out.
       quiet: no progress on the terminal.
-      worth: (a policy, a key) -> what it is judged by, and the environment steps that took; what it earns
-        under the noise and errors of the search where None.
+      worth: (an expert that is not judged yet, a key) -> what it is judged by, and the environment steps
+        that took; what it earns under the noise and errors of the search where None.
+      folder: to keep the search in, at every judgement, and to go on from; the same folder must not be given to
+        another search. None keeps nothing.
     """
     config = config or LinearSearchConfig()
     space = env.action_space(env_params)
@@ -117,23 +132,42 @@ def search_linear_expert(
     search.elite_ratio = config.best / config.directions
     params = search.default_params
 
-    def act(policy: Linear, seen: RunningStatistics, observation: jax.Array) -> jax.Array:
+    def outputs(policy: Linear, seen: RunningStatistics, observation: jax.Array) -> jax.Array:
         if config.constant:
-            return network_action(jnp.where(policy["bias"] > 0, 1.0, -1.0), space)
-        outputs = normalize(seen, observation) @ policy["matrix"] + policy["bias"]
-        return network_action(jnp.tanh(outputs), space)
+            return jnp.where(policy["bias"] > 0, jnp.inf, -jnp.inf)
+        return normalize(seen, observation) @ policy["matrix"] + policy["bias"]
+
+    def reaching(policy: Linear, seen: RunningStatistics, observation: jax.Array) -> jax.Array:
+        """What errors are added to; beyond the ends of the range where reach is above 1."""
+        squashed = config.reach * jnp.tanh(outputs(policy, seen, observation))
+        return jnp.reshape(scale_to_space(squashed, space), space.shape)
+
+    def act(policy: Linear, seen: RunningStatistics, observation: jax.Array) -> jax.Array:
+        # As steep where it switches, and a linear bandit's best action can be the same.
+        squashed = jnp.tanh(config.reach * outputs(policy, seen, observation))
+        return clip_to_space(scale_to_space(squashed, space), space)
+
+    def unjudged(policy: Linear, seen: RunningStatistics) -> Expert:
+        return Expert(Partial(act, policy, seen), 0.0, 0, Partial(reaching, policy, seen))
 
     def rolled(
-        policy: Linear, seen: RunningStatistics, key: jax.Array, number: int, **more: Any
+        policy: Linear,
+        seen: RunningStatistics,
+        key: jax.Array,
+        errors: ArrayLike,
+        number: int,
+        **more: Any,
     ) -> Episodes:
-        off = erring(Partial(act, policy, seen), observations, space, config.action_errors, key)
+        off: Callable[[jax.Array], jax.Array] = Partial(reaching, policy, seen)
+        if config.action_errors:
+            off = erring(off, observations, space, errors, key)
         off_each_step = noisy(off, space, config.action_noise)
         return evaluate(env, env_params, off_each_step, key, number, **more)
 
-    def one(policy: Linear, seen: RunningStatistics, key: jax.Array) -> Episodes:
-        return rolled(policy, seen, key, 1, horizon=config.episode_steps, moments=True)
+    def one(policy: Linear, seen: RunningStatistics, key: jax.Array, errors: ArrayLike) -> Episodes:
+        return rolled(policy, seen, key, errors, 1, horizon=config.episode_steps, moments=True)
 
-    roll = map_population(one, 2 * config.directions, (0, None, 0))
+    roll = map_population(one, 2 * config.directions, (0, None, 0, None))
 
     @jax.jit
     def ask(state: Any, key: jax.Array) -> Any:
@@ -156,51 +190,76 @@ def search_linear_expert(
         # Errors are an episode's own.
         keys = split_key(key, EPISODES) if config.action_errors else key[None]
         each = EPISODES // len(keys)
-        episodes = jax.vmap(lambda key: rolled(policy, seen, key, each))(keys)
+        episodes = jax.vmap(lambda key: rolled(policy, seen, key, config.action_errors, each))(keys)
         return episodes.returns.mean(), episodes.lengths.sum()
 
-    state = search.init(named_key(key, "start"), zero, params)
-    seen, steps = RunningStatistics.start(observations), 0.0
-    expert, best = (zero, seen), -np.inf
+    seen = RunningStatistics.start(observations)
+    kept: dict[str, Any] = {
+        "search": search.init(named_key(key, "start"), zero, params),
+        "seen": seen,
+        "steps": jnp.int32(0),
+        "seconds": jnp.float32(0.0),
+        "expert": (zero, seen),
+        "best": jnp.float32(-jnp.inf),
+    }
+    first = 0
+    checkpoints = Checkpoints(folder) if folder and processes.first() else None
+    if checkpoints:
+        first, kept, _ = checkpoints.restore(kept)
+    if folder:
+        first, kept = processes.told(first), processes.agreed(kept)
+    earlier_seconds = float(kept["seconds"])
     keys, key_judge = named_key(key, "generations"), named_key(key, "judgement")
-    with Progress(progress_console(quiet), config.generations, 0) as advance:
+    with Progress(progress_console(quiet), config.generations, first) as advance:
         watch = Stopwatch()
-        for number in range(1, config.generations + 1):
+        for number in range(first + 1, config.generations + 1):
             key_ask, key_tell = split_key(key_at(keys, number))
-            population, state, key_roll = ask(state, key_ask)
-            episodes = roll(population, seen, key_roll)
-            state, seen, taken = tell(state, population, episodes, seen, key_tell)
-            steps += float(taken)
+            population, state, key_roll = ask(kept["search"], key_ask)
+            grown = min(1.0, number / config.error_warmup) if config.error_warmup else 1.0
+            errors = jnp.float32(grown * config.action_errors)
+            episodes = roll(population, kept["seen"], key_roll, errors)
+            state, seen, steps = tell(state, population, episodes, kept["seen"], key_tell)
+            kept |= {"search": state, "seen": seen}
             metrics = {"fitness/mean": float(episodes.returns.mean()), "failed": 0}
             if number % config.judge_every == 0 or number == config.generations:
                 mean = search.get_mean(state)
                 # The same start states for all, so that judgements are compared in pairs.
                 earned, taken = (
-                    worth(Partial(act, mean, seen), key_judge)
+                    worth(unjudged(mean, seen), key_judge)
                     if worth
                     else mean_return(mean, seen, key_judge)
                 )
-                steps += float(taken)
+                steps += taken
                 metrics["mean/fitness"] = float(earned)
-                if earned > best:
-                    expert, best = (mean, seen), float(earned)
-            advance(metrics, watch.lap())
-    return judged(Partial(act, *expert), env, env_params, named_key(key, "return"), int(steps))
+                if earned > kept["best"]:
+                    kept |= {"expert": (mean, seen), "best": jnp.float32(earned)}
+            seconds = watch.lap()
+            kept |= {"steps": kept["steps"] + steps, "seconds": kept["seconds"] + seconds}
+            if checkpoints and "mean/fitness" in metrics:
+                checkpoints.save(number, kept)
+            advance(metrics, seconds)
+    if checkpoints:
+        checkpoints.close()
+    found = unjudged(*kept["expert"])
+    key_return, steps = named_key(key, "return"), int(kept["steps"])
+    judgement = judged(found.policy, env, env_params, key_return, steps)
+    return judgement._replace(reaching=found.reaching, earlier_seconds=earlier_seconds)
 
 
 def noisy(policy: Callable[[jax.Array], jax.Array], space: spaces.Box, noise: float) -> Policy:
     """A policy of flattened observations, with Gaussian noise on its actions, as `evaluate` takes it.
 
     Args:
-      noise: standard deviation, as a share of half the actions' range; actions stay within their bounds.
+      policy: its actions may lie beyond their bounds, and are clipped to them with the noise.
+      noise: standard deviation, as a share of half the actions' range.
     """
     half = noise * (space.high - space.low) / 2
 
     def act(observation: jax.Array, key: jax.Array) -> jax.Array:
         action = jnp.reshape(policy(jnp.ravel(observation)), space.shape)
-        if noise == 0:
-            return action
-        return clip_to_space(action + half * jax.random.normal(key, space.shape), space)
+        if noise:
+            action += half * jax.random.normal(key, space.shape)
+        return clip_to_space(action, space)
 
     return act
 
@@ -209,27 +268,24 @@ def erring(
     policy: Callable[[jax.Array], jax.Array],
     size: int,
     space: spaces.Box,
-    scale: float,
+    scale: ArrayLike,
     key: jax.Array,
 ) -> Callable[[jax.Array], jax.Array]:
-    """A policy of flattened observations whose errors are a function of the observation, like an agent's.
+    """A policy of flattened observations whose errors are a function of the observation, like an agent's; to be clipped.
 
     They are the outputs of an untrained network of an agent's size, times the scale: on Hopper's states half of that.
 
     Args:
       size: of the observations.
-      scale: as a share of half the actions' range; actions stay within their bounds.
+      scale: as a share of half the actions' range.
       key: decides the network.
     """
-    if scale == 0:
-        return policy
     network = MLP(AgentConfig.hidden_sizes, math.prod(space.shape), AgentConfig.activation)
     variables = network.init(named_key(key, "errors"), jnp.zeros(size))
     half = scale * (space.high - space.low) / 2
 
     def act(observation: jax.Array) -> jax.Array:
         errors = jnp.reshape(jnp.asarray(network.apply(variables, observation)), space.shape)
-        action = jnp.reshape(policy(observation), space.shape)
-        return clip_to_space(action + half * errors, space)
+        return jnp.reshape(policy(observation), space.shape) + half * errors
 
     return act

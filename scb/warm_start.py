@@ -8,12 +8,12 @@ what it cannot know is which of them *trains* well, and that is what evolution i
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from gymnax.environments import spaces
-from jax.tree_util import Partial
 
 from scb.agents.spec import (
     ALGORITHMS,
@@ -42,7 +42,12 @@ PUPILS_EPISODES = 3  # by which each of an expert's pupils is judged
 
 
 def _evolved(
-    place: Place, key: jax.Array, config: "WarmStartConfig", quiet: bool, _: Worth | None
+    place: Place,
+    key: jax.Array,
+    config: "WarmStartConfig",
+    quiet: bool,
+    _worth: Worth | None,
+    _folder: Path | None,
 ) -> Expert:
     search, generations = PolicySearchConfig(), config.expert_generations
     search = replace(
@@ -59,6 +64,7 @@ def _linear(
     config: "WarmStartConfig",
     quiet: bool,
     worth: Worth | None,
+    folder: Path | None,
     constant: bool = False,
 ) -> Expert:
     standing = environment_spec(place.name).standing_still(place.backend) or 0.0
@@ -73,16 +79,18 @@ def _linear(
         episode_steps=config.expert_episode_steps,
         action_noise=config.expert_noise,
         action_errors=config.expert_errors,
+        error_warmup=config.expert_error_warmup,
+        reach=config.expert_reach,
         constant=constant,
     )
-    return search_linear_expert(place.env, place.params, key, search, bonus, quiet, worth)
+    return search_linear_expert(place.env, place.params, key, search, bonus, quiet, worth, folder)
 
 
 class _Search(NamedTuple):
     """What finds experts that are no agents: in words, how, and what it needs and knows."""
 
     what: str
-    find: Callable[[Place, jax.Array, "WarmStartConfig", bool, Worth | None], Expert]
+    find: Callable[[Place, jax.Array, "WarmStartConfig", bool, Worth | None, Path | None], Expert]
     linear: bool = False  # for continuous actions; cuts episodes and asks pupils where told to
 
 
@@ -110,6 +118,10 @@ class WarmStartConfig(DatasetConfig):
         errors.
       expert_learning_rate: of a linear search; 0.02 where None, and 0.09 under noise or errors.
       expert_decay: factor on both a generation.
+      expert_error_warmup: generations of a linear search over which the scale of its errors grows linearly to its end.
+      expert_reach: how far the policy of a linear search goes where it errs, in halves of the actions' range, before
+        it is clipped to that. Above 1 a policy that bears errors comes to switch between the ends, beyond
+        which they vanish.
       expert_pupils: agents of each algorithm of the inner loop that train in a bandit fitted to each policy
         which the linear search judges: the expert is then the one whose agents earn most on average. With 0
         it is the one that earns most itself, under its noise and errors.
@@ -128,6 +140,8 @@ class WarmStartConfig(DatasetConfig):
     expert_sigma: float | None = None
     expert_learning_rate: float | None = None
     expert_decay: float = 1.0
+    expert_error_warmup: int = 0
+    expert_reach: float = 1.0
     expert_pupils: int = 0
     expert_episode_steps: int | None = None
     fit_steps: int = 4000
@@ -137,10 +151,17 @@ class WarmStartConfig(DatasetConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         one_of("expert", self.expert, ("auto", *SEARCHES, *ALGORITHMS))
-        at_least(0, self, "expert_pupils", "aggregation_rounds")
-        at_least(1, self, "num_experts", "expert_generations", "expert_episode_steps")
+        at_least(0, self, "expert_pupils", "expert_error_warmup", "aggregation_rounds")
+        at_least(
+            1, self, "num_experts", "expert_generations", "expert_episode_steps", "expert_reach"
+        )
         at_least(1, self, "fit_steps", "aggregation_agents")
         positive(self, "expert_sigma", "expert_learning_rate", "expert_decay")
+        if self.expert_error_warmup > self.expert_generations:
+            raise UserError(
+                f"expert_error_warmup is {self.expert_error_warmup} of {self.expert_generations} generations: the errors "
+                "would not grow to their scale; take no more."
+            )
 
 
 def expert_agent(
@@ -164,6 +185,8 @@ def expert_agent(
         ("expert_sigma", "has its own"),
         ("expert_learning_rate", "has its own"),
         ("expert_decay", "has none"),
+        ("expert_error_warmup", "has no errors"),
+        ("expert_reach", "has none"),
     ):
         value = getattr(config, field)
         if not linear and value != getattr(WarmStartConfig, field):
@@ -202,6 +225,7 @@ def warm_start(
     key: jax.Array,
     config: WarmStartConfig,
     quiet: bool = True,
+    folder: Path | None = None,
 ) -> tuple[Weights, dict[str, float]]:
     """A bandit's weights fitted to an expert of an environment, and how the fit came about.
 
@@ -212,6 +236,7 @@ def warm_start(
       key: decides everything.
       config: how.
       quiet: no progress on the terminal.
+      folder: where a linear search is kept while it goes on, and resumed; None keeps nothing.
 
     Raises:
       UserError: the expert earns less than random actions.
@@ -223,13 +248,13 @@ def warm_start(
     if config.expert_pupils:
         pupils = Learners(bandit, specs, place, config.expert_pupils, PUPILS_EPISODES)
 
-        def worth(policy: Partial, key: jax.Array) -> tuple[float, int]:
+        def worth(expert: Expert, key: jax.Array) -> tuple[float, int]:
             key_data, key_fit, key_agents = split_key(key, 3)
-            dataset, steps = expert_dataset(Expert(policy, 0.0, 0), place, key_data, config)
+            dataset, steps = expert_dataset(expert, place, key_data, config)
             earned, _ = pupils(fit(dataset, key_fit)[0], key_agents)
             return earned, steps + pupils.steps
 
-    expert = find_expert(place, key_expert, config, quiet, worth)
+    expert = find_expert(place, key_expert, config, quiet, worth, folder)
     random = environment_spec(place.name).random_return(place.backend)
     if expert.mean_return < random:
         raise UserError(
@@ -258,7 +283,7 @@ def warm_start(
     return weights, {
         "expert_return": expert.mean_return,
         "environment_steps": expert.environment_steps + steps,
-        "seconds": round(watch.lap(), 1),
+        "seconds": round(expert.earlier_seconds + watch.lap(), 1),
         **report,
     }
 
@@ -269,12 +294,22 @@ def find_expert(
     config: WarmStartConfig,
     quiet: bool = True,
     worth: Worth | None = None,
+    folder: Path | None = None,
 ) -> Expert:
-    """An expert for an environment of the registry; `worth` is what a linear search judges its policies by."""
+    """An expert for an environment of the registry.
+
+    Args:
+      place: the environment.
+      key: decides everything.
+      config: how.
+      quiet: no progress on the terminal.
+      worth: what a linear search judges its policies by.
+      folder: where a linear search is kept while it goes on, and resumed; None keeps nothing.
+    """
     spec = expert_agent(place.name, place.env.action_space(place.params), config)
     if spec is None:
         search = SEARCHES[_chosen(place.name, config)]
         progress_console(quiet).print(f"looking for an expert of {place.name} by {search.what}")
-        return search.find(place, key, config, quiet, worth)
+        return search.find(place, key, config, quiet, worth, folder)
     progress_console(quiet).print(f"training {config.num_experts} experts of {place.name}")
     return train_expert(place.env, place.params, spec, key, config.num_experts)

@@ -120,12 +120,12 @@ def test_a_search_for_an_expert_is_told_what_its_pupils_earn(bandit, place, monk
     """Of two policies the second has the better pupils, whatever it earns itself."""
     monkeypatch.setattr(warm_start, "Learners", Fake)
 
-    def find(place, key, config, quiet, worth):
+    def find(place, key, config, quiet, worth, folder):
         turned = Partial(lambda sign, observation: sign * turning(observation))
-        policies = [Partial(turned, sign) for sign in (-1.0, 1.0)]
-        earned, steps = zip(*(worth(policy, key) for policy in policies), strict=True)
+        experts = [Expert(Partial(turned, sign), 0.0, 0) for sign in (-1.0, 1.0)]
+        earned, steps = zip(*(worth(expert, key) for expert in experts), strict=True)
         assert earned == (-5.0, -3.0) and steps == (256 * 200, 256 * 200)
-        return Expert(policies[int(np.argmax(earned))], -1000.0, sum(steps))
+        return Expert(experts[int(np.argmax(earned))].policy, -1000.0, sum(steps))
 
     monkeypatch.setattr(warm_start, "find_expert", find)
     config = WarmStartConfig(expert="linear", expert_pupils=2, num_states=STATES, num_actions=2)

@@ -9,7 +9,7 @@ import pytest
 
 from scb.environments.registry import make
 from scb.errors import UserError
-from scb.linear_expert import LinearSearchConfig, search_linear_expert
+from scb.linear_expert import LinearSearchConfig, erring, noisy, search_linear_expert
 from scb.measurement import Place
 from scb.warm_start import WarmStartConfig, expert_agent, find_expert
 from tests.scb.probes import TWO_TARGETS, ContinuousCorridor, assert_solves_two_targets
@@ -82,8 +82,8 @@ def test_a_policy_that_bears_errors_is_found_and_chosen_under_noise(monkeypatch)
 def test_what_policies_are_worth_decides_where_that_is_told():
     seen = []
 
-    def worth(policy, key):
-        seen.append(np.asarray(jax.vmap(policy)(jnp.eye(2))))
+    def worth(expert, key):
+        seen.append(np.asarray(jax.vmap(expert.policy)(jnp.eye(2))))
         return [1.0, 3.0, 2.0][len(seen) - 1], 7
 
     config = replace(SEARCH, generations=3, judge_every=1)
@@ -93,6 +93,36 @@ def test_what_policies_are_worth_decides_where_that_is_told():
     assert (seen[1] != seen[2]).any()
     # Three generations of 16 episodes of 2 steps, what the three judgements took, and 20 episodes for its return.
     assert found.environment_steps == 3 * 16 * 2 + 3 * 7 + 20 * 2
+
+
+def test_a_search_that_was_killed_goes_on_from_its_last_judgement(tmp_path):
+    judged = []
+
+    def worth(expert, key):
+        judged.append(np.asarray(jax.vmap(expert.policy)(jnp.eye(2))))
+        if len(judged) == 3 and killed:
+            raise KeyboardInterrupt
+        return [1.0, 3.0, 0.0, 2.0][(len(judged) - 1) % 4], 7
+
+    def find(folder=None):
+        config = replace(SEARCH, generations=8, judge_every=2)
+        env, key = ContinuousCorridor(cells=2), jax.random.key(0)
+        return search_linear_expert(env, TWO_TARGETS, key, config, worth=worth, folder=folder)
+
+    killed = False
+    whole, judgements = find(), judged.copy()
+    judged.clear()
+    killed = True
+    with pytest.raises(KeyboardInterrupt):
+        find(tmp_path)
+    killed = False
+    # The third judgement again, and the fourth: what was found until the second is there.
+    del judged[2]
+    again = find(tmp_path)
+    np.testing.assert_array_equal(judged, judgements)
+    np.testing.assert_array_equal(again.policy(jnp.ones(2)), whole.policy(jnp.ones(2)))
+    assert again.environment_steps == whole.environment_steps
+    assert again.earlier_seconds > 0 == whole.earlier_seconds
 
 
 def test_the_one_action_that_is_best_held_is_found():
@@ -107,8 +137,8 @@ def test_the_one_action_that_is_best_held_is_found():
 def test_a_search_that_decays_comes_to_rest():
     biases = []
 
-    def worth(policy, key):
-        biases.append(float(policy.args[0]["bias"][0]))
+    def worth(expert, key):
+        biases.append(float(expert.policy.args[0]["bias"][0]))
         return 0.0, 0
 
     config = replace(SEARCH, generations=3, judge_every=1, decay=1e-6)
@@ -121,6 +151,71 @@ def test_a_search_that_decays_comes_to_rest():
 
 def test_under_errors_of_its_own_in_each_episode_a_corridor_is_solved():
     assert_solves_two_targets(search(action_errors=0.2))
+
+
+def test_a_policy_that_reaches_beyond_the_ends_bears_errors_there():
+    """Only the end at 2 pays. Errors of 0.8 of half the range are borne where the policy lies that far beyond it."""
+
+    class End(ContinuousCorridor):
+        def step_env(self, key, state, action, params):
+            observation, state, _, _, info = super().step_env(key, state, action, params)
+            return observation, state, jnp.where(action[0] > 1.99, 1.0, 0.0), jnp.bool_(True), info
+
+    env, size = End(cells=1), {"generations": 40, "judge_every": 40, "action_errors": 0.8}
+
+    def borne(reach):
+        earned = []
+
+        def worth(expert, key):
+            policy = noisy_errors(expert.reaching, env)
+            earned.append(np.mean(policy(jax.random.split(key, 200)) > 1.99))
+            return earned[-1], 0
+
+        config = replace(SEARCH, **size, reach=reach)
+        search_linear_expert(env, env.default_params, jax.random.key(0), config, worth=worth)
+        return earned[-1]
+
+    assert borne(1.0) < 0.7 < 0.95 < borne(4.0)
+
+
+def noisy_errors(policy, env):
+    """[N] keys -> [N] what a policy does with the errors of each key, in the corridor's one place."""
+    space = env.action_space(env.default_params)
+
+    def one(key):
+        off = erring(policy, 1, space, 0.8, key)
+        return noisy(off, space, 0.0)(jnp.ones(1), key)[0]
+
+    return jax.vmap(one)
+
+
+def test_what_reaches_further_is_as_steep_where_it_switches():
+    found = search(reach=3.0, generations=5)
+    space = ContinuousCorridor(cells=2).action_space()
+    places = jax.random.normal(jax.random.key(4), (50, 2))
+    far, action = (
+        (np.asarray(jax.vmap(policy)(places))[:, 0] - 0.5) / 1.5
+        for policy in (found.reaching, found.policy)
+    )
+    # far = 3 tanh(u) and action = tanh(3 u), in halves of a range from -1 to 2.
+    np.testing.assert_allclose(action, np.tanh(3 * np.arctanh(far / 3)), atol=1e-4)
+    assert np.abs(far).max() > 1
+    assert (np.asarray(found.policy(places[0])) <= space.high).all()
+
+
+def test_errors_grow_to_their_scale(monkeypatch):
+    scales = []
+    monkeypatch.setattr(
+        "scb.linear_expert.erring",
+        lambda policy, size, space, scale, key: (
+            jax.debug.callback(lambda x: scales.append(float(x)), scale) or policy
+        ),
+    )
+    search(generations=4, action_errors=0.6, error_warmup=3, judge_every=4)
+    jax.effects_barrier()
+    # Two generations under less, two under all of it, and so is the judgement.
+    assert sorted(set(scales)) == pytest.approx([0.2, 0.4, 0.6])
+    assert scales[-1] == pytest.approx(0.6)
 
 
 class Ledge(ContinuousCorridor):
@@ -168,6 +263,8 @@ def test_a_warm_starts_settings_reach_the_search(monkeypatch):
             "expert_sigma": 0.5,
             "expert_learning_rate": 0.4,
             "expert_decay": 0.99,
+            "expert_reach": 2.0,
+            "expert_error_warmup": 9,
         },
     ):
         find_expert(
@@ -177,7 +274,16 @@ def test_a_warm_starts_settings_reach_the_search(monkeypatch):
     assert searched == [
         plain,
         replace(plain, sigma=0.15, learning_rate=0.09, action_noise=0.2),
-        replace(plain, sigma=0.5, learning_rate=0.4, decay=0.99, action_errors=0.3, constant=True),
+        replace(
+            plain,
+            sigma=0.5,
+            learning_rate=0.4,
+            decay=0.99,
+            action_errors=0.3,
+            error_warmup=9,
+            reach=2.0,
+            constant=True,
+        ),
     ]
 
 
@@ -209,6 +315,17 @@ def test_a_warm_starts_settings_reach_the_search(monkeypatch):
             "Pendulum-v1",
             {"expert": "td3", "expert_decay": 0.9},
             "expert_decay is 0.9, and the expert of Pendulum-v1 is found by td3, which has none",
+        ),
+        (
+            "Pendulum-v1",
+            {"expert_generations": 3, "expert_error_warmup": 4},
+            "expert_error_warmup is 4 of 3 generations: the errors would not grow to their scale",
+        ),
+        ("Pendulum-v1", {"expert_reach": 0.5}, "expert_reach is 0.5: it must be at least 1"),
+        (
+            "Pendulum-v1",
+            {"expert": "td3", "expert_reach": 2.0},
+            "expert_reach is 2.0, and the expert of Pendulum-v1 is found by td3, which has none",
         ),
         (
             "CartPole-v1",

@@ -17,7 +17,7 @@ from scb.errors import UserError
 from scb.expert_data import expert_dataset
 from scb.experts import Expert, judged, train_expert
 from scb.fitting import ExpertDataset, energy_distance, fit_bandit, reward_targets
-from scb.linear_expert import erring
+from scb.linear_expert import erring, noisy
 from scb.measurement import Place
 from scb.warm_start import WarmStartConfig, expert_agent, find_expert
 from tests.scb.probes import ContinuousCorridor, Corridor, CorridorParams, context_bandit
@@ -220,13 +220,30 @@ def test_an_episodes_errors_are_a_function_of_where_it_is():
     assert 0.02 < spread < 0.5
 
 
+def test_errors_are_made_where_an_expert_goes_before_the_clip():
+    # Twenty halves of the range beyond its end no error of this size is seen; at the end of the range some are.
+    env = Echo(cells=1)
+    params = env.default_params.replace(max_steps_in_episode=20)
+    config = WarmStartConfig(expert_errors=0.5, num_states=2000)
+    place = Place(env.name, env, params)
+
+    def visited(reaching):
+        expert = Expert(lambda observation: jnp.full(1, 2.0), 0.0, 0, reaching)
+        dataset, _ = expert_dataset(expert, place, jax.random.key(3), config)
+        return np.unique(dataset.observation)
+
+    # A start is 1, and every other state the action that led there.
+    np.testing.assert_array_equal(visited(lambda observation: jnp.full(1, 30.0)), [1.0, 2.0])
+    assert len(visited(None)) > 100
+
+
 def test_errors_grow_with_the_scale_and_stay_the_same_in_a_place():
     space = make("Pendulum-v1")[0].action_space()  # -2 to 2
     places = jax.random.normal(jax.random.key(0), (100, 3))
 
     def errors(scale, key):
-        policy = erring(lambda observation: jnp.zeros(1), 3, space, scale, key)
-        return np.asarray(jax.vmap(policy)(places))
+        off = erring(lambda observation: jnp.zeros(1), 3, space, scale, key)
+        return np.asarray(jax.vmap(noisy(off, space, 0.0), in_axes=(0, None))(places, key))
 
     small, again, large, other = (
         errors(scale, jax.random.key(key))
