@@ -33,6 +33,8 @@ from scb.experts import EPISODES, Expert, judged
 from scb.keys import key_at, named_key, split_key
 from scb.runs import Checkpoints, Stopwatch
 
+START_GENERATIONS = 20  # after which one of several searches goes on
+
 # {"matrix": [O, A], "bias": [A]}; of a constant action the bias alone.
 Linear = dict[str, jax.Array]
 Worth = Callable[[Expert, jax.Array], tuple[float, int]]
@@ -44,6 +46,8 @@ class LinearSearchConfig:
 
     Attributes:
       generations: steps of the search.
+      starts: searches that are begun; the one whose policies earn most in their twentieth generation goes on. How
+        fast a gait is found, and which, is luck.
       directions: perturbations of a generation, each tried both ways for one episode.
       best: of the directions, those that the step is made of.
       sigma: standard deviation of the perturbations.
@@ -70,6 +74,7 @@ class LinearSearchConfig:
     """
 
     generations: int = 200
+    starts: int = 1
     directions: int = 32
     best: int = 8
     sigma: float = 0.03
@@ -193,51 +198,75 @@ def search_linear_expert(
         episodes = jax.vmap(lambda key: rolled(policy, seen, key, config.action_errors, each))(keys)
         return episodes.returns.mean(), episodes.lengths.sum()
 
-    seen = RunningStatistics.start(observations)
-    kept: dict[str, Any] = {
-        "search": search.init(named_key(key, "start"), zero, params),
-        "seen": seen,
-        "steps": jnp.int32(0),
-        "seconds": jnp.float32(0.0),
-        "expert": (zero, seen),
-        "best": jnp.float32(-jnp.inf),
-    }
-    first = 0
+    def generation(kept: dict[str, Any], number: int, judging: bool) -> dict[str, float]:
+        """One more, of what is kept; what it earned, and the seconds that it took."""
+        watch = Stopwatch()
+        begun = named_key(key, "generations")
+        if start := int(kept["start"]):
+            begun = key_at(named_key(key, "other starts"), start)
+        key_ask, key_tell = split_key(key_at(begun, number))
+        population, state, key_roll = ask(kept["search"], key_ask)
+        grown = min(1.0, number / config.error_warmup) if config.error_warmup else 1.0
+        errors = jnp.float32(grown * config.action_errors)
+        episodes = roll(population, kept["seen"], key_roll, errors)
+        state, seen, steps = tell(state, population, episodes, kept["seen"], key_tell)
+        kept |= {"search": state, "seen": seen}
+        metrics = {"fitness/mean": float(episodes.returns.mean()), "failed": 0}
+        if judging:
+            mean = search.get_mean(state)
+            # The same start states for all, so that judgements are compared in pairs.
+            earned, taken = (
+                worth(unjudged(mean, seen), key_judge)
+                if worth
+                else mean_return(mean, seen, key_judge)
+            )
+            steps += taken
+            metrics["mean/fitness"] = float(earned)
+            if earned > kept["best"]:
+                kept |= {"expert": (mean, seen), "best": jnp.float32(earned)}
+        metrics["seconds"] = watch.lap()
+        kept["steps"] += steps
+        kept["seconds"] += metrics["seconds"]
+        return metrics
+
+    def started(start: int) -> dict[str, Any]:
+        seen = RunningStatistics.start(observations)
+        return {
+            "start": jnp.int32(start),
+            "search": search.init(named_key(key, "start"), zero, params),
+            "seen": seen,
+            "steps": jnp.int32(0),
+            "seconds": jnp.float32(0.0),
+            "expert": (zero, seen),
+            "best": jnp.float32(-jnp.inf),
+        }
+
+    key_judge = named_key(key, "judgement")
+    kept, first = started(0), 0
     checkpoints = Checkpoints(folder) if folder and processes.first() else None
     if checkpoints:
         first, kept, _ = checkpoints.restore(kept)
     if folder:
         first, kept = processes.told(first), processes.agreed(kept)
     earlier_seconds = float(kept["seconds"])
-    keys, key_judge = named_key(key, "generations"), named_key(key, "judgement")
+    if not first and config.starts > 1:
+        first = min(START_GENERATIONS, config.generations - 1)
+        begun, fitness = [started(start) for start in range(config.starts)], []
+        for each in begun:
+            latest = 0.0
+            for number in range(1, first + 1):
+                latest = generation(each, number, False)["fitness/mean"]
+            fitness.append(latest)
+            progress_console(quiet).print(f"start {len(fitness)}/{config.starts}: {latest:.4g}")
+        kept = begun[int(np.argmax(np.nan_to_num(fitness, nan=-np.inf)))]
+        kept |= {count: sum(each[count] for each in begun) for count in ("steps", "seconds")}
     with Progress(progress_console(quiet), config.generations, first) as advance:
-        watch = Stopwatch()
         for number in range(first + 1, config.generations + 1):
-            key_ask, key_tell = split_key(key_at(keys, number))
-            population, state, key_roll = ask(kept["search"], key_ask)
-            grown = min(1.0, number / config.error_warmup) if config.error_warmup else 1.0
-            errors = jnp.float32(grown * config.action_errors)
-            episodes = roll(population, kept["seen"], key_roll, errors)
-            state, seen, steps = tell(state, population, episodes, kept["seen"], key_tell)
-            kept |= {"search": state, "seen": seen}
-            metrics = {"fitness/mean": float(episodes.returns.mean()), "failed": 0}
-            if number % config.judge_every == 0 or number == config.generations:
-                mean = search.get_mean(state)
-                # The same start states for all, so that judgements are compared in pairs.
-                earned, taken = (
-                    worth(unjudged(mean, seen), key_judge)
-                    if worth
-                    else mean_return(mean, seen, key_judge)
-                )
-                steps += taken
-                metrics["mean/fitness"] = float(earned)
-                if earned > kept["best"]:
-                    kept |= {"expert": (mean, seen), "best": jnp.float32(earned)}
-            seconds = watch.lap()
-            kept |= {"steps": kept["steps"] + steps, "seconds": kept["seconds"] + seconds}
-            if checkpoints and "mean/fitness" in metrics:
+            judging = number % config.judge_every == 0 or number == config.generations
+            metrics = generation(kept, number, judging)
+            if checkpoints and judging:
                 checkpoints.save(number, kept)
-            advance(metrics, seconds)
+            advance(metrics, metrics["seconds"])
     if checkpoints:
         checkpoints.close()
     found = unjudged(*kept["expert"])
@@ -271,7 +300,7 @@ def erring(
     scale: ArrayLike,
     key: jax.Array,
 ) -> Callable[[jax.Array], jax.Array]:
-    """A policy of flattened observations whose errors are a function of the observation, like an agent's; to be clipped.
+    """A policy of flattened observations whose errors are a function of the observation, like an agent's; not clipped.
 
     They are the outputs of an untrained network of an agent's size, times the scale: on Hopper's states half of that.
 

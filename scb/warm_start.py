@@ -73,6 +73,7 @@ def _linear(
     sigma, learning_rate = (0.15, 0.09) if config.erring else (0.03, 0.02)
     search = LinearSearchConfig(
         config.expert_generations,
+        config.expert_starts,
         sigma=config.expert_sigma or sigma,
         learning_rate=config.expert_learning_rate or learning_rate,
         decay=config.expert_decay,
@@ -114,6 +115,7 @@ class WarmStartConfig(DatasetConfig):
       num_experts: agents trained on the environment; the best of them is the expert.
       expert_steps: environment steps of each; the environment's own setting where None.
       expert_generations: of the evolution or the linear search, where that finds the expert.
+      expert_starts: linear searches that are begun; the one whose policies earn most after twenty generations goes on.
       expert_sigma: standard deviation of a linear search's perturbations; 0.03 where None, and 0.15 under noise or
         errors.
       expert_learning_rate: of a linear search; 0.02 where None, and 0.09 under noise or errors.
@@ -137,6 +139,7 @@ class WarmStartConfig(DatasetConfig):
     num_experts: int = 8
     expert_steps: int | None = None
     expert_generations: int = 80
+    expert_starts: int = 1
     expert_sigma: float | None = None
     expert_learning_rate: float | None = None
     expert_decay: float = 1.0
@@ -159,8 +162,8 @@ class WarmStartConfig(DatasetConfig):
         positive(self, "expert_sigma", "expert_learning_rate", "expert_decay")
         if self.expert_error_warmup > self.expert_generations:
             raise UserError(
-                f"expert_error_warmup is {self.expert_error_warmup} of {self.expert_generations} generations: the errors "
-                "would not grow to their scale; take no more."
+                f"expert_error_warmup is {self.expert_error_warmup} of {self.expert_generations} generations: the "
+                "errors would not grow to their scale; take no more."
             )
 
 
@@ -182,6 +185,7 @@ def expert_agent(
     for field, instead in (
         ("expert_episode_steps", "has whole episodes"),
         ("expert_pupils", "asks no pupils"),
+        ("expert_starts", "has one"),
         ("expert_sigma", "has its own"),
         ("expert_learning_rate", "has its own"),
         ("expert_decay", "has none"),

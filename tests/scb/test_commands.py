@@ -191,7 +191,7 @@ EVERY_FLAG = """--preset=paper --environment=MountainCar-v0 --backend=spring --m
 --select=best --hidden-size=3 --activation=relu --latent=uniform --latent-size=2 --form=linear
 --construction=q --expert=sac --expert-noise=0.2 --expert-errors=0.3 --expert-pupils=2
 --expert-episode-steps=5 --expert-sigma=0.1 --expert-learning-rate=0.2 --expert-decay=0.9 --expert-reach=1.5
---expert-error-warmup=4
+--expert-error-warmup=4 --expert-starts=2
 --near-actions=2 --num-experts=3
 --expert-steps=9 --expert-generations=8 --discount=0.5 --num-states=7 --num-actions=6 --horizon=4 --fit-steps=3
 --aggregation-rounds=2 --aggregation-agents=3

@@ -125,6 +125,30 @@ def test_a_search_that_was_killed_goes_on_from_its_last_judgement(tmp_path):
     assert again.earlier_seconds > 0 == whole.earlier_seconds
 
 
+def test_of_several_starts_the_best_goes_on(capsys, monkeypatch):
+    monkeypatch.setattr("scb.linear_expert.START_GENERATIONS", 2)
+    env, size = ContinuousCorridor(cells=2), {"generations": 3, "judge_every": 3}
+
+    def find(key, starts):
+        config = replace(SEARCH, **size, starts=starts)
+        found = search_linear_expert(env, TWO_TARGETS, jax.random.key(key), config, quiet=False)
+        lines = [x for x in capsys.readouterr().err.splitlines() if x.startswith("start ")]
+        return found, [float(x.split(": ")[1]) for x in lines]
+
+    firsts = []
+    for key in range(4):
+        (one, nothing), (several, earned) = find(key, 1), find(key, 3)
+        assert nothing == [] and len(set(earned)) == 3
+        firsts.append(bool(np.argmax(earned) == 0))
+        # The first start is the search that is alone without others.
+        same = np.array_equal(one.policy(jnp.ones(2)), several.policy(jnp.ones(2)))
+        assert same == firsts[-1]
+        # Three starts of two generations, and the third of one of them, of 16 episodes of 2 steps; a judgement of 20
+        # episodes, and the expert's.
+        assert several.environment_steps == (3 * 2 + 1) * 16 * 2 + (20 + 20) * 2
+    assert set(firsts) == {True, False}
+
+
 def test_the_one_action_that_is_best_held_is_found():
     # Of the ends of [-1, 2], 2 pays 1 - 0.5^2 and 1 - 1^2, and -1 pays 1 - 2.5^2 and 1 - 2^2.
     params = TWO_TARGETS.replace(rewards=jnp.array([[1.0, 1.0, 1.5], [1.0, 1.0, 1.0]]))
@@ -264,6 +288,7 @@ def test_a_warm_starts_settings_reach_the_search(monkeypatch):
             "expert_learning_rate": 0.4,
             "expert_decay": 0.99,
             "expert_reach": 2.0,
+            "expert_starts": 3,
             "expert_error_warmup": 9,
         },
     ):
@@ -281,6 +306,7 @@ def test_a_warm_starts_settings_reach_the_search(monkeypatch):
             decay=0.99,
             action_errors=0.3,
             error_warmup=9,
+            starts=3,
             reach=2.0,
             constant=True,
         ),
