@@ -20,6 +20,7 @@ from evosax.algorithms import ARS
 from gymnax.environments import environment, spaces
 from jax.tree_util import Partial
 from jax.typing import ArrayLike
+from rich.console import Console
 
 from scb import processes
 from scb.agents.agent import AgentConfig, clip_to_space, scale_to_space
@@ -121,128 +122,9 @@ def search_linear_expert(
       folder: to keep the search in, at every judgement, and to go on from; the same folder must not be given to
         another search. None keeps nothing.
     """
-    config = config or LinearSearchConfig()
-    space = env.action_space(env_params)
-    observations = int(np.prod(env.observation_space(env_params).shape))
-    actions = int(np.prod(space.shape))
-    zero = {"bias": jnp.zeros(actions)}
-    if not config.constant:
-        zero["matrix"] = jnp.zeros((observations, actions))
-    search = ARS(
-        2 * config.directions,
-        zero,
-        optimizer=optax.sgd(optax.exponential_decay(config.learning_rate, 1, config.decay)),
-        std_schedule=optax.exponential_decay(config.sigma, 1, config.decay),
-    )
-    search.elite_ratio = config.best / config.directions
-    params = search.default_params
-
-    def outputs(policy: Linear, seen: RunningStatistics, observation: jax.Array) -> jax.Array:
-        if config.constant:
-            return jnp.where(policy["bias"] > 0, jnp.inf, -jnp.inf)
-        return normalize(seen, observation) @ policy["matrix"] + policy["bias"]
-
-    def reaching(policy: Linear, seen: RunningStatistics, observation: jax.Array) -> jax.Array:
-        """What errors are added to; beyond the ends of the range where reach is above 1."""
-        squashed = config.reach * jnp.tanh(outputs(policy, seen, observation))
-        return jnp.reshape(scale_to_space(squashed, space), space.shape)
-
-    def act(policy: Linear, seen: RunningStatistics, observation: jax.Array) -> jax.Array:
-        # As steep where it switches, and a linear bandit's best action can be the same.
-        squashed = jnp.tanh(config.reach * outputs(policy, seen, observation))
-        return clip_to_space(scale_to_space(squashed, space), space)
-
-    def unjudged(policy: Linear, seen: RunningStatistics) -> Expert:
-        return Expert(Partial(act, policy, seen), 0.0, 0, Partial(reaching, policy, seen))
-
-    def rolled(
-        policy: Linear,
-        seen: RunningStatistics,
-        key: jax.Array,
-        errors: ArrayLike,
-        number: int,
-        **more: Any,
-    ) -> Episodes:
-        off: Callable[[jax.Array], jax.Array] = Partial(reaching, policy, seen)
-        if config.action_errors:
-            off = erring(off, observations, space, errors, key)
-        off_each_step = noisy(off, space, config.action_noise)
-        return evaluate(env, env_params, off_each_step, key, number, **more)
-
-    def one(policy: Linear, seen: RunningStatistics, key: jax.Array, errors: ArrayLike) -> Episodes:
-        return rolled(policy, seen, key, errors, 1, horizon=config.episode_steps, moments=True)
-
-    roll = map_population(one, 2 * config.directions, (0, None, 0, None))
-
-    @jax.jit
-    def ask(state: Any, key: jax.Array) -> Any:
-        key_ask, key_roll = split_key(key)
-        population, state = search.ask(key_ask, state, params)
-        # Both ways from the same start state, with the same noise.
-        return population, state, jnp.tile(split_key(key_roll, config.directions), 2)
-
-    @jax.jit
-    def tell(
-        state: Any, population: Any, episodes: Episodes, seen: RunningStatistics, key: jax.Array
-    ) -> Any:
-        fitness = (episodes.returns - bonus * episodes.lengths)[:, 0]
-        state, _ = search.tell(key, population, -fitness, state, params)
-        assert episodes.observations is not None
-        return state, merge_statistics(seen, episodes.observations), episodes.lengths.sum()
-
-    @jax.jit
-    def mean_return(policy: Linear, seen: RunningStatistics, key: jax.Array) -> Any:
-        # Errors are an episode's own.
-        keys = split_key(key, EPISODES) if config.action_errors else key[None]
-        each = EPISODES // len(keys)
-        episodes = jax.vmap(lambda key: rolled(policy, seen, key, config.action_errors, each))(keys)
-        return episodes.returns.mean(), episodes.lengths.sum()
-
-    def generation(kept: dict[str, Any], number: int, judging: bool) -> dict[str, float]:
-        """One more, of what is kept; what it earned, and the seconds that it took."""
-        watch = Stopwatch()
-        begun = named_key(key, "generations")
-        if start := int(kept["start"]):
-            begun = key_at(named_key(key, "other starts"), start)
-        key_ask, key_tell = split_key(key_at(begun, number))
-        population, state, key_roll = ask(kept["search"], key_ask)
-        grown = min(1.0, number / config.error_warmup) if config.error_warmup else 1.0
-        errors = jnp.float32(grown * config.action_errors)
-        episodes = roll(population, kept["seen"], key_roll, errors)
-        state, seen, steps = tell(state, population, episodes, kept["seen"], key_tell)
-        kept |= {"search": state, "seen": seen}
-        metrics = {"fitness/mean": float(episodes.returns.mean()), "failed": 0}
-        if judging:
-            mean = search.get_mean(state)
-            # The same start states for all, so that judgements are compared in pairs.
-            earned, taken = (
-                worth(unjudged(mean, seen), key_judge)
-                if worth
-                else mean_return(mean, seen, key_judge)
-            )
-            steps += taken
-            metrics["mean/fitness"] = float(earned)
-            if earned > kept["best"]:
-                kept |= {"expert": (mean, seen), "best": jnp.float32(earned)}
-        metrics["seconds"] = watch.lap()
-        kept["steps"] += steps
-        kept["seconds"] += metrics["seconds"]
-        return metrics
-
-    def started(start: int) -> dict[str, Any]:
-        seen = RunningStatistics.start(observations)
-        return {
-            "start": jnp.int32(start),
-            "search": search.init(named_key(key, "start"), zero, params),
-            "seen": seen,
-            "steps": jnp.int32(0),
-            "seconds": jnp.float32(0.0),
-            "expert": (zero, seen),
-            "best": jnp.float32(-jnp.inf),
-        }
-
-    key_judge = named_key(key, "judgement")
-    kept, first = started(0), 0
+    config, console = config or LinearSearchConfig(), progress_console(quiet)
+    search = _LinearSearch(env, env_params, key, config, bonus, worth)
+    kept, first = search.begin(), 0
     checkpoints = Checkpoints(folder) if folder and processes.first() else None
     if checkpoints:
         first, kept, _ = checkpoints.restore(kept)
@@ -251,28 +133,184 @@ def search_linear_expert(
     earlier_seconds = float(kept["seconds"])
     if not first and config.starts > 1:
         first = min(START_GENERATIONS, config.generations - 1)
-        begun, fitness = [started(start) for start in range(config.starts)], []
-        for each in begun:
-            latest = 0.0
-            for number in range(1, first + 1):
-                latest = generation(each, number, False)["fitness/mean"]
-            fitness.append(latest)
-            progress_console(quiet).print(f"start {len(fitness)}/{config.starts}: {latest:.4g}")
-        kept = begun[int(np.argmax(np.nan_to_num(fitness, nan=-np.inf)))]
-        kept |= {count: sum(each[count] for each in begun) for count in ("steps", "seconds")}
-    with Progress(progress_console(quiet), config.generations, first) as advance:
+        kept = _best_start(search, config.starts, first, console)
+    with Progress(console, config.generations, first) as advance:
         for number in range(first + 1, config.generations + 1):
             judging = number % config.judge_every == 0 or number == config.generations
-            metrics = generation(kept, number, judging)
+            metrics = search.generation(kept, number, judging)
             if checkpoints and judging:
                 checkpoints.save(number, kept)
             advance(metrics, metrics["seconds"])
     if checkpoints:
         checkpoints.close()
-    found = unjudged(*kept["expert"])
+    found = search.expert(*kept["expert"])
     key_return, steps = named_key(key, "return"), int(kept["steps"])
     judgement = judged(found.policy, env, env_params, key_return, steps)
     return judgement._replace(reaching=found.reaching, earlier_seconds=earlier_seconds)
+
+
+def _best_start(
+    search: "_LinearSearch", starts: int, generations: int, console: Console
+) -> dict[str, Any]:
+    """Of several searches the one whose policies earn most in its last generation, which pays for all."""
+    begun, fitness = [search.begin(start) for start in range(starts)], []
+    for kept in begun:
+        earned = 0.0
+        for number in range(1, generations + 1):
+            earned = search.generation(kept, number, judging=False)["fitness/mean"]
+        fitness.append(earned)
+        console.print(f"start {len(fitness)}/{starts}: {earned:.4g}")
+    costs = {name: sum(kept[name] for kept in begun) for name in ("steps", "seconds")}
+    return begun[int(np.argmax(np.nan_to_num(fitness, nan=-np.inf)))] | costs
+
+
+class _LinearSearch:
+    """The programs of a search, and what of it is kept from one generation to the next."""
+
+    def __init__(
+        self,
+        env: environment.Environment[Any, Any],
+        env_params: Any,
+        key: jax.Array,
+        config: LinearSearchConfig,
+        bonus: float,
+        worth: Worth | None,
+    ) -> None:
+        self._env, self._params, self._key = env, env_params, key
+        self._config, self._bonus, self._worth = config, bonus, worth
+        self._space = env.action_space(env_params)
+        self._size = int(np.prod(env.observation_space(env_params).shape))
+        actions = int(np.prod(self._space.shape))
+        self._zero = {"bias": jnp.zeros(actions)}
+        if not config.constant:
+            self._zero["matrix"] = jnp.zeros((self._size, actions))
+        self._ars = ARS(
+            2 * config.directions,
+            self._zero,
+            optimizer=optax.sgd(optax.exponential_decay(config.learning_rate, 1, config.decay)),
+            std_schedule=optax.exponential_decay(config.sigma, 1, config.decay),
+        )
+        self._ars.elite_ratio = config.best / config.directions
+        self._roll = map_population(self._episode, 2 * config.directions, (0, None, 0, None))
+        self._ask, self._tell = jax.jit(self._asked), jax.jit(self._told)
+        self._mean_return = jax.jit(self._judged)
+
+    def begin(self, start: int = 0) -> dict[str, Any]:
+        """What is kept of a search before its first generation; arrays all."""
+        seen = RunningStatistics.start(self._size)
+        return {
+            "start": jnp.int32(start),
+            "search": self._ars.init(
+                named_key(self._key, "start"), self._zero, self._ars.default_params
+            ),
+            "seen": seen,
+            "steps": jnp.int32(0),
+            "seconds": jnp.float32(0.0),
+            "expert": (self._zero, seen),
+            "best": jnp.float32(-jnp.inf),
+        }
+
+    def generation(self, kept: dict[str, Any], number: int, judging: bool) -> dict[str, float]:
+        """Moves what is kept by one generation; what was earned, without the bonus, and the seconds that it took."""
+        watch, config, key = Stopwatch(), self._config, named_key(self._key, "generations")
+        if start := int(kept["start"]):
+            key = key_at(named_key(self._key, "other starts"), start)
+        key_ask, key_tell = split_key(key_at(key, number))
+        population, state, key_roll = self._ask(kept["search"], key_ask)
+        grown = min(1.0, number / config.error_warmup) if config.error_warmup else 1.0
+        errors = jnp.float32(grown * config.action_errors)
+        episodes = self._roll(population, kept["seen"], key_roll, errors)
+        state, fitness, seen, steps = self._tell(
+            state, population, episodes, kept["seen"], key_tell
+        )
+        kept |= {"search": state, "seen": seen}
+        metrics = {"fitness/mean": float(fitness), "failed": 0}
+        if judging:
+            mean = self._ars.get_mean(state)
+            judge = self._worth or self._mean_return
+            # The same start states for all, so that judgements are compared in pairs.
+            earned, taken = judge(self.expert(mean, seen), named_key(self._key, "judgement"))
+            steps += taken
+            metrics["mean/fitness"] = float(earned)
+            if earned > kept["best"]:
+                kept |= {"expert": (mean, seen), "best": jnp.float32(earned)}
+        metrics["seconds"] = watch.lap()
+        kept |= {"steps": kept["steps"] + steps, "seconds": kept["seconds"] + metrics["seconds"]}
+        return metrics
+
+    def expert(self, policy: Linear, seen: RunningStatistics) -> Expert:
+        """Not judged yet."""
+        return Expert(
+            Partial(self._act, policy, seen), 0.0, 0, Partial(self._reaching, policy, seen)
+        )
+
+    def _outputs(
+        self, policy: Linear, seen: RunningStatistics, observation: jax.Array
+    ) -> jax.Array:
+        if self._config.constant:
+            return jnp.where(policy["bias"] > 0, jnp.inf, -jnp.inf)
+        return normalize(seen, observation) @ policy["matrix"] + policy["bias"]
+
+    def _reaching(
+        self, policy: Linear, seen: RunningStatistics, observation: jax.Array
+    ) -> jax.Array:
+        """What errors are added to; beyond the ends of the range where reach is above 1."""
+        squashed = self._config.reach * jnp.tanh(self._outputs(policy, seen, observation))
+        return jnp.reshape(scale_to_space(squashed, self._space), self._space.shape)
+
+    def _act(self, policy: Linear, seen: RunningStatistics, observation: jax.Array) -> jax.Array:
+        # As steep where it switches, and a linear bandit's best action can be the same.
+        squashed = jnp.tanh(self._config.reach * self._outputs(policy, seen, observation))
+        return clip_to_space(scale_to_space(squashed, self._space), self._space)
+
+    def _rolled(
+        self,
+        reaching: Callable[[jax.Array], jax.Array],
+        key: jax.Array,
+        errors: ArrayLike,
+        number: int,
+        **more: Any,
+    ) -> Episodes:
+        if self._config.action_errors:
+            reaching = erring(reaching, self._size, self._space, errors, key)
+        act = noisy(reaching, self._space, self._config.action_noise)
+        return evaluate(self._env, self._params, act, key, number, **more)
+
+    def _episode(
+        self, policy: Linear, seen: RunningStatistics, key: jax.Array, errors: ArrayLike
+    ) -> Episodes:
+        reaching, horizon = Partial(self._reaching, policy, seen), self._config.episode_steps
+        return self._rolled(reaching, key, errors, 1, horizon=horizon, moments=True)
+
+    def _asked(self, state: Any, key: jax.Array) -> Any:
+        key_ask, key_roll = split_key(key)
+        population, state = self._ars.ask(key_ask, state, self._ars.default_params)
+        # Both ways from the same start state, with the same noise.
+        return population, state, jnp.tile(split_key(key_roll, self._config.directions), 2)
+
+    def _told(
+        self,
+        state: Any,
+        population: Any,
+        episodes: Episodes,
+        seen: RunningStatistics,
+        key: jax.Array,
+    ) -> Any:
+        fitness = (episodes.returns - self._bonus * episodes.lengths)[:, 0]
+        state, _ = self._ars.tell(key, population, -fitness, state, self._ars.default_params)
+        assert episodes.observations is not None
+        seen = merge_statistics(seen, episodes.observations)
+        return state, fitness.mean(), seen, episodes.lengths.sum()
+
+    def _judged(self, expert: Expert, key: jax.Array) -> Any:
+        """What it earns under the noise and all of the errors, and the environment steps that took."""
+        assert expert.reaching is not None
+        reaching, errors = expert.reaching, self._config.action_errors
+        # Errors are an episode's own.
+        keys = split_key(key, EPISODES) if errors else key[None]
+        each = EPISODES // len(keys)
+        episodes = jax.vmap(lambda key: self._rolled(reaching, key, errors, each))(keys)
+        return episodes.returns.mean(), episodes.lengths.sum()
 
 
 def noisy(policy: Callable[[jax.Array], jax.Array], space: spaces.Box, noise: float) -> Policy:
