@@ -120,7 +120,9 @@ def summary(report: Report) -> list[dict[str, Any]]:
             "against": {},
         }
         for evaluation, returns in entry["returns"].items():
-            row["searches"] = 0 if name in REFERENCES else len(returns)
+            # The evaluations that came later have not all of the searches.
+            searches = 0 if name in REFERENCES else len(returns)
+            row["searches"] = max(row.get("searches", 0), searches)
             row["in"][evaluation] = pooled_estimate(list(returns.values()))
             if (estimate := found[name, evaluation].estimate) is not None:
                 row["against"][evaluation] = (estimate, found[name, evaluation].outcome)
