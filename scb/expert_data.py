@@ -122,9 +122,7 @@ def _trajectories(place: Place, config: DatasetConfig) -> Callable[[Partial, jax
         if config.erring:
             assert not isinstance(space, spaces.Discrete)
             off = erring(policy, size, space, config.expert_errors, key)
-            off_each_step = noisy(
-                off if config.expert_errors else policy, space, config.expert_noise
-            )
+            off_each_step = noisy(off, space, config.expert_noise)
 
         def act(observation: jax.Array, keys: jax.Array) -> jax.Array:
             if config.erring:

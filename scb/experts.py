@@ -37,7 +37,7 @@ class Expert(NamedTuple):
       mean_return: over 20 episodes in the environment.
       environment_steps: taken to find it, evaluation included; an upper bound where episodes end
         early.
-      reaching: what errors are added to, where that goes beyond the bounds; of shape [...] as the actions'.
+      reaching: [O] observation -> action before it is clipped, where errors are added; None where the policy is it.
       earlier_seconds: of a search that went on from what was kept of it, those until then.
     """
 

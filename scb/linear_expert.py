@@ -90,9 +90,8 @@ class LinearSearchConfig:
     constant: bool = False
 
     def __post_init__(self) -> None:
-        at_least(
-            1, self, "generations", "directions", "best", "episode_steps", "judge_every", "reach"
-        )
+        at_least(1, self, "generations", "starts", "directions", "best", "episode_steps")
+        at_least(1, self, "judge_every", "reach")
         at_least(0, self, "action_noise", "action_errors", "error_warmup")
         positive(self, "sigma", "learning_rate", "decay")
         if self.best > self.directions:
@@ -271,7 +270,7 @@ class _LinearSearch:
         number: int,
         **more: Any,
     ) -> Episodes:
-        if self._config.action_errors:
+        if self._config.action_errors:  # the scale itself is traced
             reaching = erring(reaching, self._size, self._space, errors, key)
         act = noisy(reaching, self._space, self._config.action_noise)
         return evaluate(self._env, self._params, act, key, number, **more)
@@ -347,6 +346,8 @@ def erring(
       scale: as a share of half the actions' range.
       key: decides the network.
     """
+    if isinstance(scale, float | int) and scale == 0:
+        return policy
     network = MLP(AgentConfig.hidden_sizes, math.prod(space.shape), AgentConfig.activation)
     variables = network.init(named_key(key, "errors"), jnp.zeros(size))
     half = scale * (space.high - space.low) / 2

@@ -155,10 +155,8 @@ class WarmStartConfig(DatasetConfig):
         super().__post_init__()
         one_of("expert", self.expert, ("auto", *SEARCHES, *ALGORITHMS))
         at_least(0, self, "expert_pupils", "expert_error_warmup", "aggregation_rounds")
-        at_least(
-            1, self, "num_experts", "expert_generations", "expert_episode_steps", "expert_reach"
-        )
-        at_least(1, self, "fit_steps", "aggregation_agents")
+        at_least(1, self, "num_experts", "expert_generations", "expert_starts")
+        at_least(1, self, "expert_episode_steps", "expert_reach", "fit_steps", "aggregation_agents")
         positive(self, "expert_sigma", "expert_learning_rate", "expert_decay")
         if self.expert_error_warmup > self.expert_generations:
             raise UserError(

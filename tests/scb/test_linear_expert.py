@@ -347,6 +347,12 @@ def test_a_warm_starts_settings_reach_the_search(monkeypatch):
             {"expert_generations": 3, "expert_error_warmup": 4},
             "expert_error_warmup is 4 of 3 generations: the errors would not grow to their scale",
         ),
+        ("Pendulum-v1", {"expert_starts": 0}, "expert_starts is 0: it must be at least 1"),
+        (
+            "Pendulum-v1",
+            {"expert": "td3", "expert_starts": 2},
+            "expert_starts is 2, and the expert of Pendulum-v1 is found by td3, which has one",
+        ),
         ("Pendulum-v1", {"expert_reach": 0.5}, "expert_reach is 0.5: it must be at least 1"),
         (
             "Pendulum-v1",
