@@ -77,15 +77,19 @@ class Judgement:
 
     Attributes:
       judge_agents: agents of each fitting algorithm that judge the result; 0 leaves that out.
-      judge_episodes: episodes of each of them.
+      judge_episodes: episodes of each of them; None takes 50, and of Brax, whose physics are slow, 5.
     """
 
     judge_agents: int = 20
-    judge_episodes: int = 50
+    judge_episodes: int | None = None
 
     def __post_init__(self) -> None:
         at_least(0, self, "judge_agents")
         at_least(1, self, "judge_episodes")
+
+    def episodes_in(self, environment: str) -> int:
+        """Episodes of each agent in an environment, by name."""
+        return self.judge_episodes or (5 if environment_spec(environment).backends else 50)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -132,7 +136,7 @@ class Discover(LongRun):
                 problem.place,
                 not config.fixed_hyperparameters,
                 self.judgement.judge_agents,
-                self.judgement.judge_episodes,
+                self.judgement.episodes_in(config.environment),
             )
             told = scale(config.environment, config.backend, problem.start_reports)
             console().print(told, soft_wrap=True)

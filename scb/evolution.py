@@ -291,18 +291,10 @@ def evolve(
     checkpoints = Checkpoints(run.folder) if run and processes.first() else None
     first = saved = 0
     if run and run.resumed:
-        damaged: list[int] = []
         if checkpoints:
-            first, state, damaged = checkpoints.restore(state)
-        first, state = processes.told(first), processes.agreed(state)
-        if not first:
-            console.print("no checkpoint could be read: starting again at generation 0.")
-        for step in damaged if first else ():
-            console.print(
-                f"checkpoint {step} is damaged: resuming from checkpoint {first} before it."
-            )
-        if checkpoints:
+            first, state = checkpoints.goes_on(state, console)
             run.rewind(first)
+        first, state = processes.told(first), processes.agreed(state)
         saved = first
     # What is complete at any moment: steps into the next generation are not part of it.
     latest = first, dict(state)

@@ -126,7 +126,7 @@ def search_linear_expert(
     kept, first = search.begin(), 0
     checkpoints = Checkpoints(folder) if folder and processes.first() else None
     if checkpoints:
-        first, kept, _ = checkpoints.restore(kept)
+        first, kept = checkpoints.goes_on(kept, console)
     if folder:
         first, kept = processes.told(first), processes.agreed(kept)
     earlier_seconds = float(kept["seconds"])

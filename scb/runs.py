@@ -28,6 +28,7 @@ except ImportError:  # Windows has none, and there nobody is kept out of a run
 import jax
 import numpy as np
 import orbax.checkpoint as ocp
+from rich.console import Console
 from tensorboardX.event_file_writer import EventsWriter
 from tensorboardX.proto.event_pb2 import Event, SessionLog
 from tensorboardX.summary import scalar
@@ -261,6 +262,17 @@ class Checkpoints:
             step, state = 0, template
         self._discard(damaged)
         return step, state, damaged
+
+    def goes_on(self, template: Any, console: Console) -> tuple[int, Any]:
+        """(step, state) that a search goes on from, as `restore` has it, and in words what was passed over."""
+        step, state, damaged = self.restore(template)
+        if damaged and not step:
+            console.print("no checkpoint could be read: starting again at generation 0.")
+        for number in damaged if step else ():
+            console.print(
+                f"checkpoint {number} is damaged: resuming from checkpoint {step} before it."
+            )
+        return step, state
 
     def _discard(self, steps: list[int]) -> None:
         # Orbax refuses to save a step that exists, so a damaged one must make room for its

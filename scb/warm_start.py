@@ -46,8 +46,7 @@ def _evolved(
     key: jax.Array,
     config: "WarmStartConfig",
     quiet: bool,
-    _worth: Worth | None,
-    _folder: Path | None,
+    **_: Any,
 ) -> Expert:
     search, generations = PolicySearchConfig(), config.expert_generations
     search = replace(
@@ -63,6 +62,7 @@ def _linear(
     key: jax.Array,
     config: "WarmStartConfig",
     quiet: bool,
+    *,
     worth: Worth | None,
     folder: Path | None,
     constant: bool = False,
@@ -91,7 +91,7 @@ class _Search(NamedTuple):
     """What finds experts that are no agents: in words, how, and what it needs and knows."""
 
     what: str
-    find: Callable[[Place, jax.Array, "WarmStartConfig", bool, Worth | None, Path | None], Expert]
+    find: Callable[..., Expert]  # (place, key, config, quiet; worth, folder)
     linear: bool = False  # for continuous actions; cuts episodes and asks pupils where told to
 
 
@@ -162,6 +162,11 @@ class WarmStartConfig(DatasetConfig):
             raise UserError(
                 f"expert_error_warmup is {self.expert_error_warmup} of {self.expert_generations} generations: the "
                 "errors would not grow to their scale; take no more."
+            )
+        if self.expert_error_warmup and not self.expert_errors:
+            raise UserError(
+                f"expert_error_warmup is {self.expert_error_warmup}, and there are no errors that could grow: give "
+                "expert_errors, or leave it out."
             )
 
 
@@ -312,6 +317,6 @@ def find_expert(
     if spec is None:
         search = SEARCHES[_chosen(place.name, config)]
         progress_console(quiet).print(f"looking for an expert of {place.name} by {search.what}")
-        return search.find(place, key, config, quiet, worth, folder)
+        return search.find(place, key, config, quiet, worth=worth, folder=folder)
     progress_console(quiet).print(f"training {config.num_experts} experts of {place.name}")
     return train_expert(place.env, place.params, spec, key, config.num_experts)

@@ -150,6 +150,11 @@ def test_a_resumed_discovery_judges_as_it_was_told_to_at_first(tmp_path):
     again.open().close()
 
 
+def test_a_slow_simulator_is_judged_by_fewer_episodes():
+    assert [Judgement().episodes_in(x) for x in ("CartPole-v1", "hopper")] == [50, 5]
+    assert Judgement(judge_episodes=7).episodes_in("hopper") == 7
+
+
 def test_a_flag_that_contradicts_the_resumed_run_is_refused(discovered):
     folder, _ = discovered
     result = call("discover", "--resume", folder, "--seed", 8)

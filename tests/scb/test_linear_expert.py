@@ -125,6 +125,23 @@ def test_a_search_that_was_killed_goes_on_from_its_last_judgement(tmp_path):
     assert again.earlier_seconds > 0 == whole.earlier_seconds
 
 
+def test_a_search_tells_that_its_last_judgement_is_damaged(tmp_path, capsys):
+    def find():
+        config = replace(SEARCH, generations=4, judge_every=2)
+        env, key = ContinuousCorridor(cells=2), jax.random.key(0)
+        return search_linear_expert(env, TWO_TARGETS, key, config, quiet=False, folder=tmp_path)
+
+    whole = find()
+    assert "checkpoint" not in capsys.readouterr().err
+    for path in [x for x in (tmp_path / "checkpoints" / "4").rglob("*") if x.is_file()]:
+        path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    again = find()
+    assert (
+        "checkpoint 4 is damaged: resuming from checkpoint 2 before it." in capsys.readouterr().err
+    )
+    np.testing.assert_array_equal(again.policy(jnp.ones(2)), whole.policy(jnp.ones(2)))
+
+
 def test_of_several_starts_the_best_goes_on(capsys, monkeypatch):
     monkeypatch.setattr("scb.linear_expert.START_GENERATIONS", 2)
     env, size = ContinuousCorridor(cells=2), {"generations": 3, "judge_every": 3}
@@ -346,6 +363,11 @@ def test_a_warm_starts_settings_reach_the_search(monkeypatch):
             "Pendulum-v1",
             {"expert_generations": 3, "expert_error_warmup": 4},
             "expert_error_warmup is 4 of 3 generations: the errors would not grow to their scale",
+        ),
+        (
+            "Pendulum-v1",
+            {"expert": "linear", "expert_error_warmup": 4},
+            "expert_error_warmup is 4, and there are no errors that could grow",
         ),
         ("Pendulum-v1", {"expert_starts": 0}, "expert_starts is 0: it must be at least 1"),
         (
