@@ -142,12 +142,21 @@ def facts(report: Report) -> dict[str, Any]:
             and row["searches"] != 1
         ]
 
+    # Of one environment each, with either initialisation of the policy.
+    single = [e["name"] for e in report["evaluations"] if not Evaluation(**e).normalized]
+
+    def behind(row: dict[str, Any], places: Sequence[str]) -> bool:
+        return row["searches"] > 1 and all(
+            place in row["against"] and row["against"][place][1] == FAILS for place in places
+        )
+
     number = sum(x.low is not None for row in rows for x, _ in row["against"].values())
     return {
         "rows": rows,
         "better": those(HOLDS),
         "worse": those(FAILS),
         "undecided": those(UNDECIDED),
+        "behind": [row["name"] for row in rows if behind(row, single)],
         "once": [row["name"] for row in rows if row["searches"] == 1],
         "number": number,
         "places": {

@@ -71,7 +71,13 @@ def test_one_search_decides_nothing_and_several_do(report):
     assert "no gate" in found["once"] and not any("no gate" in x for x in found["worse"])
     for returns in entries["no gate"]["returns"].values():
         returns["1"] = [-9000.0] * 4
-    assert any(x.startswith("no gate (Pendulum") for x in module.facts(report)["worse"])
+    found = module.facts(report)
+    assert any(x.startswith("no gate (Pendulum") for x in found["worse"])
+    # One search of the noise in common with the default is none that decides.
+    assert found["behind"] == ["no gate"]
+    assert "initialisation, by the whole interval of several searches: no gate.**" in (
+        module.EXPERIMENT.page(report)
+    )
 
 
 def test_what_an_earlier_search_found_is_measured_again(tmp_path, monkeypatch, report):
