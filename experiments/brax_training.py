@@ -222,7 +222,7 @@ def claims(report: Report) -> list[Claim]:
         standing = environment_spec(row["environment"]).standing_still(row["backend"])
         if standing is not None:
             text = f"{name}: agents from the bandit earn more than standing still"
-            found.append(Claim(text, partial(estimate, row["finals"]), standing, places=0))
+            found.append(Claim(text, partial(estimate, row["finals"]), round(standing), places=0))
     return found
 
 
@@ -245,7 +245,24 @@ def facts(report: Report) -> dict[str, Any]:
             )
     for of_all in (report["bandits"], report["environments"]):
         lost += sum(x.get("failed", 0) for by in of_all.values() for x in by.values())
-    return {"finals": rows, "matches": matches(report), "lost": lost}
+    found = matches(report)
+    for row in found:
+        row["times"], row["times_low"] = (_times(row, row[x]) for x in ("steps", "steps_low"))
+    ordered = sorted(found, key=lambda row: (row["steps"] or row["trained"]) / row["bandit_steps"])
+    return {
+        "finals": rows,
+        "matches": found,
+        "fewest": ordered[0]["times"],
+        "most": ordered[-1]["times"],
+        "short": [f"{x['bandit']}, {x['algorithm'].upper()}" for x in found if x["steps"] is None],
+        "lost": lost,
+    }
+
+
+def _times(row: Mapping[str, Any], steps: float | None) -> str:
+    """The environment's steps as a multiple of the bandit's; where they were not enough, of those that were trained."""
+    times = f"{(steps or row['trained']) / row['bandit_steps']:.0f}"
+    return times if steps else f"more than {times}"
 
 
 def draw(report: Mapping[str, Any]) -> Figure:

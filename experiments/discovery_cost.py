@@ -1,11 +1,11 @@
-"""What discovering a bandit costs from a warm start and from random weights, and what it reaches.
+"""What discovering a bandit costs: those that ship, and searches from a warm start and from random weights.
 
     python -m experiments.discovery_cost runs/warm-1 runs/random-1 ...
 
 Reads run folders of `scb discover`, finished or not. How good the search is at a generation is the
 mean return of the agents that judge its distribution's mean; it is drawn against minutes and against
 environment steps, and tabled with what it took to reach the environment's target. Nothing is
-computed anew. `--only-render` makes table and figure from the JSON.
+computed anew. `--only-render` makes tables and figure from the JSON and from what the zoo says of itself.
 """
 
 import json
@@ -23,8 +23,9 @@ from experiments.harness import Experiment, Save
 from experiments.rendering import plain
 from experiments.searches import judgements, read_log
 from experiments.zoo_table_page import TARGETS, label, rank
-from scb import plotting
+from scb import listing, plotting
 from scb.environments.registry import environment_spec
+from scb.environments.zoo import bandit_metadata, zoo_names
 from scb.errors import UserError
 from scb.runs import read_config
 
@@ -172,8 +173,25 @@ def facts(report: Mapping[str, Any]) -> dict[str, Any]:
     return {
         "machines": list(map(json.loads, sorted(machines))),
         "differing": differing,
+        "shipped": shipped(),
         "end": _end,
     }
+
+
+def shipped() -> list[dict[str, Any]]:
+    """A row a bandit of the zoo: what its expert earns, steps, minutes, cores, and whether minutes lack the expert's."""
+    rows = []
+    for name in sorted(zoo_names(), key=lambda x: rank(environment_spec(x).evaluation_environment)):
+        cost = bandit_metadata(name)["cost"]
+        rows.append(
+            {
+                **listing.entry(name),
+                "expert": cost["warm_start"]["expert_return"],
+                "cores": cost["machine"]["cores"],
+                "in_part": "seconds" not in cost["warm_start"],
+            }
+        )
+    return rows
 
 
 def _setting(value: Any) -> str:

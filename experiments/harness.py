@@ -29,7 +29,7 @@ from scb import plotting
 from scb.artefacts import machine_description, package_versions
 from scb.environments.registry import environment_spec, families
 from scb.environments.synthetic import SyntheticBandit
-from scb.environments.zoo import bandit_metadata, open_bandit
+from scb.environments.zoo import bandit_metadata, open_bandit, zoo_names
 from scb.errors import UserError
 from scb.files import make_folder, write_json
 
@@ -215,6 +215,7 @@ class Experiment:
                     f"{out} was measured when the preset {preset} was another one: choose another --out."
                 )
             fixed = {"preset": preset, "plan": plan, "complete": False}
+            forget_replaced(report)
         before, start = report.get("seconds", 0.0), time.monotonic()
         # What measures nothing leaves the report to the machine that made it.
         here = {"versions": package_versions(), "machine": machine_description()}
@@ -301,6 +302,31 @@ def bandit_of(environment: str) -> tuple[SyntheticBandit, str]:
     """The zoo's bandit of an environment, and the checksum of its weights."""
     name = environment_spec(environment).bandit
     return open_bandit(name), bandit_metadata(name)["sha256"]
+
+
+def forget_replaced(report: dict[str, Any]) -> None:
+    """Takes out of a report what is of bandits that the zoo has replaced since, so that it is measured again.
+
+    An entry's "sha256" says which bandit it is of; ", published" ends the names of entries of other people's.
+    """
+    ours = {bandit_metadata(name)["sha256"] for name in zoo_names()}
+
+    def replaced(entry: Any) -> bool:
+        digest = entry.get("sha256") if isinstance(entry, dict) else None
+        return isinstance(digest, str) and digest not in ours
+
+    def forget(tree: dict[str, Any]) -> None:
+        for name, entry in list(tree.items()):
+            if name.endswith(", published"):
+                continue
+            if replaced(entry):
+                del tree[name]
+            elif isinstance(entry, dict):
+                forget(entry)
+
+    if replaced(report):
+        report.clear()
+    forget(report)
 
 
 def packed(rows: Any) -> list[str]:

@@ -57,7 +57,7 @@ def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None
 def _show(name: str, plan: Mapping[str, Any]) -> dict[str, Any]:
     place = environment_spec(name)
     env, env_params = place.make()
-    bandit, _ = bandit_of(name)
+    bandit, digest = bandit_of(name)
     spec = bandit_agent("ppo", name, sampled=False)
     agent = spec.agent(bandit)
     key_agents, key_show = split_key(root_key(plan["seed"]))
@@ -73,7 +73,7 @@ def _show(name: str, plan: Mapping[str, Any]) -> dict[str, Any]:
     def policy(observation: Any, key: Any) -> Any:
         return agent.act(state, observation, key, bandit.default_params, mode=True)
 
-    entry: dict[str, Any] = {"agents": estimate(returns).as_dict()}
+    entry: dict[str, Any] = {"sha256": digest, "agents": estimate(returns).as_dict()}
     if name == HOPPER:
         _, shown = animation.save_brax_html(VIEWER, env, policy, key_show, plan["brax_steps"])
         return {**entry, "shown": round(shown, 1), "steps": plan["brax_steps"]}

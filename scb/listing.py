@@ -11,6 +11,9 @@ from scb.console import console
 from scb.environments.registry import environment_spec
 from scb.environments.zoo import bandit_metadata, zoo_names
 
+# What a search's cost calls its steps of the environment; a warm start's are all of them.
+_IN_ENVIRONMENT = ("environment_steps_evaluation", "environment_steps_judgements")
+
 
 def list_command(json: bool = False) -> None:
     """List the bandits that ship with the library: what they are worth, how they were found, and what that cost.
@@ -32,7 +35,7 @@ def list_command(json: bool = False) -> None:
                 bandit["name"],
                 *(_cell(bandit["results"].get(name)) for name in algorithms),
                 bandit["found"],
-                f"{bandit['minutes']:.0f}",
+                f"{bandit['minutes']:.1g}" if bandit["minutes"] < 1 else f"{bandit['minutes']:.0f}",
             )
             for bandit in bandits
         ],
@@ -42,12 +45,14 @@ def list_command(json: bool = False) -> None:
 def entry(name: str) -> dict[str, Any]:
     """What `scb list --json` says of a bandit."""
     metadata = bandit_metadata(name)
-    seconds = _seconds(metadata["cost"], metadata["config"].get("started_from"))
+    cost, earlier = metadata["cost"], metadata["config"].get("started_from")
     return {
         "name": name,
         "environment": environment_spec(name).evaluation_environment,
         "found": found(metadata),
-        "minutes": round(seconds / 60, 2),
+        "minutes": round(_total(cost, earlier, "seconds") / 60, 2),
+        "environment_steps": int(_total(cost, earlier, "environment_steps", *_IN_ENVIRONMENT)),
+        "bandit_steps": int(_total(cost, earlier, "environment_steps_training")),
         "results": metadata["results"],
         "command": metadata["command"],
     }
@@ -81,11 +86,11 @@ def found(metadata: Mapping[str, Any]) -> str:
     return f"{start}, evolved" if evolved else start
 
 
-def _seconds(cost: Mapping[str, Any], started_from: Mapping[str, Any] | None) -> float:
+def _total(cost: Mapping[str, Any], earlier: Mapping[str, Any] | None, *names: str) -> float:
     """Of a search, the warm start and refinement before it, and the searches that it goes on from."""
-    before = _seconds(started_from["cost"], started_from["started_from"]) if started_from else 0.0
-    start = sum(cost.get(x, {}).get("seconds", 0.0) for x in ("warm_start", "refinement"))
-    return float(cost["seconds"] + start + before)
+    before = _total(earlier["cost"], earlier["started_from"], *names) if earlier else 0.0
+    stages = (cost, cost.get("warm_start", {}), cost.get("refinement", {}))
+    return before + sum(stage.get(name, 0.0) for stage in stages for name in names)
 
 
 def _cell(result: Mapping[str, Any] | None) -> str:

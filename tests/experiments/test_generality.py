@@ -18,6 +18,7 @@ from experiments.generality import (
     ZOO,
 )
 from experiments.harness import CLASSIC_CONTROL
+from scb.environments.zoo import bandit_metadata
 from scb.neuroevolution import NeuroevolutionConfig
 
 TINY = {
@@ -100,6 +101,29 @@ def test_neuroevolution_takes_as_many_steps_of_an_environment_as_of_a_bandit():
 def test_every_algorithm_meets_every_network():
     agents = generality.agents_of("Pendulum-v1")
     assert len(agents) == 4 * 3 + 2 and f"td3, {SWISH}" in agents
+
+
+def test_a_replaced_bandit_is_measured_again_and_nothing_else(monkeypatch):
+    measured = []
+    monkeypatch.setattr(generality, "_source", lambda place, source, plan: (source, None))
+    monkeypatch.setattr(
+        generality, "_returns", lambda agent, source, *_: measured.append((agent, source)) or [9.0]
+    )
+    agents = ["ppo", EVOLVED, OPTIMAL]
+    monkeypatch.setattr(generality, "agents_of", lambda name: agents)
+    of_drawn = f"CartPole-v1, {DRAWN}, ppo"
+    found = report() | {
+        "sha256": {"CartPole-v1": "replaced"},
+        "failed": {f"CartPole-v1, {ZOO}, ppo": 1, of_drawn: 1},
+    }
+    before = copy.deepcopy(found["environments"]["CartPole-v1"])
+    plan = found["plan"] | {"environments": ["CartPole-v1"]}
+    generality.measure(plan, found, lambda: None)
+    assert measured == [(agent, ZOO) for agent in agents]
+    assert found["environments"]["CartPole-v1"] == before | {ZOO: dict.fromkeys(agents, [9.0])}
+    assert found["failed"] == {of_drawn: 1}
+    ours = bandit_metadata("Synthetic-CartPole-v1")["sha256"]
+    assert found["sha256"] == {"CartPole-v1": ours}
 
 
 @pytest.mark.slow

@@ -11,6 +11,7 @@ from experiments import harness, rendering
 from experiments.claims import Claim
 from experiments.harness import Experiment
 from experiments.rendering import text
+from scb.environments.zoo import bandit_metadata
 from scb.statistics import Estimate
 
 PAGE = """{% extends "page.md.j2" %}
@@ -84,6 +85,30 @@ def test_a_report_stays_with_the_machine_that_measured_it(tmp_path):
     out.write_text(json.dumps(elsewhere))
     assert counting().main(flags) == 0
     assert json.loads(out.read_text())["machine"] == here["machine"]
+
+
+def test_what_is_of_a_bandit_that_was_replaced_is_measured_again():
+    ours = bandit_metadata("Synthetic-CartPole-v1")["sha256"]
+    kept = {"a": {"sha256": ours, "x": 1}, "b, published": {"sha256": "other"}, "c": {"x": 1}}
+    report = {"of": {"d": {"sha256": "replaced"}, **kept}, "digests": {"sha256": {"a": ours}}}
+    harness.forget_replaced(report)
+    assert report == {"of": kept, "digests": {"sha256": {"a": ours}}}
+    # A report of a single bandit.
+    report["sha256"] = "replaced"
+    harness.forget_replaced(report)
+    assert report == {}
+
+
+def test_an_experiment_forgets_what_is_of_a_replaced_bandit_before_it_measures(tmp_path):
+    out = tmp_path / "c.json"
+    flags = ["--out", str(out), "--docs", str(tmp_path)]
+    assert counting().main(flags) == 0
+    report = json.loads(out.read_text())
+    report["parts"]["a"] = {"sha256": "replaced"}
+    out.write_text(json.dumps(report))
+    assert counting().main(flags) == 0
+    report = json.loads(out.read_text())
+    assert report["parts"] == {"a": 1, "b": 1} and report["measured"] == 3
 
 
 def test_another_preset_does_not_continue_a_report(tmp_path, capsys):
