@@ -120,7 +120,7 @@ def test_a_replaced_bandit_is_measured_again_and_nothing_else(monkeypatch):
     plan = found["plan"] | {"environments": ["CartPole-v1"]}
     generality.measure(plan, found, lambda: None)
     assert measured == [(agent, ZOO) for agent in agents]
-    assert found["environments"]["CartPole-v1"] == before | {ZOO: dict.fromkeys(agents, [9.0])}
+    assert found["environments"]["CartPole-v1"] == before | {ZOO: {x: [9.0] for x in agents}}
     assert found["failed"] == {of_drawn: 1}
     ours = bandit_metadata("Synthetic-CartPole-v1")["sha256"]
     assert found["sha256"] == {"CartPole-v1": ours}
