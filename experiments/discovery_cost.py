@@ -179,7 +179,7 @@ def facts(report: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def shipped() -> list[dict[str, Any]]:
-    """A row a bandit of the zoo: what its expert earns, steps, minutes, cores, and whether minutes lack the expert's."""
+    """A row a bandit of the zoo: its expert's return, steps, minutes, cores, and whether those lack the expert's."""
     rows = []
     for name in sorted(zoo_names(), key=lambda x: rank(environment_spec(x).evaluation_environment)):
         cost = bandit_metadata(name)["cost"]

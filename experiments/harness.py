@@ -79,6 +79,7 @@ class Experiment:
       claim: what the paper says, in a sentence.
       claims: report -> the parts of that.
       presets: {"quick": {...}, "paper": {...}}; what they hold is the experiment's own.
+      grows: lists or tables of a preset that may get longer: what is new is measured for a report, the rest kept.
       minutes: {preset: roughly how long it takes on two cores}.
       needs: what it needs beyond the library or keeps beside its report, in words; empty for nothing.
       facts: report -> what its template shows beside the report itself.
@@ -98,6 +99,7 @@ class Experiment:
     claim: str = ""
     claims: Claims = lambda report: ()
     presets: Mapping[str, Mapping[str, Any]] | None = None
+    grows: Sequence[str] = ()
     minutes: Mapping[str, str] | None = None
     needs: str = ""
     facts: Callable[[Report], Mapping[str, Any]] = lambda report: {}
@@ -210,7 +212,9 @@ class Experiment:
                     "its page is then written beside it."
                 )
             plan = json.loads(json.dumps(dict(self.presets[preset])))
-            if report.get("plan", plan) != plan:
+            before_it = report.get("plan", plan)
+            grown = {x: plan[x] for x in self.grows if _grown(before_it.get(x), plan[x])}
+            if {**before_it, **grown} != plan:
                 raise UserError(
                     f"{out} was measured when the preset {preset} was another one: choose another --out."
                 )
@@ -262,6 +266,13 @@ class Experiment:
             plotting.save(figure, docs / "figures" / f"{name}.png", self.dpi)
         if self.extras is not None:
             self.extras(report, docs)
+
+
+def _grown(before: Any, now: Any) -> bool:
+    """Whether a list or a table holds all that it held before."""
+    if isinstance(before, dict) and isinstance(now, dict):
+        return all(name in now and now[name] == value for name, value in before.items())
+    return isinstance(before, list) and isinstance(now, list) and all(x in now for x in before)
 
 
 def plan_of(name: str) -> dict[str, Any]:

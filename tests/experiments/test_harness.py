@@ -245,6 +245,28 @@ def test_a_report_of_another_plan_is_not_continued(tmp_path, capsys):
     assert "when the preset quick was another one" in capsys.readouterr().err
 
 
+def test_a_report_goes_on_where_only_what_may_grow_has_grown(tmp_path, capsys):
+    flags = ["--out", str(tmp_path / "c.json"), "--docs", str(tmp_path)]
+
+    def growing(quick) -> Experiment:
+        return replace(counting(), presets={"quick": quick, "paper": {"value": 2}}, grows=("of",))
+
+    first = {"value": 1, "of": [["x"]], "by": {"x": 1}}
+    assert growing(first).main(flags) == 0
+    longer = {**first, "of": [["w"], ["x"]]}
+    assert growing(longer).main(flags) == 0
+    report = json.loads((tmp_path / "c.json").read_text())
+    assert report["plan"] == longer and report["measured"] == 2
+    for other in ({**longer, "by": {"x": 1, "y": 2}}, {**longer, "of": [["x"]]}):
+        assert growing(other).main(flags) == 2
+        assert "when the preset quick was another one" in capsys.readouterr().err
+    tables = {"value": 1, "of": {"x": 1}}
+    (tmp_path / "c.json").unlink()
+    assert growing(tables).main(flags) == 0
+    assert growing({"value": 1, "of": {"x": 1, "y": 2}}).main(flags) == 0
+    assert growing({"value": 1, "of": {"x": 2, "y": 2}}).main(flags) == 2
+
+
 def test_returns_that_are_no_number_count_as_a_random_policy():
     assert harness.finite([1.234, float("nan"), float("inf")], -7.0) == ([1.23, -7.0, -7.0], 2)
     assert rendering.span([3, 3]) == "3" and rendering.span([30, 60, 30]) == "30 to 60"
