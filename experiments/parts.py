@@ -44,7 +44,7 @@ class Part:
         return ", ".join((*self.path, *(" ".join(keys) for keys in self.names if keys)))
 
     def there(self, report: Mapping[str, Any]) -> bool:
-        """Whether the report has it."""
+        """Whether the report has it; None holds the place of what is to be measured again."""
         return all(_has(report, (*self.path, *keys)) for keys in self.names)
 
     def add(self, found: Any, report: dict[str, Any]) -> None:
@@ -52,7 +52,7 @@ class Part:
         *parents, last = self.path
         for key in parents:
             report = report.setdefault(key, {})
-        if isinstance(found, dict) and last in report:
+        if isinstance(found, dict) and isinstance(report.get(last), dict):
             _merge(report[last], found)
         else:
             report[last] = found
@@ -63,7 +63,7 @@ def _has(tree: Any, keys: Keys) -> bool:
         if not isinstance(tree, dict) or key not in tree:
             return False
         tree = tree[key]
-    return True
+    return tree is not None
 
 
 def _merge(tree: dict[str, Any], other: Mapping[str, Any]) -> None:

@@ -47,7 +47,7 @@ def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None
     """An environment at a time: train, choose, record."""
     found = report.setdefault("environments", {})
     for name in (*CLASSIC_CONTROL, HOPPER):
-        if name not in found:
+        if found.get(name) is None:
             found[name] = _show(name, plan)
             save()
         elif name == HOPPER and not VIEWER.exists():

@@ -10,6 +10,7 @@ from experiments import __main__ as everything
 from experiments import harness, rendering
 from experiments.claims import Claim
 from experiments.harness import Experiment
+from experiments.parts import Part
 from experiments.rendering import text
 from scb.environments.zoo import bandit_metadata
 from scb.statistics import Estimate
@@ -31,7 +32,7 @@ def counting(parts=("a", "b"), fail_at=None) -> Experiment:
     def measure(plan, report, save):
         plan["rows"].mkdir(exist_ok=True)  # where it may keep what no part of the report has yet
         for name in parts:
-            if name in report.setdefault("parts", {}):
+            if report.setdefault("parts", {}).get(name) is not None:
                 continue
             if name == fail_at:
                 raise KeyboardInterrupt
@@ -92,7 +93,11 @@ def test_what_is_of_a_bandit_that_was_replaced_is_measured_again():
     kept = {"a": {"sha256": ours, "x": 1}, "b, published": {"sha256": "other"}, "c": {"x": 1}}
     report = {"of": {"d": {"sha256": "replaced"}, **kept}, "digests": {"sha256": {"a": ours}}}
     harness.forget_replaced(report)
-    assert report == {"of": kept, "digests": {"sha256": {"a": ours}}}
+    assert report == {"of": {"d": None, **kept}, "digests": {"sha256": {"a": ours}}}
+    again = Part(("of", "d"), lambda: {"x": 2})
+    assert not again.there(report)
+    again.add(again.measured(), report)
+    assert list(report["of"]) == ["d", "a", "b, published", "c"] and again.there(report)
     # A report of a single bandit.
     report["sha256"] = "replaced"
     harness.forget_replaced(report)
