@@ -129,6 +129,11 @@ def claims(report: Report) -> list[Claim]:
             (NOW, BEFORE, "errors and jitter earn PPO's agents more than noise"),
             (NOW, (BEFORE[0], NOW[1]), "errors earn them more than noise in jittered contexts"),
             (NOW, (NOW[0], BEFORE[1]), "under errors jitter earns them more"),
+            (
+                NOW,
+                ("no errors", NOW[1]),
+                "errors earn them more than no errors in jittered contexts",
+            ),
         ):
             groups = (earned(entry, expert, contexts, "ppo"), earned(entry, other, others, "ppo"))
             same = len(groups[0]) == len(groups[1])

@@ -41,10 +41,10 @@ def outcomes(found):
 
 
 def test_what_earns_agents_more_is_shown_by_three_searches():
-    assert outcomes(report(1, 2, 3)) == [HOLDS] * 3
+    assert outcomes(report(1, 2, 3)) == [HOLDS] * 4
     # Errors earn less than noise in the same contexts, but more than noise had in contexts without jitter.
-    assert outcomes(report(1, 2, 3, errors=500.0)) == [HOLDS, FAILS, HOLDS]
-    assert outcomes(report(1, 2)) == [UNTESTED] * 3
+    assert outcomes(report(1, 2, 3, errors=500.0)) == [HOLDS, FAILS, HOLDS, HOLDS]
+    assert outcomes(report(1, 2)) == [UNTESTED] * 4
 
 
 def test_the_page_has_a_row_for_every_expert_and_contexts():
@@ -54,7 +54,9 @@ def test_the_page_has_a_row_for_every_expert_and_contexts():
         "hopper: a search has 30 or 40 generations" in page and "12 agents of PPO and 4 of" in page
     )
     assert "Standing still earns 1000." in page
-    assert "Shown: hopper: errors and jitter earn PPO's agents more than noise" in page
+    assert (
+        "Shown of PPO's agents: hopper: errors and jitter earn PPO's agents more than noise" in page
+    )
     few = module.EXPERIMENT.page(report(1))
     assert "Not shown yet" in few
 
