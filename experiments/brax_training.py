@@ -213,8 +213,8 @@ def claims(report: Report) -> list[Claim]:
     """
     found = []
     for row in matches(report):
-        times = np.array([x or row["trained"] for x in row["each_low"]]) / row["bandit_steps"]
-        told = None not in row["each_low"] or row["trained"] / row["bandit_steps"] >= ROUGHLY
+        times = np.array([_ratio(row, x) for x in row["each_low"]])
+        told = None not in row["each_low"] or _ratio(row, None) >= ROUGHLY
         name = f"{row['bandit']}, {row['algorithm'].upper()}"
         text = f"{name}: the environment takes {ROUGHLY} times the steps, roughly two orders of magnitude"
         evidence = partial(estimate, times, statistic=np.median) if told else None
@@ -222,7 +222,7 @@ def claims(report: Report) -> list[Claim]:
         standing = environment_spec(row["environment"]).standing_still(row["backend"])
         if standing is not None:
             text = f"{name}: agents from the bandit earn more than standing still"
-            found.append(Claim(text, partial(estimate, row["finals"]), round(standing), places=0))
+            found.append(Claim(text, partial(estimate, row["finals"]), standing, places=0))
     return found
 
 
@@ -246,23 +246,23 @@ def facts(report: Report) -> dict[str, Any]:
     for of_all in (report["bandits"], report["environments"]):
         lost += sum(x.get("failed", 0) for by in of_all.values() for x in by.values())
     found = matches(report)
-    for row in found:
-        row["times"], row["times_low"] = (_times(row, row[x]) for x in ("steps", "steps_low"))
-    ordered = sorted(found, key=lambda row: (row["steps"] or row["trained"]) / row["bandit_steps"])
     return {
         "finals": rows,
         "matches": found,
-        "fewest": ordered[0]["times"],
-        "most": ordered[-1]["times"],
+        "ordered": sorted(found, key=lambda row: _ratio(row, row["steps"])),
+        "times": _times,
         "short": [f"{x['bandit']}, {x['algorithm'].upper()}" for x in found if x["steps"] is None],
         "lost": lost,
     }
 
 
-def _times(row: Mapping[str, Any], steps: float | None) -> str:
+def _ratio(row: Mapping[str, Any], steps: float | None) -> float:
     """The environment's steps as a multiple of the bandit's; where they were not enough, of those that were trained."""
-    times = f"{(steps or row['trained']) / row['bandit_steps']:.0f}"
-    return times if steps else f"more than {times}"
+    return float((steps or row["trained"]) / row["bandit_steps"])
+
+
+def _times(row: Mapping[str, Any], steps: float | None) -> str:
+    return f"{'' if steps else 'more than '}{_ratio(row, steps):.0f}"
 
 
 def draw(report: Mapping[str, Any]) -> Figure:

@@ -99,8 +99,6 @@ def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None
         _, digest = bandit_of(environment)
         if digests.setdefault(environment, digest) != digest:  # the zoo has another one since
             digests[environment], entry[ZOO] = digest, {}
-            for name in [x for x in failed if x.startswith(f"{environment}, {ZOO}, ")]:
-                del failed[name]
         chosen = generations.setdefault(environment, {})
         judge_in = Place.named(environment)
         for source in SOURCES:
@@ -116,8 +114,9 @@ def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None
             for agent in lacking:
                 returns = _returns(agent, train_in, judge_in, plan)
                 entry[source][agent], number = finite(returns, random[environment])
+                failed.pop(name := f"{environment}, {source}, {agent}", None)
                 if number:
-                    failed[f"{environment}, {source}, {agent}"] = number
+                    failed[name] = number
                 save()
 
 

@@ -212,9 +212,9 @@ class Experiment:
                     "its page is then written beside it."
                 )
             plan = json.loads(json.dumps(dict(self.presets[preset])))
-            before_it = report.get("plan", plan)
-            grown = {x: plan[x] for x in self.grows if _grown(before_it.get(x), plan[x])}
-            if {**before_it, **grown} != plan:
+            stored = report.get("plan", plan)
+            grown = {x: plan[x] for x in self.grows if _grown(stored.get(x), plan[x])}
+            if {**stored, **grown} != plan:
                 raise UserError(
                     f"{out} was measured when the preset {preset} was another one: choose another --out."
                 )
