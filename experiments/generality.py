@@ -9,7 +9,7 @@ and the bandits' optimal policies need no training. The searches are run folders
 runs/generality and are resumed.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -20,7 +20,8 @@ from matplotlib.figure import Figure
 import scb
 from experiments import searches
 from experiments.claims import OF_THE_WAY, TENTH, Claim
-from experiments.harness import Experiment, Report, Save, bandit_of, finite
+from experiments.harness import Experiment, Report, bandit_of, finite
+from experiments.parts import InParts, Part
 from scb import measurement, plotting
 from scb.agents.spec import algorithms_for, bandit_agent
 from scb.analysis.optimal_actions import optimal_policy
@@ -32,7 +33,7 @@ from scb.evolution import map_population
 from scb.keys import root_key, split_key
 from scb.measurement import Agents, Place
 from scb.neuroevolution import NeuroevolutionConfig, evolve_policy
-from scb.rows import pivot
+from scb.rows import Rows, pivot
 from scb.seeds import REPORTING
 from scb.statistics import (
     Estimate,
@@ -87,37 +88,33 @@ def config_of(environment: str, source: str, plan: Mapping[str, Any]) -> Discove
     )
 
 
-def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None:
-    """One kind of agent from one source at a time."""
-    found, random = report.setdefault("environments", {}), report.setdefault("random", {})
-    failed, digests = report.setdefault("failed", {}), report.setdefault("sha256", {})
-    generations = report.setdefault("generation", {})
+def parts(plan: Mapping[str, Any], report: dict[str, Any]) -> Iterator[Part]:
+    """What agents of each kind earn, a source at a time."""
+    random = report.setdefault("random", {})
     for environment in plan["environments"]:
         if environment not in random:
             random[environment] = round(environment_spec(environment).random_return(), 2)
-        entry = found.setdefault(environment, {source: {} for source in SOURCES})
-        _, digest = bandit_of(environment)
-        if digests.setdefault(environment, digest) != digest:  # the zoo has another one since
-            digests[environment], entry[ZOO] = digest, {}
-        chosen = generations.setdefault(environment, {})
-        judge_in = Place.named(environment)
         for source in SOURCES:
-            lacking = [
-                agent
-                for agent in agents_of(environment)
-                if agent not in entry[source] and (agent, source) != (OPTIMAL, ENVIRONMENT)
-            ]
-            if not lacking and source in chosen:
-                continue
-            train_in, chosen[source] = _source(judge_in, source, plan)
-            save()
-            for agent in lacking:
-                returns = _returns(agent, train_in, judge_in, plan)
-                entry[source][agent], number = finite(returns, random[environment])
-                failed.pop(name := f"{environment}, {source}, {agent}", None)
-                if number:
-                    failed[name] = number
-                save()
+            there = report.get("environments", {}).get(environment, {}).get(source) or {}
+            kinds = [x for x in agents_of(environment) if (x, source) != (OPTIMAL, ENVIRONMENT)]
+            lacking = [x for x in kinds if x not in there.get("returns", ())]
+            measured = partial(_measured, environment, source, lacking, random[environment], plan)
+            names = tuple(("returns", kind) for kind in kinds)
+            yield Part(("environments", environment, source), measured, names)
+
+
+measure = InParts(parts)
+
+
+def _measured(
+    environment: str, source: str, kinds: Sequence[str], random: float, plan: Mapping[str, Any]
+) -> dict[str, Any]:
+    """What is said of a source, and {kind of agent: [N] returns}."""
+    judge_in = Place.named(environment)
+    train_in, said = _source(judge_in, source, plan)
+    found = {kind: finite(_returns(kind, train_in, judge_in, plan), random) for kind in kinds}
+    failed = {kind: number for kind, (_, number) in found.items() if number}
+    return {**said, "returns": {kind: x for kind, (x, _) in found.items()}, "failed": failed}
 
 
 def agents_of(environment: str) -> list[str]:
@@ -128,19 +125,19 @@ def agents_of(environment: str) -> list[str]:
     return [*algorithms, *others, EVOLVED, OPTIMAL]
 
 
-def _source(judge_in: Place, source: str, plan: Mapping[str, Any]) -> tuple[Place, int | None]:
-    """Where agents are trained, and of a search the generation at which its mean was judged best."""
+def _source(judge_in: Place, source: str, plan: Mapping[str, Any]) -> tuple[Place, dict[str, Any]]:
+    """Where agents are trained, and what tells which: a checksum, or the generation whose mean was judged best."""
     if source == ENVIRONMENT:
-        return judge_in, None
+        return judge_in, {}
     if source == ZOO:
-        bandit, _ = bandit_of(judge_in.name)
-        return Place(source, bandit, bandit.default_params), None
+        bandit, digest = bandit_of(judge_in.name)
+        return Place(source, bandit, bandit.default_params), {"sha256": digest}
     kind = "drawn" if source == DRAWN else "fixed"
     problem, outcome = searches.search(
         config_of(judge_in.name, source, plan), f"{plan['runs']}/{judge_in.name}-{kind}"
     )
-    weights = problem.bandit.params(outcome.best_mean)
-    return Place(source, problem.bandit, weights), outcome.best_mean_generation
+    place = Place(source, problem.bandit, problem.bandit.params(outcome.best_mean))
+    return place, {"generation": outcome.best_mean_generation}
 
 
 def _returns(agent: str, train_in: Place, judge_in: Place, plan: Mapping[str, Any]) -> np.ndarray:
@@ -150,9 +147,10 @@ def _returns(agent: str, train_in: Place, judge_in: Place, plan: Mapping[str, An
         algorithm, _, network = agent.partition(", ")
         spec = bandit_agent(algorithm, judge_in.name).with_values(**NETWORKS[network])
         agents = Agents.drawn_from(spec, REPORTING.start, number)
-        return pivot(
-            measurement.measure(spec, train_in, judge_in, agents, episodes=episodes), "agent"
-        )
+        folder = plan.get("rows")
+        kept = Rows(folder and folder / f"{judge_in.name}, {train_in.name}, {agent}.jsonl")
+        rows = measurement.measure(spec, train_in, judge_in, agents, episodes=episodes, rows=kept)
+        return pivot(rows, "agent")
     config = NeuroevolutionConfig(**plan["neuroevolution"])
     if train_in is judge_in:
         config = in_environment(config, int(judge_in.params.max_steps_in_episode))
@@ -174,9 +172,9 @@ def in_environment(config: NeuroevolutionConfig, limit: int) -> NeuroevolutionCo
     return replace(config, episodes=1, num_generations=generations)
 
 
-def columns(entry: Mapping[str, list[float]]) -> dict[str, np.ndarray]:
+def columns(entry: Mapping[str, Any]) -> dict[str, np.ndarray]:
     """{column of the figure: [N] returns}: algorithms, all of them together, and agents that no search saw."""
-    trained = {name: np.asarray(x) for name, x in entry.items()}
+    trained = {name: np.asarray(x) for name, x in entry["returns"].items()}
     algorithms = [name for name in trained if "," not in name and name not in UNSEEN]
     found = {name: trained[name] for name in algorithms}
     found[TOGETHER] = np.concatenate(list(found.values()))
@@ -240,14 +238,22 @@ def facts(report: Report) -> dict[str, Any]:
             )
             for name, entry in report["environments"].items()
         },
-        "chosen": {name: (x[DRAWN], x[FIXED]) for name, x in report["generation"].items()},
+        "chosen": {
+            name: [entry[x]["generation"] for x in (DRAWN, FIXED)]
+            for name, entry in report["environments"].items()
+        },
         "sources": SOURCES,
         "columns": {
             name: {source: columns(entry[source]) for source in SOURCES}
             for name, entry in report["environments"].items()
         },
         "names": {"together": TOGETHER, "wide": WIDE, "swish": SWISH},
-        "lost": sum(report["failed"].values()),
+        "lost": sum(
+            number
+            for entry in report["environments"].values()
+            for of_source in entry.values()
+            for number in of_source["failed"].values()
+        ),
     }
 
 

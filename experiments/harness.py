@@ -318,7 +318,7 @@ def bandit_of(environment: str) -> tuple[SyntheticBandit, str]:
 def forget_replaced(report: dict[str, Any]) -> None:
     """Takes out of a report what is of bandits that the zoo has replaced since, so that it is measured again.
 
-    An entry's "sha256" says which bandit it is of; ", published" ends the names of entries of other people's. None
+    An entry's "sha256" says which bandit it is of; "published" ends the names of entries of other people's. None
     keeps the entry's place.
     """
     ours = {bandit_metadata(name)["sha256"] for name in zoo_names()}
@@ -329,7 +329,7 @@ def forget_replaced(report: dict[str, Any]) -> None:
 
     def forget(tree: dict[str, Any]) -> None:
         for name, entry in tree.items():
-            if name.endswith(", published"):
+            if name.endswith("published"):
                 continue
             if replaced(entry):
                 tree[name] = None
