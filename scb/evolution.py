@@ -24,7 +24,7 @@ from scb.console import Progress, progress_console
 from scb.errors import UserError, at_least, one_of, positive
 from scb.files import plain
 from scb.keys import key_at, root_key, split_key
-from scb.runs import Checkpoints, Run, Stopwatch
+from scb.runs import Run, Stopwatch, continued
 from scb.seeds import VALIDATING, searching
 from scb.statistics import iqm
 from scb.strategies import STRATEGIES, has_mean, strategy_for
@@ -288,14 +288,10 @@ def evolve(
         "best_mean_generation": jnp.int32(-1),
     }
     console = progress_console(quiet)
-    checkpoints = Checkpoints(run.folder) if run and processes.first() else None
-    first = saved = 0
-    if run and run.resumed:
-        if checkpoints:
-            first, state = checkpoints.goes_on(state, console)
-            run.rewind(first)
-        first, state = processes.told(first), processes.agreed(state)
-        saved = first
+    checkpoints, first, state = continued(run.folder if run else None, state, console)
+    if run and checkpoints:
+        run.rewind(first)
+    saved = first
     # What is complete at any moment: steps into the next generation are not part of it.
     latest = first, dict(state)
 

@@ -22,7 +22,6 @@ from jax.tree_util import Partial
 from jax.typing import ArrayLike
 from rich.console import Console
 
-from scb import processes
 from scb.agents.agent import AgentConfig, clip_to_space, scale_to_space
 from scb.agents.networks import MLP
 from scb.agents.normalization import RunningStatistics, merge_statistics, normalize
@@ -32,7 +31,7 @@ from scb.evaluation import Episodes, Policy, evaluate
 from scb.evolution import map_population
 from scb.experts import EPISODES, Expert, judged
 from scb.keys import key_at, named_key, split_key
-from scb.runs import Checkpoints, Stopwatch
+from scb.runs import Stopwatch, continued
 
 START_GENERATIONS = 20  # after which one of several searches goes on
 
@@ -118,21 +117,18 @@ def search_linear_expert(
       quiet: no progress on the terminal.
       worth: (an expert that is not judged yet, a key) -> what it is judged by, and the environment steps
         that took; what it earns under the noise and errors of the search where None.
-      folder: to keep the search in, at every judgement, and to go on from; the same folder must not be given to
-        another search. None keeps nothing.
+      folder: to keep the search in, after its starts and at every judgement, and to go on from; the same folder
+        must not be given to another search. None keeps nothing.
     """
     config, console = config or LinearSearchConfig(), progress_console(quiet)
     search = _LinearSearch(env, env_params, key, config, bonus, worth)
-    kept, first = search.begin(), 0
-    checkpoints = Checkpoints(folder) if folder and processes.first() else None
-    if checkpoints:
-        first, kept = checkpoints.goes_on(kept, console)
-    if folder:
-        first, kept = processes.told(first), processes.agreed(kept)
+    checkpoints, first, kept = continued(folder, search.begin(), console)
     earlier_seconds = float(kept["seconds"])
     if not first and config.starts > 1:
         first = min(START_GENERATIONS, config.generations - 1)
         kept = _best_start(search, config.starts, first, console)
+        if checkpoints and first:
+            checkpoints.save(first, kept)
     with Progress(console, config.generations, first) as advance:
         for number in range(first + 1, config.generations + 1):
             judging = number % config.judge_every == 0 or number == config.generations

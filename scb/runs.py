@@ -33,6 +33,7 @@ from tensorboardX.event_file_writer import EventsWriter
 from tensorboardX.proto.event_pb2 import Event, SessionLog
 from tensorboardX.summary import scalar
 
+from scb import processes
 from scb.errors import UserError
 from scb.files import cannot_write, make_folder, plain, write_json, write_text
 
@@ -263,17 +264,6 @@ class Checkpoints:
         self._discard(damaged)
         return step, state, damaged
 
-    def goes_on(self, template: Any, console: Console) -> tuple[int, Any]:
-        """(step, state) that a search goes on from, as `restore` has it, and in words what was passed over."""
-        step, state, damaged = self.restore(template)
-        if damaged and not step:
-            console.print("no checkpoint could be read: starting again at generation 0.")
-        for number in damaged if step else ():
-            console.print(
-                f"checkpoint {number} is damaged: resuming from checkpoint {step} before it."
-            )
-        return step, state
-
     def _discard(self, steps: list[int]) -> None:
         # Orbax refuses to save a step that exists, so a damaged one must make room for its
         # repetition.
@@ -285,6 +275,29 @@ class Checkpoints:
 
     def close(self) -> None:
         self._manager.close()
+
+
+def continued(
+    folder: Path | None, template: Any, console: Console
+) -> tuple[Checkpoints | None, int, Any]:
+    """(checkpoints, step, state) of a search, in all of its processes: the newest state in its folder, and its step.
+
+    The first process alone has checkpoints, and says what was damaged. Without a folder, or with nothing in it, step
+    0 and the template.
+    """
+    if folder is None:
+        return None, 0, template
+    checkpoints, step, state = None, 0, template
+    if processes.first():
+        checkpoints = Checkpoints(folder)
+        step, state, damaged = checkpoints.restore(template)
+        if damaged and not step:
+            console.print("no checkpoint could be read: starting again at generation 0.")
+        for number in damaged if step else ():
+            console.print(
+                f"checkpoint {number} is damaged: resuming from checkpoint {step} before it."
+            )
+    return checkpoints, processes.told(step), processes.agreed(state)
 
 
 class Stopwatch:

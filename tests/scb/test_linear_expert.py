@@ -142,6 +142,35 @@ def test_a_search_tells_that_its_last_judgement_is_damaged(tmp_path, capsys):
     np.testing.assert_array_equal(again.policy(jnp.ones(2)), whole.policy(jnp.ones(2)))
 
 
+def test_a_search_that_was_killed_does_not_repeat_its_starts(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("scb.linear_expert.START_GENERATIONS", 2)
+
+    def worth(expert, key):
+        if killed:
+            raise KeyboardInterrupt
+        return 1.0, 7
+
+    def find(folder=None):
+        config = replace(SEARCH, generations=4, judge_every=4, starts=3)
+        env, key = ContinuousCorridor(cells=2), jax.random.key(0)
+        found = search_linear_expert(
+            env, TWO_TARGETS, key, config, quiet=False, worth=worth, folder=folder
+        )
+        return found, capsys.readouterr().err.count("start ")
+
+    killed = False
+    whole, starts = find()
+    killed = True
+    with pytest.raises(KeyboardInterrupt):
+        find(tmp_path)
+    assert capsys.readouterr().err.count("start ") == starts == 3
+    killed = False
+    again, starts = find(tmp_path)
+    assert starts == 0
+    np.testing.assert_array_equal(again.policy(jnp.ones(2)), whole.policy(jnp.ones(2)))
+    assert again.environment_steps == whole.environment_steps
+
+
 def test_of_several_starts_the_best_goes_on(capsys, monkeypatch):
     monkeypatch.setattr("scb.linear_expert.START_GENERATIONS", 2)
     env, size = ContinuousCorridor(cells=2), {"generations": 3, "judge_every": 3}
