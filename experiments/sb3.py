@@ -180,9 +180,10 @@ def draw(report: Mapping[str, Any]) -> Figure:
     """A panel an environment: return after each number of steps, trained here and there."""
     shown = facts(report)
     tables = shown["tables"]
-    rows = -(-len(tables) // 2)
+    columns = min(2, len(tables))
+    rows = -(-len(tables) // columns)
     figure = Figure(figsize=(plotting.WIDTH, 2.9 * rows))
-    panels = figure.subplots(rows, 2, squeeze=False).ravel()
+    panels = figure.subplots(rows, columns, squeeze=False).ravel()
     for axes, (name, algorithms) in zip(panels, tables.items(), strict=False):
         for algorithm, places in algorithms.items():
             for place, found in places.items():
