@@ -154,13 +154,8 @@ def paired(
     curves: LearningCurves, reference: LearningCurves, of: str
 ) -> Callable[..., Estimate] | Estimate | None:
     """How much more agents of the same seeds earn ("final", "late", "area"), no interval where there are few."""
-    shared = [seed for seed in curves.seeds if seed in reference.seeds]
-    if not shared:
-        return None
-    ours, theirs = (
-        getattr(x, of)[[x.seeds.index(seed) for seed in shared]] for x in (curves, reference)
-    )
-    return of_agents(partial(paired_difference, ours, theirs), len(shared))
+    ours, theirs = curves.paired(reference, of)
+    return of_agents(partial(paired_difference, ours, theirs), len(ours)) if len(ours) else None
 
 
 def claims(report: Report) -> list[Claim]:

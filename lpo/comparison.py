@@ -88,6 +88,16 @@ class LearningCurves:
         standing = self.standing_still
         return None if standing is None else float(np.mean(self.final > standing))
 
+    def paired(
+        self, reference: "LearningCurves", of: str = "final"
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """([S], [S]) "final", "late" or "area" of both, of the S seeds that both have."""
+        shared = [seed for seed in self.seeds if seed in reference.seeds]
+        ours, theirs = (
+            getattr(x, of)[[x.seeds.index(seed) for seed in shared]] for x in (self, reference)
+        )
+        return ours, theirs
+
     def as_dict(self) -> dict[str, Any]:
         moving = {
             name: [plain(x) for x in values[:, -1]]
@@ -113,9 +123,9 @@ class Comparison:
     curves: list[LearningCurves]
 
     def differences(self) -> dict[str, Estimate]:
-        """{objective: paired difference of final IQM to the reference}, positive where it is better."""
-        reference = self.curves[0]
-        return {c.objective: paired_difference(c.final, reference.final) for c in self.curves[1:]}
+        """{objective: difference of final IQM to the reference}, of the seeds of both; positive where it is better."""
+        both = {c.objective: c.paired(self.curves[0]) for c in self.curves[1:]}
+        return {name: paired_difference(*x) for name, x in both.items() if x[0].size}
 
     @property
     def caution(self) -> str:

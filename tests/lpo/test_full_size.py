@@ -1,0 +1,28 @@
+"""What ships of full-size trainings is compared as a report compares what was just measured."""
+
+import json
+
+from lpo.full_size import PATH, as_comparison, full_size
+
+
+def test_what_ships_can_be_shown_beside_a_short_run():
+    for environment in json.loads(PATH.read_text())["environments"]:
+        whole = full_size(environment)
+        assert whole.curves[0].objective == "ppo"
+        others = {curve.objective for curve in whole.curves[1:]}
+        assert whole.as_dict()["paired_differences"].keys() == others, environment
+
+
+def test_objectives_are_compared_on_the_seeds_that_both_have():
+    def agents(earned):
+        return {seed: {"returns": f"0 {x}", "length": None, "speed": None} for seed, x in earned}
+
+    # The first has agents that the second lacks, in another order.
+    ppo, other = agents([("3", 7), ("1", 1), ("2", 2)]), agents([("1", 4), ("2", 5)])
+    entry = {"backend": "generalized", "steps": [0, 10], "episodes": 2}
+    found = as_comparison(
+        "hopper", {**entry, "agents": {"ppo": ppo, "a": other, "b": agents([("9", 1)])}}
+    )
+    differences = found.as_dict()["paired_differences"]
+    assert (differences["a"]["value"], differences["a"]["n"]) == (3.0, 2)
+    assert "b" not in differences
