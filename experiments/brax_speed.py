@@ -17,6 +17,7 @@ import numpy as np
 
 from experiments.harness import Experiment, Report, Save
 from experiments.timing import OWN, in_turn
+from scb.environments.brax_physics import CHUNK
 from scb.environments.registry import environment_spec, families
 from scb.errors import at_least
 from scb.keys import named_key, root_key, split_key
@@ -91,7 +92,7 @@ def facts(report: Report) -> dict[str, Any]:
     ratios = {
         name: float(np.median(cell["ratios"])) for name, cell in report["environments"].items()
     }
-    return {"own": OWN, "peer": PEER, "ratios": ratios}
+    return {"own": OWN, "peer": PEER, "ratios": ratios, "chunk": CHUNK}
 
 
 EXPERIMENT = Experiment(

@@ -7,7 +7,13 @@ import numpy as np
 import pytest
 
 from scb.environments.brax import BraxEnvironment
-from scb.environments.brax_physics import _batches_last, improved_inverse, nonnegative_forces
+from scb.environments.brax_physics import (
+    CHUNK,
+    _batches_last,
+    _in_chunks,
+    improved_inverse,
+    nonnegative_forces,
+)
 
 
 def matrices(condition: float, number: int, size: int = 6) -> np.ndarray:
@@ -76,6 +82,37 @@ def test_forces_are_jaxopts(iterations, halvings):
     found = jax.jit(jax.vmap(ours))(product, offset)
     assert not expected[0].any() and expected[1:].any()
     np.testing.assert_allclose(found, expected, atol=1e-4 * np.abs(expected).max())
+
+
+def test_chunks_are_the_same_as_a_whole_batch_and_wait_for_their_own_slowest_alone():
+    waits = []
+
+    def doublings(start: jax.Array, factors: jax.Array) -> jax.Array:
+        """Doubles until 100, as a loop that under vmap waits for the slowest of its batch."""
+
+        def double(carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+            jax.debug.callback(lambda _: waits.append(1), carry[1])  # once for each of a batch
+            return carry[0] * 2, carry[1] + 1
+
+        _, number = jax.lax.while_loop(lambda x: x[0] < 100, double, (start, 0))
+        return number * jnp.sum(factors)
+
+    # One of all is slow: alone in the last chunk, which is not a full one.
+    start = jnp.full((5, CHUNK), 60.0).reshape(-1)[: 4 * CHUNK + 3].at[-1].set(1e-3)
+    factors = jnp.arange(3.0)
+    expected = jax.jit(jax.vmap(doublings, (0, None)))(start, factors)
+    jax.effects_barrier()
+    together = len(waits)
+    waits.clear()
+    found = jax.jit(jax.vmap(_in_chunks(doublings), (0, None)))(start, factors)
+    jax.effects_barrier()
+    np.testing.assert_array_equal(found, expected)
+    assert len(waits) == 4 * CHUNK + 3 * 17 < together == 17 * len(start)
+
+    pairs = jnp.stack([start, start[::-1]])
+    nested = jax.vmap(jax.vmap(_in_chunks(doublings), (0, None)), (1, None))(pairs, factors)
+    np.testing.assert_array_equal(nested, jnp.stack([expected, expected[::-1]], axis=1))
+    np.testing.assert_array_equal(_in_chunks(doublings)(start[0], factors), expected[0])
 
 
 @pytest.mark.slow
