@@ -21,7 +21,7 @@ import scb
 from experiments import searches
 from experiments.claims import OF_THE_WAY, TENTH, Claim
 from experiments.harness import Experiment, Report, bandit_of, finite
-from experiments.parts import InParts, Part
+from experiments.parts import InParts, Part, lacking
 from scb import measurement, plotting
 from scb.agents.spec import algorithms_for, bandit_agent
 from scb.analysis.optimal_actions import optimal_policy
@@ -95,12 +95,12 @@ def parts(plan: Mapping[str, Any], report: dict[str, Any]) -> Iterator[Part]:
         if environment not in random:
             random[environment] = round(environment_spec(environment).random_return(), 2)
         for source in SOURCES:
-            there = report.get("environments", {}).get(environment, {}).get(source) or {}
+            path = ("environments", environment, source)
             kinds = [x for x in agents_of(environment) if (x, source) != (OPTIMAL, ENVIRONMENT)]
-            lacking = [x for x in kinds if x not in there.get("returns", ())]
-            measured = partial(_measured, environment, source, lacking, random[environment], plan)
-            names = tuple(("returns", kind) for kind in kinds)
-            yield Part(("environments", environment, source), measured, names)
+            names = lacking(report, path, [("returns", kind) for kind in kinds])
+            left = [kind for _, kind in names]
+            measured = partial(_measured, environment, source, left, random[environment], plan)
+            yield Part(path, measured, names)
 
 
 measure = InParts(parts)

@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 
 from experiments.claims import DECIDING, Claim, of_agents
 from experiments.harness import Experiment, Report, packed
-from experiments.parts import InParts, Part
+from experiments.parts import InParts, Part, lacking
 from lpo import figures
 from lpo.comparison import LearningCurves, compare, ppo_spec
 from lpo.full_size import as_comparison
@@ -85,13 +85,13 @@ def _of(
     report: Report,
     place: str,
 ) -> Iterator[Part]:
+    path = ("environments", environment)
     for start in range(0, len(seeds), options.together):
         for name in objectives:
-            there = report.get("environments", {}).get(environment, {}).get(place, {}).get(name, {})
-            few = [s for s in seeds[start : start + options.together] if str(s) not in there]
-            trained = partial(_trained, environment, name, few, options.runs, place)
-            names = tuple((place, name, str(seed)) for seed in few)
-            yield Part(("environments", environment), trained, names)
+            few = {(place, name, str(s)): s for s in seeds[start : start + options.together]}
+            names = lacking(report, path, few)
+            left = [few[keys] for keys in names]
+            yield Part(path, partial(_trained, environment, name, left, options.runs, place), names)
 
 
 measure = InParts(parts)

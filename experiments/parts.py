@@ -45,7 +45,7 @@ class Part:
 
     def there(self, report: Mapping[str, Any]) -> bool:
         """Whether the report has it; None holds the place of what is to be measured again."""
-        return all(_has(report, (*self.path, *keys)) for keys in self.names)
+        return not lacking(report, self.path, self.names)
 
     def add(self, found: Any, report: dict[str, Any]) -> None:
         """Puts what was measured into the report."""
@@ -56,6 +56,11 @@ class Part:
             _merge(report[last], found)
         else:
             report[last] = found
+
+
+def lacking(report: Mapping[str, Any], path: Keys, names: Iterable[Keys]) -> tuple[Keys, ...]:
+    """Those of some names below a path where the report has nothing."""
+    return tuple(keys for keys in names if not _has(report, (*path, *keys)))
 
 
 def _has(tree: Any, keys: Keys) -> bool:
@@ -186,8 +191,8 @@ def elsewhere(
     """
     make_folder(folder)
     # Two that stand in one place are one: its job would only wait for the other's.
-    lacking = {part.name: part for part in parts if not part.there(report)}
-    kept = {part: folder / f"{_digest(part)}.json" for part in lacking.values()}
+    named = {part.name: part for part in parts if not part.there(report)}
+    kept = {part: folder / f"{_digest(part)}.json" for part in named.values()}
 
     def taken(part: Part) -> bool:
         if kept[part].exists():

@@ -22,7 +22,7 @@ from matplotlib.ticker import MaxNLocator
 
 from experiments.claims import FAILS, HOLDS, UNDECIDED, Claim, judge
 from experiments.harness import Experiment, Report, plan_of
-from experiments.parts import InParts, Part
+from experiments.parts import InParts, Part, lacking
 from experiments.searches import meta_training, objective_of_run
 from lpo.comparison import compare, ppo_spec
 from lpo.objectives import Objective, load_objective
@@ -220,28 +220,26 @@ def parts(options: Options, report: dict[str, Any]) -> Iterator[Part]:
         *((name, NO_SEARCH) for name in REFERENCES),
         *((name, seed) for seed in seeds for name in options.variations),
     ):
-        entry = report.get("objectives", {}).get(name, {})
-        there = entry.get("returns", {})
-        lacking = [at for at in EVALUATIONS if seed not in there.get(at.name, {})]
-        names = tuple(("returns", at.name, seed) for at in lacking)
-        digest = entry.get("digests", {}).get(seed)
-        yield Part(
-            ("objectives", name), partial(_judged, name, seed, lacking, digest, options), names
-        )
+        path = ("objectives", name)
+        places = {("returns", at.name, seed): at for at in EVALUATIONS}
+        names = lacking(report, path, places)
+        left = [places[keys] for keys in names]
+        digest = report.get("objectives", {}).get(name, {}).get("digests", {}).get(seed)
+        yield Part(path, partial(_judged, name, seed, left, digest, options), names)
 
 
 measure = InParts(parts)
 
 
 def _judged(
-    name: str, seed: str, lacking: Sequence[Evaluation], digest: str | None, options: Options
+    name: str, seed: str, left: Sequence[Evaluation], digest: str | None, options: Options
 ) -> dict[str, Any]:
     """What an objective earns, and of one that was learned what that took.
 
     A search of an earlier version may have found another: what the report holds of that is measured again.
 
     Args:
-      lacking: the evaluations that the report lacks.
+      left: the evaluations that the report lacks.
       digest: of the objective whose evaluations it has.
     """
     if name in REFERENCES:
@@ -251,7 +249,7 @@ def _judged(
         objective, entry = _learned(name, int(seed), options)
     same = entry.get("digests", {}).get(seed) == digest
     returns = {}
-    for at in lacking if same else EVALUATIONS:
+    for at in left if same else EVALUATIONS:
         each = [_earned(objective, environment, at, options) for environment in at.environments]
         earned = np.mean(each, axis=0)
         returns[at.name] = {seed: np.round(earned, 4 if at.normalized else 2).tolist()}

@@ -5,13 +5,11 @@ al., 2022); here genetic programming does the reading (gplearn, the extra `disti
 sets the numbers, and what comes out is a `lpo.drifts.ClosedFormDrift`.
 """
 
-import itertools
 import math
-import re
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -21,18 +19,28 @@ from numpy.typing import NDArray
 from lpo.certificate import certify
 from lpo.drifts import ClosedFormDrift
 from lpo.drifts.contract import CorrectedDrift
-from lpo.drifts.formula import Node, evaluate, parse
+from lpo.drifts.formula import evaluate, parse
+from lpo.drifts.sums import (
+    Sum,
+    as_sum,
+    as_text,
+    collect,
+    function,
+    node_of,
+    numbers_of,
+    one_fewer,
+    product,
+    scaled,
+    size_of,
+    structure_of,
+    value_of,
+    with_numbers,
+)
 from scb.errors import UserError, at_least
 from scb.keys import root_key
 
 if TYPE_CHECKING:
     from lpo.objectives import Objective
-
-# A sum of coefficients times products. A product's factors, sorted, are variables, "abs(A)", and
-# functions of further sums. Programs that are the same formula become the same sum, with no number
-# in two places.
-_Factor: TypeAlias = "str | tuple[str, _Sum]"
-_Sum: TypeAlias = "tuple[tuple[tuple[_Factor, ...], float], ...]"
 
 # What gplearn combines: each is 0 at ratio 1 and so is whatever it makes of them.
 _TERMINALS: tuple[tuple[str, ...], ...] = (
@@ -43,7 +51,6 @@ _TERMINALS: tuple[tuple[str, ...], ...] = (
     ("abs(A)", "d"),
     ("abs(A)", "log_r"),
 )
-_MOST_TERMS = 48  # of a program that is being multiplied out
 _UNITS = 60
 # In standard deviations of a term.
 _FIRST_STEPS = (-1.0, -0.3, -0.1, 0.1, 0.3, 1.0)
@@ -313,15 +320,15 @@ def _programs(
     ]
 
 
-def _formulas(programs: Sequence[Sequence[Any]], config: DistillConfig) -> list[_Sum]:
+def _formulas(programs: Sequence[Sequence[Any]], config: DistillConfig) -> list[Sum]:
     """The best formulas, at most three of a size, each once; programs come best first."""
-    found: dict[str, _Sum] = {}
+    found: dict[str, Sum] = {}
     sizes: dict[int, int] = {}
     for program in programs:
-        formula = _as_sum(program)
-        if not formula or len(_numbers(formula)) > config.numbers:
+        formula = as_sum(program)
+        if not formula or len(numbers_of(formula)) > config.numbers:
             continue
-        structure, size = _structure(formula), _size(formula)
+        structure, size = structure_of(formula), size_of(formula)
         if structure in found or sizes.get(size, 0) >= 3:
             continue
         found[structure] = formula
@@ -331,116 +338,12 @@ def _formulas(programs: Sequence[Sequence[Any]], config: DistillConfig) -> list[
     return list(found.values())
 
 
-def _as_sum(program: Sequence[Any]) -> _Sum:
-    """A program in prefix notation as a sum, multiplied out; empty where it grew too long."""
-    stack: list[_Sum] = []
-    # Backwards: a function's arguments lie on the stack, the first on top, when it is met.
-    for symbol in reversed(program):
-        if symbol[0] not in _OPERATIONS:
-            stack.append(((tuple(sorted(symbol)), 1.0),))
-            continue
-        name, arity = symbol
-        arguments = [stack.pop() for _ in range(arity)]
-        made = _OPERATIONS[name](*arguments)
-        if len(made) > _MOST_TERMS:
-            return ()
-        stack.append(made)
-    return stack[0]
-
-
-def _collect(terms: "Sequence[tuple[tuple[_Factor, ...], float]]") -> _Sum:
-    total: dict[tuple[_Factor, ...], float] = {}
-    for factors, coefficient in terms:
-        total[factors] = total.get(factors, 0.0) + coefficient
-    return tuple(sorted(((k, v) for k, v in total.items() if v != 0.0), key=repr))
-
-
-def _scale(terms: _Sum, by: float) -> _Sum:
-    return tuple((factors, by * coefficient) for factors, coefficient in terms)
-
-
-def _product(left: _Sum, right: _Sum) -> _Sum:
-    return _collect([(tuple(sorted(f + g, key=repr)), c * k) for f, c in left for g, k in right])
-
-
-def _function(name: str) -> Callable[[_Sum], _Sum]:
-    def made(argument: _Sum) -> _Sum:
-        if not argument:
-            return ()
-        if name == "relu":  # a positive factor inside is the same as one outside
-            size = max(abs(c) for _, c in argument)
-            return (((("relu", _scale(argument, 1.0 / size)),), size),)
-        return ((((name, argument),), 1.0),)
-
-    return made
-
-
-_OPERATIONS: dict[str, Callable[..., _Sum]] = {
-    "add": lambda x, y: _collect([*x, *y]),
-    "sub": lambda x, y: _collect([*x, *_scale(y, -1.0)]),
-    "mul": _product,
-    "half": lambda x: _scale(x, 0.5),
-    "double": lambda x: _scale(x, 2.0),
-    "tanh": _function("tanh"),
-    "relu": _function("relu"),
-}
-
-
-def _structure(terms: _Sum) -> str:
-    """A formula without its numbers."""
-    return as_text(_with_numbers(terms, itertools.repeat(1.0)))
-
-
-def _size(terms: _Sum) -> int:
-    """Numbers, variables and functions in a formula."""
-    return len(_numbers(terms)) + len(re.findall(r"\w+", _structure(terms)))
-
-
-def _node(terms: _Sum, numbers: list[float]) -> Node:
-    """A formula as `evaluate` takes it; its coefficients, each before those inside its term, join the numbers."""
-    made = []
-    for factors, coefficient in terms:
-        numbers.append(coefficient)
-        parts = [Node("number", position=len(numbers) - 1)]
-        for factor in factors:
-            if isinstance(factor, str):
-                parts.append(Node("variable", name=factor))
-            else:
-                parts.append(Node(factor[0], (_node(factor[1], numbers),)))
-        made.append(Node("*", tuple(parts)))
-    return Node("+", tuple(made))
-
-
-def _numbers(terms: _Sum) -> list[float]:
-    numbers: list[float] = []
-    _node(terms, numbers)
-    return numbers
-
-
-def _with_numbers(terms: _Sum, numbers: Iterator[float]) -> _Sum:
-    """The inverse of `_numbers`."""
-    made = []
-    for factors, _ in terms:
-        coefficient = next(numbers)
-        inside = tuple(
-            f if isinstance(f, str) else (f[0], _with_numbers(f[1], numbers)) for f in factors
-        )
-        made.append((inside, float(coefficient)))
-    return tuple(made)
-
-
-def _value(terms: _Sum, variables: Mapping[str, NDArray[np.floating]]) -> NDArray[np.floating]:
-    numbers: list[float] = []
-    root = _node(terms, numbers)
-    return np.asarray(evaluate(root, numbers, variables, np))
-
-
-def _tune(terms: _Sum, data: _Data, evaluations: int = 20) -> tuple[_Sum, float]:
+def _tune(terms: Sum, data: _Data, evaluations: int = 20) -> tuple[Sum, float]:
     """A formula with the numbers that fit best, and its score."""
     from scipy.optimize import least_squares
 
     start: list[float] = []
-    root = _node(terms, start)
+    root = node_of(terms, start)
 
     def residuals(numbers: NDArray[np.floating]) -> NDArray[np.floating]:
         value = evaluate(root, numbers, data.variables, np)
@@ -449,42 +352,42 @@ def _tune(terms: _Sum, data: _Data, evaluations: int = 20) -> tuple[_Sum, float]
 
     found = least_squares(residuals, start, max_nfev=evaluations).x
     # Four digits are what the text keeps, and so what is scored.
-    rounded = _with_numbers(terms, (float(f"{x:.4g}") for x in found))
-    return rounded, data.score(_value(rounded, data.variables))
+    rounded = with_numbers(terms, (float(f"{x:.4g}") for x in found))
+    return rounded, data.score(value_of(rounded, data.variables))
 
 
-def _library(rng: np.random.Generator, terminals: Sequence[tuple[str, ...]]) -> list[_Sum]:
+def _library(rng: np.random.Generator, terminals: Sequence[tuple[str, ...]]) -> list[Sum]:
     """Terms to grow by: products of at most two terminals, and tanh of random sums of three."""
-    singles: list[_Sum] = [((tuple(sorted(t)), 1.0),) for t in terminals]
-    pairs = [_product(x, y) for i, x in enumerate(singles) for y in singles[i:]]
-    tanh = _function("tanh")
+    singles: list[Sum] = [((tuple(sorted(t)), 1.0),) for t in terminals]
+    pairs = [product(x, y) for i, x in enumerate(singles) for y in singles[i:]]
+    tanh = function("tanh")
     units = []
     for _ in range(_UNITS):
         chosen = rng.choice(len(singles), 3, replace=False)
         # Inputs are around 0.3: weights of 3 bring tanh to where it bends.
         units.append(
-            tanh(_collect([(singles[i][0][0], 3.0 * rng.standard_normal()) for i in chosen]))
+            tanh(collect([(singles[i][0][0], 3.0 * rng.standard_normal()) for i in chosen]))
         )
     return [*singles, *pairs, *units]
 
 
 def _grow(
-    terms: _Sum, score: float, data: _Data, library: Sequence[_Sum], config: DistillConfig
-) -> list[tuple[_Sum, float]]:
+    terms: Sum, score: float, data: _Data, library: Sequence[Sum], config: DistillConfig
+) -> list[tuple[Sum, float]]:
     """The formula with one more term, with two more, ..., as long as each adds the tolerance."""
-    values = [_value(term, data.variables) for term in library]
+    values = [value_of(term, data.variables) for term in library]
     steps = [
         (i, step / max(float(value.std()), 1e-12))
         for i, value in enumerate(values)
         for step in _FIRST_STEPS
     ]
-    grown: list[tuple[_Sum, float]] = []
+    grown: list[tuple[Sum, float]] = []
     while True:
-        here = _value(terms, data.variables)
+        here = value_of(terms, data.variables)
         # One step along every term shows which are worth a fit of all numbers.
         promising = sorted(steps, key=lambda tried: -data.score(here + tried[1] * values[tried[0]]))
-        longer = [_collect([*terms, *_scale(library[i], s)]) for i, s in promising[:_PROMISING]]
-        fits = [_tune(one, data) for one in longer if len(_numbers(one)) <= config.numbers]
+        longer = [collect([*terms, *scaled(library[i], s)]) for i, s in promising[:_PROMISING]]
+        fits = [_tune(one, data) for one in longer if len(numbers_of(one)) <= config.numbers]
         best = max(fits, key=lambda found: found[1], default=None)
         if best is None or best[1] < score + config.tolerance:
             return grown
@@ -492,33 +395,21 @@ def _grow(
         grown.append(best)
 
 
-def _drop_terms(terms: _Sum, score: float, data: _Data, tolerance: float) -> tuple[_Sum, float]:
+def _drop_terms(terms: Sum, score: float, data: _Data, tolerance: float) -> tuple[Sum, float]:
     """Leaves out term after term while the score falls by less than a third of the tolerance in all."""
     floor = score - tolerance / 3.0
     while True:
-        shorter = [_tune(fewer, data, 10) for fewer in _one_fewer(terms)]
+        shorter = [_tune(fewer, data, 10) for fewer in one_fewer(terms)]
         best = max(shorter, key=lambda found: found[1], default=None)
         if best is None or best[1] < floor:
             return terms, score
         terms, score = best
 
 
-def _one_fewer(terms: _Sum) -> Iterator[_Sum]:
-    """The formulas that lack one term, of the sum or inside a function; never an empty sum."""
-    for i, (factors, coefficient) in enumerate(terms):
-        if len(terms) > 1:
-            yield (*terms[:i], *terms[i + 1 :])
-        for j, factor in enumerate(factors):
-            if not isinstance(factor, str):
-                for inside in _one_fewer(factor[1]):
-                    made = (*factors[:j], (factor[0], inside), *factors[j + 1 :])
-                    yield (*terms[:i], (made, coefficient), *terms[i + 1 :])
-
-
-def _front(found: Sequence[tuple[_Sum, float]]) -> list[tuple[str, float, int]]:
+def _front(found: Sequence[tuple[Sum, float]]) -> list[tuple[str, float, int]]:
     """(text, score, size) of the readable formulas that no shorter or equally long one matches, shortest first."""
     front: list[tuple[str, float, int]] = []
-    for terms, score in sorted(found, key=lambda f: (_size(f[0]), -f[1])):
+    for terms, score in sorted(found, key=lambda f: (size_of(f[0]), -f[1])):
         if not math.isfinite(score) or (front and score <= front[-1][1]):
             continue
         text = as_text(terms)
@@ -526,20 +417,9 @@ def _front(found: Sequence[tuple[_Sum, float]]) -> list[tuple[str, float, int]]:
             parse(text)
         except UserError:  # it grows too fast, or became too long or deep
             continue
-        front.append((text, score, _size(terms)))
+        front.append((text, score, size_of(terms)))
     if not front:
         raise UserError(
             "the search found no formula that stays finite: give it more generations or another seed."
         )
     return front
-
-
-def as_text(terms: _Sum) -> str:
-    """A sum in the language of `parse`; a coefficient of 1 is left out."""
-    text = ""
-    for factors, coefficient in terms:
-        sign, size = ("-" if coefficient < 0 else "+"), f"{abs(coefficient):.4g}"
-        shown = [f if isinstance(f, str) else f"{f[0]}({as_text(f[1])})" for f in factors]
-        term = "*".join([*([] if size == "1" else [size]), *shown])
-        text += f" {sign} {term}" if text else (term if sign == "+" else f"-{term}")
-    return text

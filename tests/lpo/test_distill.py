@@ -11,9 +11,10 @@ import pytest
 
 from lpo import cli, commands
 from lpo.certificate import certify
-from lpo.distill import DistillConfig, _as_sum, _shortest, as_text, distill
+from lpo.distill import DistillConfig, _shortest, distill
 from lpo.drifts import ClipDrift, ClosedFormDrift, DPODrift, LearnedDrift
 from lpo.drifts.formula import parse
+from lpo.drifts.sums import as_sum, as_text
 from lpo.objectives import Objective, load_objective, save_objective
 from scb.agents.ppo import PPO, PPOHyperparameters
 from scb.environments.registry import make
@@ -226,15 +227,15 @@ def test_programs_are_multiplied_out():
     # mul(add(d, A d), sub(d, d)) = 0, and mul(add(d, A d), half(log_r)) = 0.5 d log r + 0.5 A d log r.
     add, sub, mul, half = ("add", 2), ("sub", 2), ("mul", 2), ("half", 1)
     d, log_r, scaled = ("d",), ("log_r",), ("A", "d")
-    assert _as_sum([mul, add, d, scaled, sub, d, d]) == ()
-    found = as_text(_as_sum([mul, add, d, scaled, half, log_r]))
+    assert as_sum([mul, add, d, scaled, sub, d, d]) == ()
+    found = as_text(as_sum([mul, add, d, scaled, half, log_r]))
     assert found == "0.5*A*d*log_r + 0.5*d*log_r"
 
 
 def test_text_of_a_program_is_read_as_the_program():
     # sub(tanh(double(d)), relu(half(A d))): tanh(2 d) - 0.5 relu(A d).
     program = [("sub", 2), ("tanh", 1), ("double", 1), ("d",), ("relu", 1), ("half", 1), ("A", "d")]
-    text = as_text(_as_sum(program))
+    text = as_text(as_sum(program))
     assert text == "-0.5*relu(A*d) + tanh(2*d)"
     # At r = 1.5, A = 1: tanh(1) - 0.25 = 0.7616 - 0.25.
     value = charged(ClosedFormDrift(text), [np.log(1.5)], [1.0])
