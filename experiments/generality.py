@@ -97,10 +97,11 @@ def parts(plan: Mapping[str, Any], report: dict[str, Any]) -> Iterator[Part]:
         for source in SOURCES:
             path = ("environments", environment, source)
             kinds = [x for x in agents_of(environment) if (x, source) != (OPTIMAL, ENVIRONMENT)]
-            names = lacking(report, path, [("returns", kind) for kind in kinds])
-            left = [kind for _, kind in names]
-            measured = partial(_measured, environment, source, left, random[environment], plan)
-            yield Part(path, measured, names)
+            left = lacking(report, path, {("returns", kind): kind for kind in kinds})
+            measured = partial(
+                _measured, environment, source, list(left.values()), random[environment], plan
+            )
+            yield Part(path, measured, tuple(left))
 
 
 measure = InParts(parts)

@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 
 from experiments.claims import DECIDING, Claim, of_agents
 from experiments.harness import Experiment, Report, packed
-from experiments.parts import InParts, Part, lacking
+from experiments.parts import InParts, Keys, Part, lacking
 from lpo import figures
 from lpo.comparison import LearningCurves, compare, ppo_spec
 from lpo.full_size import as_comparison
@@ -88,10 +88,12 @@ def _of(
     path = ("environments", environment)
     for start in range(0, len(seeds), options.together):
         for name in objectives:
-            few = {(place, name, str(s)): s for s in seeds[start : start + options.together]}
-            names = lacking(report, path, few)
-            left = [few[keys] for keys in names]
-            yield Part(path, partial(_trained, environment, name, left, options.runs, place), names)
+            few: dict[Keys, int] = {
+                (place, name, str(s)): s for s in seeds[start : start + options.together]
+            }
+            left = lacking(report, path, few)
+            trained = partial(_trained, environment, name, list(left.values()), options.runs, place)
+            yield Part(path, trained, tuple(left))
 
 
 measure = InParts(parts)

@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import submitit
 from submitit.helpers import Checkpointable
@@ -22,6 +22,7 @@ from scb.errors import UserError, at_least
 from scb.files import make_folder, write_json
 
 Keys = tuple[str, ...]
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -45,7 +46,7 @@ class Part:
 
     def there(self, report: Mapping[str, Any]) -> bool:
         """Whether the report has it; None holds the place of what is to be measured again."""
-        return not lacking(report, self.path, self.names)
+        return not lacking(report, self.path, dict.fromkeys(self.names))
 
     def add(self, found: Any, report: dict[str, Any]) -> None:
         """Puts what was measured into the report."""
@@ -58,9 +59,9 @@ class Part:
             report[last] = found
 
 
-def lacking(report: Mapping[str, Any], path: Keys, names: Iterable[Keys]) -> tuple[Keys, ...]:
-    """Those of some names below a path where the report has nothing."""
-    return tuple(keys for keys in names if not _has(report, (*path, *keys)))
+def lacking(report: Mapping[str, Any], path: Keys, places: Mapping[Keys, T]) -> dict[Keys, T]:
+    """Those of some places below a path where the report has nothing, with what belongs there."""
+    return {keys: x for keys, x in places.items() if not _has(report, (*path, *keys))}
 
 
 def _has(tree: Any, keys: Keys) -> bool:

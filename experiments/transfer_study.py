@@ -22,7 +22,7 @@ from matplotlib.ticker import MaxNLocator
 
 from experiments.claims import FAILS, HOLDS, UNDECIDED, Claim, judge
 from experiments.harness import Experiment, Report, plan_of
-from experiments.parts import InParts, Part, lacking
+from experiments.parts import InParts, Keys, Part, lacking
 from experiments.searches import meta_training, objective_of_run
 from lpo.comparison import compare, ppo_spec
 from lpo.objectives import Objective, load_objective
@@ -221,11 +221,11 @@ def parts(options: Options, report: dict[str, Any]) -> Iterator[Part]:
         *((name, seed) for seed in seeds for name in options.variations),
     ):
         path = ("objectives", name)
-        places = {("returns", at.name, seed): at for at in EVALUATIONS}
-        names = lacking(report, path, places)
-        left = [places[keys] for keys in names]
+        places: dict[Keys, Evaluation] = {("returns", at.name, seed): at for at in EVALUATIONS}
+        left = lacking(report, path, places)
         digest = report.get("objectives", {}).get(name, {}).get("digests", {}).get(seed)
-        yield Part(path, partial(_judged, name, seed, left, digest, options), names)
+        judged = partial(_judged, name, seed, list(left.values()), digest, options)
+        yield Part(path, judged, tuple(left))
 
 
 measure = InParts(parts)
