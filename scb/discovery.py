@@ -13,6 +13,7 @@ from typing import Annotated, Any, cast
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import tyro
 from jax.typing import ArrayLike
 
@@ -285,7 +286,9 @@ class BanditDiscovery:
             return self._starts[name]
         path = None if self._folder is None else self._folder / f"{name}.npz"
         report: Any = None
-        weights: Weights = self.bandit.init_weights(root_key(0))
+        shapes = jax.eval_shape(self.bandit.init_weights, root_key(0))
+        # What a process holds that is told of weights, until it is.
+        weights: Weights = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), shapes)
         if processes.first() and path is not None and path.with_suffix(".json").exists():
             report = dict(bandit_metadata(str(path))["cost"])  # it is written last
             weights = load_bandit(path).default_params.weights
