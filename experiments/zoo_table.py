@@ -42,7 +42,7 @@ from scb.environments.synthetic import BanditConfig, SyntheticBandit
 from scb.environments.zoo import bandit_metadata, open_bandit, zoo_names
 from scb.errors import UserError, at_least
 from scb.importer import PUBLISHED_BANDITS, published_bandit
-from scb.judgement import check_fits, judge
+from scb.judgement import BRAX_EPISODES, EPISODES, check_fits, judge
 from scb.measurement import Place
 from scb.runs import config_dict
 from scb.seeds import REPORTING
@@ -75,9 +75,9 @@ class Options:
     bandits: tuple[str, ...] = ()
     """zoo names or path.npz; the zoo and all published if left out"""
     agents: int = 20
-    episodes: int = 50
+    episodes: int = EPISODES
     """of each agent in classic control"""
-    brax_episodes: int = 5
+    brax_episodes: int = BRAX_EPISODES
     """of each agent in Brax"""
     backend: str = "generalized"
     """Brax's physics"""

@@ -18,7 +18,7 @@ from scb.environments.registry import environment_spec
 from scb.environments.zoo import bandit_metadata, open_synthetic, save_bandit
 from scb.errors import at_least
 from scb.evolution import EvolutionConfig
-from scb.judgement import evaluation_place, judge, judge_all
+from scb.judgement import BRAX_EPISODES, EPISODES, evaluation_place, judge, judge_all
 from scb.runs import config_dict
 from scb.seeds import VALIDATING
 from scb.statistics import estimate
@@ -89,7 +89,8 @@ class Judgement:
 
     def episodes_in(self, environment: str) -> int:
         """Episodes of each agent in an environment, by name."""
-        return self.judge_episodes or (5 if environment_spec(environment).backends else 50)
+        slow = environment_spec(environment).backends
+        return self.judge_episodes or (BRAX_EPISODES if slow else EPISODES)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -211,7 +212,7 @@ class TrainConfig:
     evaluation_environment: str | None = None
     backend: str | None = None
     agents: int = 20
-    episodes: int = 50
+    episodes: int = EPISODES
     seed: int = 0
     fixed_hyperparameters: bool = False
     sampled_actions: bool = False

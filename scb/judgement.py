@@ -16,6 +16,8 @@ from scb.rows import Rows, pivot
 from scb.seeds import VALIDATING
 from scb.statistics import estimate
 
+EPISODES, BRAX_EPISODES = 50, 5  # of each agent that judges a bandit; Brax's physics are slow
+
 
 def check_fits(
     bandit: SyntheticBandit | SyntheticMDP,
@@ -57,7 +59,7 @@ def judge(
     judge_in: Place,
     seed: int,
     num_agents: int = 20,
-    num_episodes: int = 50,
+    num_episodes: int = EPISODES,
     mode: bool | None = None,
     rows: Rows | None = None,
 ) -> dict[str, np.ndarray]:
@@ -94,7 +96,7 @@ def judge_all(
     judge_in: Place,
     sampled: bool = True,
     num_agents: int = 20,
-    num_episodes: int = 50,
+    num_episodes: int = EPISODES,
 ) -> dict[str, Any]:
     """What agents of every fitting algorithm earn, by name of the algorithm in capitals, printed as it comes."""
     results = {}
