@@ -1,9 +1,12 @@
 """Two ways to do the same, timed in one process."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any
 
+import jax
 import numpy as np
+from jax.experimental.compilation_cache.compilation_cache import reset_cache
 
 OWN = "scb"
 
@@ -27,3 +30,16 @@ def in_turn(rates: Mapping[str, Callable[[], float]], repeats: int) -> dict[str,
         **{who: round(float(np.median(x))) for who, x in found.items()},
         "ratios": [round(a / b, 2) for a, b in zip(found[OWN], found[other], strict=True)],
     }
+
+
+@contextmanager
+def without_compilation_cache() -> Iterator[None]:
+    """Programs are compiled whether an earlier process has compiled them or not."""
+    before = jax.config.values["jax_enable_compilation_cache"]
+    jax.config.update("jax_enable_compilation_cache", False)
+    reset_cache()  # JAX asks once whether there is one
+    try:
+        yield
+    finally:
+        jax.config.update("jax_enable_compilation_cache", before)
+        reset_cache()

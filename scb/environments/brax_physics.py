@@ -8,9 +8,9 @@ and products cost far more than their arithmetic:
 - The forces of contacts and joint limits: accelerated projected gradient descent (Beck & Teboulle, 2009) with a line
   search, which is jaxopt's there (`nonnegative_forces`).
 
-Brax's loops always run to their ends, here they stop when all have converged. For the inverse, the axis that vmap
-adds is the last one here, so that each product of small matrices is arithmetic on whole batches. For the forces, a
-large batch is taken in chunks on a CPU: each waits for its own slowest environment alone.
+Brax's loops always run to their ends, here they stop when all have converged. For the inverse of all but humanoids'
+matrices, the axis that vmap adds is the last one here, so that each product of small matrices is arithmetic on whole
+batches. For the forces, a large batch is taken in chunks on a CPU: each waits for its own slowest environment alone.
 
 Loops that stop have no reverse mode: whoever differentiates through the physics takes Brax's own environment.
 """
@@ -29,6 +29,9 @@ from jax.custom_batching import custom_vmap
 TOLERANCE = 1e-3  # jaxopt's, of the iterates' change over the size of the step
 SMALLEST = 1e-6  # step, below which jaxopt starts from 1 again
 CHUNK = 16  # environments
+LARGEST = (
+    16  # matrix whose products are faster as arithmetic on whole batches; a humanoid's is of 23
+)
 Carry = tuple[Any, ...]
 
 
@@ -61,7 +64,9 @@ def matrix_inv(sys: Any, state: Any, iterations: int) -> Any:
     from brax.generalized import mass
 
     matrix = mass.matrix(sys, state)
-    inverse = _batches_last(partial(improved_inverse, iterations=iterations))
+    inverse: Callable[..., jax.Array] = partial(improved_inverse, iterations=iterations)
+    if len(matrix) <= LARGEST:
+        inverse = _batches_last(inverse)
     return state.replace(mass_mx=matrix, mass_mx_inv=inverse(matrix, state.mass_mx_inv))
 
 
@@ -188,6 +193,8 @@ def nonnegative_forces(
 
 def _product(left: jax.Array, right: jax.Array) -> jax.Array:
     """[N, M, ...], [M, K, ...] -> [N, K, ...]."""
+    if left.ndim == 2:
+        return left @ right
     return reduce(add, (left[:, k, None] * right[k] for k in range(len(right))))
 
 
