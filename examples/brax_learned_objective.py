@@ -11,9 +11,11 @@ from unittest import mock
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import tyro
 from brax import envs
 from brax.training.agents.ppo import losses, train
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 import lpo
 
@@ -22,7 +24,8 @@ THEIRS = losses.compute_ppo_loss
 
 def replicated(tree: Any, devices: list[jax.Device]) -> Any:
     """A copy for each device: `jax.device_put_replicated`, which Brax's trainer calls and JAX 0.10 has no more."""
-    return jax.tree.map(lambda x: jnp.stack([x] * len(devices)), tree)
+    each = NamedSharding(Mesh(np.asarray(devices), ("devices",)), PartitionSpec("devices"))
+    return jax.tree.map(lambda x: jax.device_put(jnp.stack([x] * len(devices)), each), tree)
 
 
 def loss_with(objective: str) -> Any:

@@ -10,7 +10,7 @@ from rich.console import Console
 
 from scb import processes
 
-PIPE_WIDTH = 120
+PIPE_WIDTH = 200
 
 
 def console() -> Console:
