@@ -16,7 +16,7 @@ Loops that stop have no reverse mode: whoever differentiates through the physics
 """
 
 import types
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial, reduce
 from operator import add
@@ -29,9 +29,7 @@ from jax.custom_batching import custom_vmap
 TOLERANCE = 1e-3  # jaxopt's, of the iterates' change over the size of the step
 SMALLEST = 1e-6  # step, below which jaxopt starts from 1 again
 CHUNK = 16  # environments
-LARGEST = (
-    16  # matrix whose products are faster as arithmetic on whole batches; a humanoid's is of 23
-)
+LARGEST = 16  # matrix whose products are arithmetic on whole batches; a humanoid's is of 23
 Carry = tuple[Any, ...]
 
 
@@ -193,7 +191,7 @@ def nonnegative_forces(
 
 def _product(left: jax.Array, right: jax.Array) -> jax.Array:
     """[N, M, ...], [M, K, ...] -> [N, K, ...]."""
-    if left.ndim == 2:
+    if left.ndim == 2 and len(left) > LARGEST:
         return left @ right
     return reduce(add, (left[:, k, None] * right[k] for k in range(len(right))))
 
@@ -212,12 +210,7 @@ def _batches_last(function: Callable[..., jax.Array]) -> Callable[..., jax.Array
 
     @batched.def_vmap
     def rule(size: int, is_batched: list[bool], *arrays: jax.Array) -> tuple[jax.Array, bool]:
-        last = [
-            jnp.moveaxis(array, 0, 2)
-            if there
-            else jnp.repeat(jnp.expand_dims(array, 2), size, axis=2)
-            for array, there in zip(arrays, is_batched, strict=True)
-        ]
+        last = (jnp.moveaxis(x, 0, 2) for x in _all_batched(size, is_batched, arrays))
         return jnp.moveaxis(batched(*last), 2, 0), True
 
     return batched
@@ -235,12 +228,19 @@ def _in_chunks(function: Callable[..., jax.Array]) -> Callable[..., jax.Array]:
 
     @chunked.def_vmap
     def rule(size: int, is_batched: list[bool], *arrays: jax.Array) -> tuple[jax.Array, bool]:
-        flat = [
-            (array if there else jnp.repeat(array[None], size, axis=0)).reshape(-1, *shape)
-            for array, there in zip(arrays, is_batched, strict=True)
-            for shape in [array.shape[2 if there else 1 :]]
-        ]
-        found = chunked(*flat)
+        found = chunked(
+            *(x.reshape(-1, *x.shape[2:]) for x in _all_batched(size, is_batched, arrays))
+        )
         return found.reshape(size, -1, *found.shape[1:]), True
 
     return lambda *arrays: chunked(*(array[None] for array in arrays))[0]
+
+
+def _all_batched(
+    size: int, is_batched: Sequence[bool], arrays: Sequence[jax.Array]
+) -> list[jax.Array]:
+    """What a rule of vmap is given, all of it with the new axis, which is the first."""
+    return [
+        array if there else jnp.repeat(array[None], size, axis=0)
+        for array, there in zip(arrays, is_batched, strict=True)
+    ]

@@ -28,17 +28,19 @@ def inverted(matrix: jax.Array, guess: jax.Array, iterations: int) -> jax.Array:
     return _batches_last(partial(improved_inverse, iterations=iterations))(matrix, guess)
 
 
-@pytest.mark.parametrize(
-    "inverse", [inverted, improved_inverse]
-)  # of batches last, and as products
+# The second as humanoids' are, by products.
+@pytest.mark.parametrize(("inverse", "largest"), [(inverted, 6), (improved_inverse, 5)])
 # Near: a guess from which it converges. Far: one that is given up, which converges or, as for walker2d, doesn't.
 @pytest.mark.parametrize(
     ("condition", "near", "iterations"),
     [(50, True, 10), (5, False, 20), (1000, False, 20), (1000, True, 1)],
 )
-def test_an_inverse_is_braxs_converged_or_not(inverse, condition, near, iterations):
+def test_an_inverse_is_braxs_converged_or_not(
+    inverse, largest, condition, near, iterations, monkeypatch
+):
     from brax.math import inv_approximate
 
+    monkeypatch.setattr("scb.environments.brax_physics.LARGEST", largest)
     matrix = matrices(condition, 6)
     guess = np.linalg.inv(matrix * 1.05) if near else matrix
     expected = jax.vmap(partial(inv_approximate, num_iter=iterations))(matrix, guess)
@@ -55,7 +57,7 @@ def test_an_inverse_is_the_same_in_batches_of_batches_and_alone():
     alone = jnp.stack([invert(one, guess) for one in matrix])
     batch = jax.vmap(invert, (0, None))(matrix, guess)
     batches = jax.vmap(jax.vmap(invert, (0, None)), (1, None))(matrix.reshape(2, 3, 6, 6), guess)
-    np.testing.assert_allclose(batch, alone, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(batch, alone, rtol=1e-5)
     np.testing.assert_allclose(
         batches, alone.reshape(2, 3, 6, 6).swapaxes(0, 1), rtol=1e-5, atol=1e-6
     )
