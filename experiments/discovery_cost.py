@@ -5,7 +5,8 @@
 Reads run folders of `scb discover`, finished or not. How good the search is at a generation is the
 mean return of the agents that judge its distribution's mean; it is drawn against minutes and against
 environment steps, and tabled with what it took to reach the environment's target. Nothing is
-computed anew. `--only-render` makes tables and figure from the JSON and from what the zoo says of itself.
+computed anew, and runs that the report has already stay in it, unless a folder of the same name is given.
+`--only-render` makes tables and figure from the JSON and from what the zoo says of itself.
 """
 
 import json
@@ -257,8 +258,11 @@ class Options:
 
 
 def measure(options: Options, report: dict[str, Any], save: Save) -> None:
-    """Everything anew: nothing is computed here."""
-    report |= collect(options.folders)
+    """The runs of these folders, beside those that the report has of others."""
+    earlier = {run["name"]: run for run in report.get("runs", ())}
+    found = collect(options.folders)
+    runs = earlier | {run["name"]: run for run in found["runs"]}
+    report |= {"runs": sorted(runs.values(), key=_place), "left_out": found["left_out"]}
     for left in report["left_out"]:
         print(f"left out: {left['name']}, since {left['why']}")
     save()

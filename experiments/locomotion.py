@@ -16,7 +16,7 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from experiments.claims import DECIDING, Claim, of_agents
+from experiments.claims import DECIDING, Claim, Judged, judge, of_agents
 from experiments.harness import Experiment, Report, packed
 from experiments.parts import InParts, Keys, Part, lacking
 from lpo import figures
@@ -32,6 +32,26 @@ from scb.statistics import Estimate, iqm, paired_difference
 BACKEND = "generalized"
 REFERENCE = "ppo"
 MARGIN = 0.05  # of what the reference earns: what is not worse by more is as good
+AS_GOOD = {"final": "ends no lower than PPO", "late": "earns no less over the last quarter than PPO"}
+
+
+@dataclass(frozen=True)
+class Confirmation:
+    """One claim, stated before any of its agents was trained, and decided when all have been.
+
+    Attributes:
+      environment, objective: whose it is.
+      seeds: of its agents, none of which suggested the claim.
+      of: what is said of them, as `AS_GOOD` has it.
+    """
+
+    environment: str
+    objective: str
+    seeds: Sequence[int]
+    of: str = "final"
+
+
+CONFIRMATIONS = (Confirmation("hopper", "ta-lpo", reporting(30, offset=20)),)
 
 
 @dataclass(frozen=True)
@@ -165,21 +185,36 @@ def claims(report: Report) -> list[Claim]:
     found = []
     for environment, entry in report["environments"].items():
         reference, *others = as_comparison(environment, entry).curves
-        margins = {
-            of: round(MARGIN * float(getattr(reference, of).mean()), 1) for of in ("final", "late")
-        }
-        reason = "a twentieth of what PPO's clip earns"
         for curves in others:
-            difference = {of: paired(curves, reference, of) for of in ("final", "late", "area")}
-            name = f"{environment}: {curves.objective}"
-            for of, what in (
-                ("final", "ends no lower than PPO"),
-                ("late", "earns no less over the last quarter than PPO"),
-            ):
-                text = f"{name} {what}"
-                found.append(Claim(text, difference[of], 0.0, margins[of], reason, places=0))
-            text = f"{name} earns more over the training than PPO"
-            found.append(Claim(text, difference["area"], places=0))
+            found += [_as_good(curves, reference, of) for of in AS_GOOD]
+            text = f"{environment}: {curves.objective} earns more over the training than PPO"
+            found.append(Claim(text, paired(curves, reference, "area"), places=0))
+    return found
+
+
+def _as_good(curves: LearningCurves, reference: LearningCurves, of: str) -> Claim:
+    text = f"{curves.environment}: {curves.objective} {AS_GOOD[of]}"
+    margin = round(MARGIN * float(getattr(reference, of).mean()), 1)
+    reason = "a twentieth of what PPO's clip earns"
+    return Claim(text, paired(curves, reference, of), 0.0, margin, reason, places=0)
+
+
+def confirmed(report: Report) -> list[tuple[Confirmation, int, Judged | None]]:
+    """Of every confirmation: how many of its pairs of agents there are, and once all are, what became of it."""
+    found: list[tuple[Confirmation, int, Judged | None]] = []
+    for asked in CONFIRMATIONS:
+        entry = report["environments"].get(asked.environment, {"agents": {}})
+        names = (REFERENCE, asked.objective)
+        if any(name not in entry["agents"] for name in names):
+            continue
+        agents = {name: entry["agents"][name] for name in names}
+        seeds = [str(s) for s in asked.seeds if all(str(s) in agents[name] for name in names)]
+        judged = None
+        if len(seeds) == len(asked.seeds):
+            fresh = {name: {s: agents[name][s] for s in seeds} for name in names}
+            reference, curves = as_comparison(asked.environment, {**entry, "agents": fresh}).curves
+            (judged,) = judge([_as_good(curves, reference, asked.of)])
+        found.append((asked, len(seeds), judged))
     return found
 
 
@@ -190,6 +225,7 @@ def facts(report: Report) -> dict[str, Any]:
             name: as_comparison(name, entry) for name, entry in report["environments"].items()
         },
         "deciding": DECIDING,
+        "confirmations": [(asked, AS_GOOD[asked.of], *rest) for asked, *rest in confirmed(report)],
         "sweeps": {
             name: (sweep, len(entry["sweep"][REFERENCE]), tuned(sweep))
             for name, entry in report["environments"].items()

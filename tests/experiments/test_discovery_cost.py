@@ -1,6 +1,7 @@
 """What the page on costs says must be what the run folders hold."""
 
 import json
+import shutil
 from dataclasses import replace
 
 import pytest
@@ -218,3 +219,14 @@ def test_the_interquartile_mean_counts_where_it_is_logged(tmp_path):
     assert run["statistic"] == "IQM"
     [other] = discovery_cost.collect([run_folder(tmp_path / "b", "random")])["runs"]
     assert other["statistic"] == "mean"
+
+
+def test_runs_that_were_read_before_stay_but_where_the_same_folder_is_read_again(tmp_path):
+    places = ["--out", str(tmp_path / "cost.json"), "--docs", str(tmp_path)]
+    folder = run_folder(tmp_path / "a", rows=3)
+    for given in (folder, run_folder(tmp_path / "b", "random")):
+        assert discovery_cost.EXPERIMENT.main([str(given), *places]) == 0
+    shutil.rmtree(folder)
+    assert discovery_cost.EXPERIMENT.main([str(run_folder(folder)), *places]) == 0
+    runs = json.loads((tmp_path / "cost.json").read_text())["runs"]
+    assert {run["name"]: run["generations"] for run in runs} == {"a": 4, "b": 4}

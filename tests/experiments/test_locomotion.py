@@ -154,6 +154,24 @@ def test_only_agents_of_the_same_seeds_are_compared():
     assert [x.outcome for x in judged[:3]] == [claims.UNTESTED] * 3
 
 
+def test_a_confirmation_is_decided_by_its_own_agents_when_all_are_there(monkeypatch):
+    asked = module.Confirmation("hopper", "dpo", range(4, 14))
+    monkeypatch.setattr(module, "CONFIRMATIONS", (asked,))
+    made = report(13)
+    for seed in range(4):  # which say the opposite, and are not asked
+        made["environments"]["hopper"]["agents"]["dpo"][str(seed)]["returns"] = "0 0 -9000"
+    assert module.confirmed(made) == [(asked, 9, None)]
+    assert "There are 9 yet" in module.EXPERIMENT.page(made)
+    more = report(14)["environments"]["hopper"]["agents"]
+    for name, agents in made["environments"]["hopper"]["agents"].items():
+        agents["13"] = more[name]["13"]
+    ((_, pairs, judged),) = module.confirmed(made)
+    assert (pairs, judged.outcome) == (10, claims.HOLDS)
+    assert "Their difference is +100 [100, 100]" in module.EXPERIMENT.page(made)
+    made["environments"]["hopper"]["agents"].pop("dpo")
+    assert module.confirmed(made) == []
+
+
 def test_the_shipped_curves_are_of_the_full_size_and_stand_beside_shorter_trainings():
     whole = full_size.full_size("hopper")
     # The paper's 5.24 million.
