@@ -32,7 +32,10 @@ from scb.statistics import Estimate, iqm, paired_difference
 BACKEND = "generalized"
 REFERENCE = "ppo"
 MARGIN = 0.05  # of what the reference earns: what is not worse by more is as good
-AS_GOOD = {"final": "ends no lower than PPO", "late": "earns no less over the last quarter than PPO"}
+AS_GOOD = {
+    "final": "ends no lower than PPO",
+    "late": "earns no less over the last quarter than PPO",
+}
 
 
 @dataclass(frozen=True)
