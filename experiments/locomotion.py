@@ -8,12 +8,14 @@ are trained at a time, and --out is saved after each few: the same command goes 
 that report nothing, and compared like the others. (As jobs, the same command once more trains it.)
 """
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from matplotlib.figure import Figure
 
 from experiments.claims import DECIDING, Claim, Judged, judge, of_agents
@@ -234,7 +236,11 @@ def facts(report: Report) -> dict[str, Any]:
             for name, entry in report["environments"].items()
             if (sweep := swept(entry))
         },
-        "diagnosed": [name for name in report["environments"] if _diagnosed(report, name)],
+        "diagnosed": {
+            name: {curve.objective: widths(curve)[1] for curve in curves}
+            for name in report["environments"]
+            if (curves := _diagnosed(report, name))
+        },
     }
 
 
@@ -246,6 +252,16 @@ def draw(report: Mapping[str, Any]) -> dict[str, Figure]:
         if curves := _diagnosed(report, name):
             drawn[f"locomotion_{name}_updates"] = figures.diagnosis(curves)
     return drawn
+
+
+def widths(curves: LearningCurves) -> tuple[float, float]:
+    """(first, last): standard deviation of a Gaussian policy, as the geometric mean over joints and diagnosed agents."""
+    entropy = np.nanmean((curves.diagnosis or {})["entropy"], axis=0)
+    # A Gaussian starts with a deviation of 1 in each joint, which says how many there are.
+    of_one = 0.5 * math.log(2 * math.pi * math.e)
+    joints = round(entropy[0] / of_one)
+    first, last = (math.exp(x / joints - of_one) for x in entropy[[0, -1]])
+    return first, last
 
 
 def _diagnosed(report: Mapping[str, Any], environment: str) -> list[LearningCurves]:

@@ -266,8 +266,7 @@ def learning_curves(curves: "Sequence[LearningCurves]") -> Figure:
         final.grid(axis="x", visible=False)
         final.set_ylabel("final return")
         final.set_title("At the end: each seed a dot", fontsize=10, weight="normal")
-        seeds = "1 seed" if counts == [1] else f"n = {' and '.join(map(str, counts))} seeds"
-        figure_title(figure, f"{_protocol(first)}, {seeds}")
+        figure_title(figure, f"{_protocol(first)}, {_number(counts, 'seeds')}")
         # Under its own panel, beside the names on the right; constrained layout keeps its room.
         training.legend(loc="upper center", bbox_to_anchor=(0.5, -0.17), ncols=min(len(curves), 3))
     return figure
@@ -304,12 +303,8 @@ def diagnosis(curves: "Sequence[LearningCurves]") -> Figure:
         panels[0, 0].set_yscale("log")
         for axes in panels[1]:
             axes.set_xlabel("environment steps")
-        counts = sorted({curve.diagnosed for curve in curves})
-        number = " and ".join(map(str, counts))
-        figure_title(
-            figure,
-            f"What an iteration does to the policy: {_place(curves[0])}, n = {number} agents",
-        )
+        number = _number([curve.diagnosed for curve in curves], "agents")
+        figure_title(figure, f"What an iteration does to the policy: {_place(curves[0])}, {number}")
         legend_below(figure, panels[0, 0].get_legend_handles_labels(), columns=4)
     return figure
 
@@ -429,6 +424,14 @@ def _protocol(curve: "LearningCurves") -> str:
     scale = curve.policy_output_scale
     start = "" if scale == 1.0 else f", policy's last layer x {scale:g}"
     return f"{_place(curve)}{start}: {actions} actions, {curve.episodes} episodes"
+
+
+def _number(counts: Sequence[int], of: str) -> str:
+    """How many there are: "1 seed", "n = 10 seeds", "n = 8 to 20 seeds"."""
+    low, high = min(counts), max(counts)
+    if (low, high) == (1, 1):
+        return f"1 {of.removesuffix('s')}"
+    return f"n = {low} {of}" if low == high else f"n = {low} to {high} {of}"
 
 
 def _count(steps: float) -> str:

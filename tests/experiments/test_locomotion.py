@@ -25,6 +25,8 @@ def curves(objective, seeds, end=100.0, steps=STEPS):
         "speeds": returns / 100,
         "diagnosis": {name: returns / (10 * i + 10) for i, name in enumerate(DIAGNOSIS)},
     }
+    # Of three joints, whose deviations start at 1.
+    further["diagnosis"]["entropy"] += 3 * 1.4189
     return LearningCurves(*place, np.array(steps), returns, list(seeds), 20, True, **further)
 
 
@@ -152,6 +154,13 @@ def test_only_agents_of_the_same_seeds_are_compared():
     agents["dpo"] = module.kept(curves("dpo", range(100, 104)))
     judged = claims.judge(module.claims(made))
     assert [x.outcome for x in judged[:3]] == [claims.UNTESTED] * 3
+
+
+def test_the_width_of_a_policy_is_read_off_its_entropy():
+    # At the end (50 + seed) / 50 nats more than three joints of deviation 1 have.
+    first, last = module.widths(curves("ppo", range(10), 50.0))
+    assert first == pytest.approx(1.0, abs=1e-3)
+    assert last == pytest.approx(np.exp(np.mean(50 + np.arange(10)) / 50 / 3), rel=1e-3)
 
 
 def test_a_confirmation_is_decided_by_its_own_agents_when_all_are_there(monkeypatch):
