@@ -255,7 +255,7 @@ def draw(report: Mapping[str, Any]) -> dict[str, Figure]:
 
 
 def widths(curves: LearningCurves) -> tuple[float, float]:
-    """(first, last): standard deviation of a Gaussian policy, as the geometric mean over joints and diagnosed agents."""
+    """(first, last) standard deviation of a Gaussian policy: the geometric mean over joints and diagnosed agents."""
     entropy = np.nanmean((curves.diagnosis or {})["entropy"], axis=0)
     # A Gaussian starts with a deviation of 1 in each joint, which says how many there are.
     of_one = 0.5 * math.log(2 * math.pi * math.e)
