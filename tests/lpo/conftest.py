@@ -6,6 +6,8 @@ from pathlib import Path
 import jax
 import pytest
 
+import scb.cli
+from lpo import cli
 from lpo.drifts import LearnedDrift
 from lpo.objectives import save_objective
 from scb.agents.ppo import PPOConfig
@@ -53,3 +55,46 @@ def one_sentence() -> Callable[[str], str]:
         return message
 
     return check
+
+
+PROGRAMS = {"lpo": cli.main, "scb": scb.cli.main}
+
+
+@pytest.fixture
+def working_folder(tmp_path, monkeypatch) -> Path:
+    """Where default outputs such as runs/quick would go."""
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def files(folder: Path) -> dict[str, bytes]:
+    paths = (path for path in sorted(folder.rglob("*")) if path.is_file())
+    return {str(path.relative_to(folder)): path.read_bytes() for path in paths}
+
+
+@pytest.fixture
+def refused(capsys, working_folder, one_sentence):
+    """Runs a command that must fail as a user's mistake does, and returns its sentence."""
+
+    def run(*arguments: object, program: str = "lpo") -> str:
+        before = files(working_folder)
+        assert PROGRAMS[program]([str(a) for a in arguments]) == 2
+        output, error = capsys.readouterr()
+        assert output == ""
+        assert error.startswith(f"{program}: ") and error.endswith("\n")
+        assert files(working_folder) == before
+        return one_sentence(error.removesuffix("\n"))
+
+    return run
+
+
+@pytest.fixture
+def no_training(monkeypatch):
+    """No mistake may get as far as training; the test that trains undoes this."""
+
+    def refuse(*arguments, **named):
+        raise AssertionError("this must fail before any training")
+
+    monkeypatch.setattr("lpo.meta_training.evolve", refuse)
+    monkeypatch.setattr("lpo.pipeline.run_pipeline", refuse)
+    monkeypatch.setattr("scb.measurement._program_of", refuse)
