@@ -65,6 +65,7 @@ class Regime:
             )
         at_least(1, self, "iterations", "epochs", "minibatches", "contexts")
         at_least(0, self, "reward_noise")
+        self.spec()  # which refuses what does not fit, before anything is trained
 
     def spec(self) -> AgentSpec:
         """Of its agents: the setting's own but for what is given here."""

@@ -140,6 +140,7 @@ def certify(
         kink=float(np.max([kink(progress) for progress in progress_values])),
         finite=finite,
         grid=f"{len(log_ratios)} log-ratios in [-{MAX_LOG_RATIO:g}, {MAX_LOG_RATIO:g}] x "
-        f"{len(advantages)} advantages in [-10, 10] x 3 training fractions",
+        f"{len(advantages)} advantages in [-10, 10] x {len(progress_values)} training fraction"
+        + ("s" if len(progress_values) > 1 else ""),
         by_construction=getattr(drift, "always_holds", False),
     )

@@ -19,7 +19,7 @@ from scb.errors import UserError
 from scb.files import plain
 from scb.measurement import MODE, SAMPLED, Place, measure
 from scb.rows import Rows, pivot
-from scb.statistics import Estimate, estimate, paired_difference
+from scb.statistics import Estimate, estimate, paired_difference, with_failures_as
 
 _ARRAYS = ("lengths", "speeds", "diagnosis")
 
@@ -40,6 +40,7 @@ class LearningCurves:
       speeds: [S, P] their mean forward velocity, NaN where the environment has none; None likewise.
       diagnosis: {name: [S, P]} of what an iteration does to the policy (`scb.agents.ppo.PPO.diagnose`); None where
         it was not asked for.
+      failed: agents that had no finite return at some point, where they count as random actions.
     """
 
     environment: str
@@ -54,6 +55,7 @@ class LearningCurves:
     lengths: np.ndarray | None = None
     speeds: np.ndarray | None = None
     diagnosis: dict[str, np.ndarray] | None = None
+    failed: int = 0
 
     @property
     def final(self) -> np.ndarray:
@@ -129,14 +131,20 @@ class Comparison:
 
     @property
     def caution(self) -> str:
-        """What to hold against the comparison, in a sentence; empty for nothing."""
+        """What to hold against the comparison, in sentences; empty for nothing."""
+        sentences = [
+            f"{c.failed} of {len(c.seeds)} agents of {c.objective} diverged: where they have no return, they count as "
+            "random actions."
+            for c in self.curves
+            if c.failed
+        ]
         standing = self.curves[0].standing_still
-        if standing is None or any(c.above_standing_still for c in self.curves):
-            return ""
-        return (
-            f"No agent is above standing still ({standing:g}): of moving, this tells one objective from another "
-            "nothing. Train for longer, or with other physics."
-        )
+        if standing is not None and not any(c.above_standing_still for c in self.curves):
+            sentences.append(
+                f"No agent is above standing still ({standing:g}): of moving, this tells one objective from another "
+                "nothing. Train for longer, or with other physics."
+            )
+        return " ".join(sentences)
 
     def as_dict(self) -> dict[str, Any]:
         return {
@@ -214,6 +222,10 @@ def compare(
     steps = np.asarray(list(dict.fromkeys(row["step"] for row in found)))
     columns = ("return", "length", "speed", *(DIAGNOSIS if diagnose else ()))
     measured = {value: pivot(found, "objective", "seed", "step", value=value) for value in columns}
+    finite = np.isfinite(measured["return"])
+    if not finite.all():
+        random = environment_spec(place.name).random_return(place.backend)
+        measured["return"], _ = with_failures_as(random, measured["return"])
     return Comparison(
         [
             LearningCurves(
@@ -229,6 +241,7 @@ def compare(
                 measured["length"][i],
                 measured["speed"][i],
                 {name: measured[name][i] for name in DIAGNOSIS} if diagnose else None,
+                int((~finite[i].all(axis=1)).sum()),
             )
             for i, objective in enumerate(objectives)
         ]

@@ -16,7 +16,7 @@ from lpo.fitness import FITNESSES, Fitness
 from scb.agents.ppo import PPOConfig, PPOHyperparameters
 from scb.agents.spec import AgentSpec, check_lists, environment_agent
 from scb.command_line import listed, numbers, text
-from scb.environments.registry import environment_spec
+from scb.environments.registry import check_backend, environment_spec
 from scb.errors import UserError, at_least, unknown_name
 from scb.evolution import EnvironmentSteps, EvolutionConfig
 from scb.keys import named_key, root_key, split_key
@@ -110,6 +110,8 @@ class MetaTrainingConfig:
                     f"fitness {self.fitness!r} asks for a bandit, and {name!r} is none: use 'return' or 'area', or "
                     f"train on {environment_spec(name).bandit!r}."
                 )
+        if len(self.tasks) > 1:
+            check_backend(self.backend, self.homes)
         known = {n: environment_spec(n).reference(self.backend) is not None for n in self.homes}
         if self.validation and len(known) > 1 and not all(known.values()):
             raise UserError(

@@ -116,7 +116,7 @@ def run_pipeline(run: Run, config: PipelineConfig, preset: str, command: str) ->
     Returns:
       The path of report.html.
     """
-    console = Console(stderr=True)
+    console = Console(stderr=True, markup=False)
     watch = Stopwatch()
     folder, search = run.folder, config.meta_training
     meta: dict[str, Any] = {}

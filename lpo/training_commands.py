@@ -24,7 +24,7 @@ from scb import plotting
 from scb.artefacts import package_versions
 from scb.command_line import Measuring
 from scb.console import console
-from scb.environments.registry import environment_spec
+from scb.environments.registry import check_backend, environment_spec
 from scb.errors import UserError, at_least
 from scb.files import write_json
 from scb.measurement import Place, check_seeds
@@ -211,7 +211,10 @@ class Evaluate(Comparing):
 
     def run_suite(self, name: str, objectives: Sequence[Objective]) -> None:
         config, seeds = self.config, self.config.seed_list()
-        suite_environments(name)
+        environments = suite_environments(name)
+        check_backend(config.backend, environments)
+        for environment in environments:
+            ppo_spec(environment, config.steps, config.policy_output_scale)
         (folder, rows), printer = self.opened(), console()
         scores, comparisons = run_suite(
             name,
@@ -320,7 +323,9 @@ class Align(Measuring):
         family = [*known_drifts(), *_named_apart(config.objectives)]
         regimes, seeds = config.regimes(), config.seed_list()
         target = config.environment or environment_spec(regimes[0].bandit).evaluation_environment
-        Place.named(target, config.backend)  # a mistake must not leave a folder behind
+        # A mistake must not leave a folder behind.
+        Place.named(target, config.backend)
+        ppo_spec(target, config.steps, config.policy_output_scale)
         folder, rows = self.opened()
         stored = None if folder is None else folder / "alignment.json"
         printer = console()

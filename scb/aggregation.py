@@ -14,11 +14,14 @@ import numpy as np
 from scb.agents.agent import Agent
 from scb.agents.spec import AgentSpec
 from scb.console import progress_console
+from scb.environments.registry import environment_spec
 from scb.environments.synthetic import SyntheticBandit, Weights
+from scb.errors import UserError
 from scb.evolution import map_population
 from scb.experts import EPISODES
 from scb.keys import named_key, split_key
 from scb.measurement import Judge, Place, train_and_judge
+from scb.statistics import with_failures_as
 
 TRAJECTORIES = 256
 LENGTH = 200
@@ -55,7 +58,7 @@ class Learned(NamedTuple):
     """Agents of one algorithm.
 
     Attributes:
-      returns: [N] what each earns; what is not finite counts as -inf.
+      returns: [N] what each earns; one that diverged counts as random actions.
       states: of the agents, every leaf [N], to act with; keys are left as numbers.
       keys: [N] that decided them.
     """
@@ -112,6 +115,7 @@ class Learners:
 
         self._training = {name: training(agent) for name, agent in self.agents.items()}
         self._visiting = {name: visiting(agent) for name, agent in self.agents.items()}
+        self._random = environment_spec(place.name).random_return(place.backend)
         limit = int(place.params.max_steps_in_episode)
         self.steps = number * len(specs) * episodes * limit
 
@@ -122,16 +126,28 @@ class Learners:
             key_draw, key_agents = split_key(named_key(key, name))
             drawn, keys = spec.sample(key_draw, self._number), split_key(key_agents, self._number)
             earned, states = self._training[name](drawn, keys, params)
-            learned[name] = Learned(np.where(np.isfinite(earned), earned, -np.inf), states, keys)
+            returns, _ = with_failures_as(self._random, earned)
+            learned[name] = Learned(returns, states, keys)
         mean = np.concatenate([of.returns for of in learned.values()]).mean()
         return float(mean), learned
 
     def visits(self, weights: Weights, learned: Mapping[str, Learned]) -> Visited:
-        """[N, T, ...] states that agents of a bandit visit in the environment; as many of each."""
+        """[N, T, ...] states that agents of a bandit visit in the environment; as many of each that did not diverge.
+
+        Raises:
+          UserError: all did.
+        """
         params = self._bandit.params(weights)
         visits = [self._visiting[name](of.states, of.keys, params) for name, of in learned.items()]
         flat = jax.tree.map(lambda x: jnp.reshape(x, (-1, *x.shape[2:])), visits)
-        return jax.tree.map(lambda *x: jnp.concatenate(x), *flat)
+        visited: Visited = jax.tree.map(lambda *x: jnp.concatenate(x), *flat)
+        observed = np.asarray(visited.observation)
+        usable = np.isfinite(np.reshape(observed, (len(observed), -1))).all(axis=1)
+        if not usable.any():
+            raise UserError(
+                f"all agents of {self._bandit.name} diverge: lower their learning rate, or fit another bandit."
+            )
+        return visited if usable.all() else jax.tree.map(lambda x: x[usable], visited)
 
 
 Fit = tuple[Weights, dict[str, float]]  # a bandit's weights, and how they came about

@@ -140,6 +140,11 @@ class LongRun(ABC):
                 "--resume names no run: give the folder of one, such as --resume runs/NAME."
             )
         if folder is not None:
+            out = flags_given(arguments, "out").get("out", folder)
+            if Path(out) != Path(folder):
+                raise UserError(
+                    f"--out is {out} and --resume {folder}: a resumed run goes on in its own folder; leave out --out."
+                )
             arguments = [*cls._stored(folder), *arguments]
         given = flags_given(arguments, "preset", *cls.deciding)
         preset = given.get("preset", "quick")

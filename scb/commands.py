@@ -18,7 +18,16 @@ from scb.environments.registry import environment_spec
 from scb.environments.zoo import bandit_metadata, open_synthetic, save_bandit
 from scb.errors import at_least
 from scb.evolution import EvolutionConfig
-from scb.judgement import BRAX_EPISODES, EPISODES, evaluation_place, judge, judge_all
+from scb.judgement import (
+    BRAX_EPISODES,
+    EPISODES,
+    counted,
+    evaluation_place,
+    judge,
+    judge_all,
+    told,
+)
+from scb.measurement import check_seeds
 from scb.runs import config_dict
 from scb.seeds import VALIDATING
 from scb.statistics import estimate
@@ -128,6 +137,7 @@ class Discover(LongRun):
         folder = self.open()
         outcome = problem.search(folder)
         folder.close()
+        outcome.check()
         weights = outcome.best_mean if best else outcome.mean
         results = {}
         if self.judgement.judge_agents:
@@ -139,8 +149,8 @@ class Discover(LongRun):
                 self.judgement.judge_agents,
                 self.judgement.episodes_in(config.environment),
             )
-            told = scale(config.environment, config.backend, problem.start_reports)
-            console().print(told, soft_wrap=True)
+            compared = scale(config.environment, config.backend, problem.start_reports)
+            console().print(compared, soft_wrap=True)
         if not processes.first():
             return
         metadata = {
@@ -177,8 +187,8 @@ def scale(environment: str, backend: str | None, start: Mapping[str, Mapping[str
         known[reference.source] = reference.value
     if (standing := spec.standing_still(backend)) is not None:
         known["standing still"] = standing
-    told = "; ".join(f"{who}: {value:.4g}" for who, value in known.items())
-    return f"to compare with, on {environment}: {told}"
+    values = "; ".join(f"{who}: {value:.4g}" for who, value in known.items())
+    return f"to compare with, on {environment}: {values}"
 
 
 def _origin(bandit: str) -> dict[str, Any]:
@@ -242,6 +252,7 @@ class Train(Measuring):
             bandit, config.bandit, config.evaluation_environment, config.backend
         )
         spec = bandit_agent(config.algorithm, judge_in.name, not config.fixed_hyperparameters)
+        check_seeds([config.seed])
         _, rows = self.opened()  # last: a mistake must not leave a folder behind
         by_actions = judge(
             spec,
@@ -254,6 +265,7 @@ class Train(Measuring):
             mode=not config.sampled_actions,
             rows=rows,
         )
+        by_actions, failed = counted(by_actions, judge_in)
         (returns,) = by_actions.values()
         print(f"returns on {judge_in.name}: {' '.join(f'{r:.0f}' for r in np.sort(returns))}")
-        print(f"IQM: {estimate(returns)}")
+        print(f"IQM: {estimate(returns)}{told(failed)}")

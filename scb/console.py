@@ -18,13 +18,16 @@ def console() -> Console:
 
     Of several processes the first alone says something.
     """
-    made = Console(quiet=not processes.first())
-    return made if made.quiet or sys.stdout.isatty() else Console(width=max(PIPE_WIDTH, made.width))
+    # No markup: "[no interval]" and a path with brackets are what they say.
+    made = Console(quiet=not processes.first(), markup=False)
+    if not made.quiet and not sys.stdout.isatty():
+        made.width = max(PIPE_WIDTH, made.width)
+    return made
 
 
 def progress_console(quiet: bool) -> Console:
     """Standard error, where nothing is said if `quiet`, and of several processes by the first alone."""
-    return Console(file=sys.stderr, quiet=quiet or not processes.first())
+    return Console(file=sys.stderr, quiet=quiet or not processes.first(), markup=False)
 
 
 class Progress:

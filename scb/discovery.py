@@ -53,6 +53,7 @@ from scb.lists import read_lists, write_lists
 from scb.measurement import Judge, Place, train_and_judge
 from scb.refinement import RefinementConfig, refined
 from scb.runs import Run, config_dict
+from scb.strategies import strategy_for
 from scb.warm_start import WarmStartConfig, expert_agent, warm_start
 
 INITS = ("random", "expert")
@@ -187,7 +188,8 @@ class BanditDiscovery:
         if not config.algorithms:
             config = replace(config, algorithms=algorithms_for(space))
         if isinstance(config.curriculum, str):
-            generations = config.evolution.num_generations
+            # Of none there is no curriculum to follow, but the environment must have one.
+            generations = max(1, config.evolution.num_generations)
             config = replace(config, curriculum=paper_curriculum(config.environment, generations))
         check_algorithms(config.algorithms, kind_of_actions(space))
         if config.mode == "all" and len(set(config.algorithms)) < len(config.algorithms):
@@ -213,6 +215,8 @@ class BanditDiscovery:
             config.max_steps,
         )
         self.specs = {name: self._spec(name) for name in dict.fromkeys(config.algorithms)}
+        if config.evolution.num_generations:
+            self._check_strategy()
         self._horizon, self._longest = None, None
         if isinstance(config.curriculum, CurriculumConfig):
             limit = int(self.place.params.max_steps_in_episode)
@@ -229,6 +233,13 @@ class BanditDiscovery:
         """Evolves; in a run's folder the fit is kept, so that a resumed one need not look for an expert again."""
         self._folder, self._quiet = None if run is None else run.folder, quiet
         return evolve(self, self.config.evolution, run, quiet)
+
+    def _check_strategy(self) -> None:
+        """A UserError, before anything is computed, where the strategy does not fit the weights."""
+        shapes = jax.eval_shape(self.bandit.init_weights, root_key(0))
+        strategy = strategy_for(self.config.evolution, jax.tree.map(jnp.zeros_like, shapes))
+        if self.bandit.config.form == "linear":
+            strategy.check_units(jax.tree.map(jnp.zeros_like, shapes))
 
     def _spec(self, name: str) -> AgentSpec:
         config = self.config

@@ -153,6 +153,14 @@ class Outcome:
     seconds: float
     validate: Callable[[Any], dict[str, np.ndarray]]
 
+    def check(self) -> None:
+        """Raises a UserError where no candidate of any generation had a finite fitness."""
+        if self.metrics and not any("fitness/mean" in line for line in self.metrics):
+            raise UserError(
+                f"no candidate of {len(self.metrics)} generations had a finite fitness, so nothing was found: lower "
+                "the learning rates, or start from something else."
+            )
+
     def cost(self, problem: Problem, config: EvolutionConfig, best: bool) -> dict[str, Any]:
         """What an artefact says of the search's cost; `best` where the mean judged best was taken."""
         steps, evaluations = problem.steps(), config.num_generations * config.population_size

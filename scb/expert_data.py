@@ -199,31 +199,22 @@ def labelled(
             q = jax.vmap(q_value, in_axes=(None, 0, None))(env_state, actions, key_follow)
         return actions, q, best
 
-    actions, q, best = label(*states, split_key(key_label, number))
     observations = states.observation
     if config.min_spread > 0 or config.stretch != 1 or config.jitter > 0:
-        key_jitter = named_key(key_label, "jitter")
-        observations, best = _stretched(observations, key_jitter, config, expert_policy)
-        best = jnp.reshape(best, (number, *space.shape))
-        if not isinstance(space, spaces.Discrete):
-            actions = actions.at[:, 0].set(best)
+        observations = _stretched(observations, named_key(key_label, "jitter"), config)
+    actions, q, best = label(states.env_state, observations, split_key(key_label, number))
     dataset = ExpertDataset(jnp.reshape(observations, (number, -1)), actions, q, best)
     if config.construction != "action_distance":
         total += number * actions.shape[1] * config.horizon
     return dataset, total
 
 
-def _stretched(
-    observations: jax.Array,
-    key: jax.Array,
-    config: DatasetConfig,
-    policy: Callable[[jax.Array], jax.Array],
-) -> tuple[jax.Array, jax.Array]:
-    """[S, O] states whose every entry has the least deviation, stretched and jittered; what the expert does there."""
+def _stretched(observations: jax.Array, key: jax.Array, config: DatasetConfig) -> jax.Array:
+    """[S, O] states whose every entry has the least deviation, stretched and jittered."""
     flat = jnp.reshape(observations, (observations.shape[0], -1))
     mean, std = flat.mean(axis=0), flat.std(axis=0)
     factors = config.stretch * jnp.maximum(1.0, config.min_spread / (std + 1e-8))
     stretched = mean + (flat - mean) * factors
     if config.jitter:
         stretched += config.jitter * std * jax.random.normal(key, flat.shape)
-    return stretched, jax.jit(jax.vmap(policy))(stretched)
+    return stretched

@@ -103,19 +103,20 @@ def train_expert(
     key: jax.Array,
     num_experts: int,
 ) -> Expert:
-    """The best of `num_experts` agents trained on the environment itself, by 20 episodes of mode actions."""
+    """The best of `num_experts` agents trained on the environment itself, by 20 episodes of mode actions.
+
+    Its return is that of other episodes than those which chose it.
+    """
     agent = spec.agent(env)
     judge = Judge(env, env_params, EPISODES, mode=True)
-    state, returns = best_agent(
-        agent, spec, spec.training_params(env_params), key, num_experts, judge
-    )
+    state, _ = best_agent(agent, spec, spec.training_params(env_params), key, num_experts, judge)
 
     def policy(observation: jax.Array) -> jax.Array:
         return agent.act(state, observation, key, env_params, mode=True)
 
     steps = spec.steps * num_experts
     evaluation = num_experts * EPISODES * int(env_params.max_steps_in_episode)
-    return Expert(policy, float(np.nanmax(returns)), steps + evaluation)
+    return judged(policy, env, env_params, named_key(key, "return"), steps + evaluation)
 
 
 @dataclass(frozen=True)

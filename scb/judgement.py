@@ -1,5 +1,6 @@
 """What agents of a synthetic environment are worth in the environment that it stands for."""
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,7 @@ from scb.errors import UserError
 from scb.measurement import MODE, SAMPLED, Agents, Place, measure
 from scb.rows import Rows, pivot
 from scb.seeds import VALIDATING
-from scb.statistics import estimate
+from scb.statistics import estimate, with_failures_as
 
 EPISODES, BRAX_EPISODES = 50, 5  # of each agent that judges a bandit; Brax's physics are slow
 
@@ -102,17 +103,33 @@ def judge_all(
     results = {}
     for algorithm in algorithms_for(judge_in.env.action_space(judge_in.params)):
         spec = bandit_agent(algorithm, judge_in.name, sampled)
-        returns = judge(
+        found = judge(
             spec, synthetic, weights, judge_in, VALIDATING.start, num_agents, num_episodes
         )
+        returns, failed = counted(found, judge_in)
         results[algorithm.upper()] = {
             "agents": num_agents,
             "episodes": num_episodes,
             "hyperparameters": "sampled from the paper's lists" if spec.lists else "fixed",
+            **({"failed": failed} if failed else {}),
             **{actions: estimate(x).as_dict() for actions, x in returns.items()},
         }
         line = "; ".join(
             f"{actions.replace('_', ' ')} IQM {estimate(x)}" for actions, x in returns.items()
         )
-        console().print(f"{algorithm.upper()} on {judge_in.name}: {line}")
+        console().print(f"{algorithm.upper()} on {judge_in.name}: {line}{told(failed)}")
     return results
+
+
+def counted(
+    returns: Mapping[str, np.ndarray], judge_in: Place
+) -> tuple[dict[str, np.ndarray], int]:
+    """(what `judge` found, where an agent that diverged counts as random actions do; how many agents did)."""
+    random = environment_spec(judge_in.name).random_return(judge_in.backend)
+    found = {name: with_failures_as(random, x) for name, x in returns.items()}
+    return {k: values for k, (values, _) in found.items()}, max(n for _, n in found.values())
+
+
+def told(failed: int) -> str:
+    """How many agents failed, as the end of a sentence; empty for none."""
+    return f"; {failed} diverged, counted as random actions" if failed else ""

@@ -8,7 +8,7 @@ throughout, which is all that humanoidstandup asks for.
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -215,11 +215,11 @@ class _LinearSearch:
         grown = min(1.0, number / config.error_warmup) if config.error_warmup else 1.0
         errors = jnp.float32(grown * config.action_errors)
         episodes = self._roll(population, kept["seen"], key_roll, errors)
-        state, fitness, seen, steps = self._tell(
+        state, fitness, failed, seen, steps = self._tell(
             state, population, episodes, kept["seen"], key_tell
         )
         kept |= {"search": state, "seen": seen}
-        metrics = {"fitness/mean": float(fitness), "failed": 0}
+        metrics = {"fitness/mean": float(fitness), "failed": int(failed)}
         if judging:
             mean = self._ars.get_mean(state)
             judge = self._worth or self._mean_return
@@ -292,10 +292,15 @@ class _LinearSearch:
         key: jax.Array,
     ) -> Any:
         fitness = (episodes.returns - self._bonus * episodes.lengths)[:, 0]
+        observed = episodes.observations
+        assert observed is not None
+        # Where the simulation broke down nothing is known, and what was seen there is not learned from.
+        failed = ~(jnp.isfinite(fitness) & jnp.isfinite(observed.mean + observed.squares).all(-1))
+        worst = jnp.min(jnp.where(failed, jnp.inf, fitness))
+        fitness = jnp.where(failed, jnp.where(jnp.isfinite(worst), worst, 0.0), fitness)
         state, _ = self._ars.tell(key, population, -fitness, state, self._ars.default_params)
-        assert episodes.observations is not None
-        seen = merge_statistics(seen, episodes.observations)
-        return state, fitness.mean(), seen, episodes.lengths.sum()
+        seen = merge_statistics(seen, replace(observed, count=jnp.where(failed, 0, observed.count)))
+        return state, fitness.mean(), failed.sum(), seen, episodes.lengths.sum()
 
     def _judged(self, expert: Expert, key: jax.Array) -> Any:
         """What it earns under the noise and all of the errors, and the environment steps that took."""

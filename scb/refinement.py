@@ -201,10 +201,12 @@ class Refinement:
 def paired_ranks(returns: np.ndarray) -> np.ndarray:
     """[2 D] the rank of how much one way earns more than the other, the sign with it; -1 to 1.
 
-    Agents differ by more than what they follow does: by their returns alone the best agents would decide.
+    Agents differ by more than what they follow does: by their returns alone the best agents would decide. A pair in
+    which one has no finite return says nothing.
     """
-    ahead, back = np.split(np.nan_to_num(np.asarray(returns, float), neginf=0.0), 2)
-    difference = ahead - back
+    ahead, back = np.split(np.asarray(returns, float), 2)
+    known = np.isfinite(ahead) & np.isfinite(back)
+    difference = np.where(known, np.where(known, ahead, 0) - np.where(known, back, 0), 0.0)
     ranks = np.argsort(np.argsort(np.abs(difference))) + 1
     signed = np.sign(difference) * ranks / len(ranks)
     return np.concatenate([signed, -signed])

@@ -75,10 +75,11 @@ class Rows:
                     f"{self.path or 'the rows'} were measured under another configuration: it differs at "
                     f"{difference}; choose another file, or measure as then."
                 )
-        if self.path is not None and digest not in self._configurations:
+        if digest not in self._configurations:
             self._configurations[digest] = described
-            self._described.parent.mkdir(parents=True, exist_ok=True)
-            write_json(self._described, self._configurations)
+            if self.path is not None:
+                self._described.parent.mkdir(parents=True, exist_ok=True)
+                write_json(self._described, self._configurations)
         done: dict[tuple[int, int], list[Row]] = {}
         for row in there:
             done.setdefault((row["seed"], row["agent"]), []).append(row)

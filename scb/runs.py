@@ -12,6 +12,7 @@ runs/NAME/.lock             held by the process that writes here
 import hashlib
 import json
 import os
+import secrets
 import shutil
 import socket
 import time
@@ -72,6 +73,8 @@ class Run:
             process's, or its config differs.
         """
         folder = Path(folder)
+        if wandb_project:
+            _wandb()  # that a missing package leaves no folder behind
         config = json.loads(json.dumps(config))
         if resume:
             stored = read_config(folder)
@@ -342,11 +345,25 @@ def first_difference(stored: Any, given: Any, path: str = "") -> str:
     return "" if stored == given else f"{path.lstrip('.')} ({stored!r} there, {given!r} now)"
 
 
-def _start_wandb(folder: Path, project: str) -> Any:
+def _wandb() -> Any:
     try:
         import wandb
     except ImportError as error:
         raise UserError(
             "logging to Weights & Biases needs the package wandb: install the extra `wandb`."
         ) from error
-    return wandb.init(project=project, name=folder.name, dir=str(folder), resume="allow")
+    return wandb
+
+
+def _start_wandb(folder: Path, project: str) -> Any:
+    """The folder's run there, which is the same one after a resumption."""
+    kept = folder / "wandb-id.txt"
+    if not kept.exists():
+        write_text(kept, secrets.token_hex(4))
+    return _wandb().init(
+        project=project,
+        name=folder.name,
+        dir=str(folder),
+        id=kept.read_text().strip(),
+        resume="allow",
+    )

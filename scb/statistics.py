@@ -47,6 +47,13 @@ class Estimate:
         return asdict(self)
 
 
+def with_failures_as(instead: float, returns: ArrayLike) -> tuple[NDArray[np.floating], int]:
+    """(returns, how many were no finite number): those of agents that diverged count as `instead`, such as random's."""
+    values = np.asarray(returns, np.float64)
+    failed = ~np.isfinite(values)
+    return np.where(failed, instead, values), int(failed.sum())
+
+
 def iqm(x: ArrayLike, axis: int | None = None) -> NDArray[np.floating]:
     """Interquartile mean: the mean after dropping the lowest and the highest quarter.
 
@@ -118,7 +125,7 @@ def stratified_estimate(
       UserError: no groups, or other sizes in `minus`.
     """
     first = [_runs("a group", group) for group in groups]
-    second = [_runs("a group", group) for group in minus or ()]
+    second = [_runs("a group", group) for group in (() if minus is None else minus)]
     if not first:
         raise UserError("there is no group: give at least one.")
     if minus is not None and (

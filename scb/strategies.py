@@ -1,5 +1,6 @@
 """Evolution strategies: any of evosax's by name, behind one interface that maximises."""
 
+import math
 from dataclasses import replace
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
@@ -11,7 +12,7 @@ import numpy as np
 import optax
 
 from scb.errors import UserError
-from scb.keys import split_key
+from scb.keys import root_key, split_key
 from scb.start import unstarted
 
 with unstarted():
@@ -83,14 +84,9 @@ class Strategy:
     def start(self, key: jax.Array, solution: Any, units: Any = None) -> Any:
         """The state before the first ask; `units`, a tree like the solution, are factors on its initial deviations."""
         if units is not None:
+            self.check_units(solution)
             state = self._algorithm.init(key, solution, self._params)
-            factors = jax.flatten_util.ravel_pytree(units)[0]
-            if np.shape(getattr(state, "std", 0.0)) != factors.shape:
-                raise UserError(
-                    f"{self._name} has one deviation for all weights, and those of this bandit have different sizes: "
-                    "choose SNES, or the form networks."
-                )
-            return state.replace(std=state.std * factors)
+            return state.replace(std=state.std * jax.flatten_util.ravel_pytree(units)[0])
         if self.has_mean:
             return self._algorithm.init(key, solution, self._params)
         key_population, key_init = split_key(key)
@@ -101,6 +97,18 @@ class Strategy:
         # infinity.
         unknown = jnp.full(self._size, 1e9)
         return self._algorithm.init(key_init, population, unknown, self._params)
+
+    def check_units(self, solution: Any) -> None:
+        """Raises a UserError where the strategy has no deviation for each weight, which units ask for."""
+        weights = sum(math.prod(leaf.shape) for leaf in jax.tree.leaves(solution))
+        state = self.has_mean and jax.eval_shape(
+            lambda: self._algorithm.init(root_key(0), solution, self._params)
+        )
+        if np.shape(getattr(state, "std", 0.0)) != (weights,):
+            raise UserError(
+                f"{self._name} has one deviation for all weights, and those of this bandit have different sizes: "
+                "choose SNES, or the form networks."
+            )
 
     def ask(self, key: jax.Array, state: Any) -> tuple[Any, Any]:
         return self._algorithm.ask(key, state, self._params)

@@ -24,10 +24,14 @@ def update_statistics(statistics: RunningStatistics, batch: jax.Array) -> Runnin
 
 def merge_statistics(statistics: RunningStatistics, others: RunningStatistics) -> RunningStatistics:
     """Adds what [N] others have seen; of those that are one observation, count says whether it counts."""
-    count = others.count.sum()
-    mean = jnp.sum(others.count[:, None] * others.mean, axis=0) / jnp.maximum(count, 1)
-    spread = others.count[:, None] * (others.mean - mean) ** 2
-    return _merged(statistics, count, mean, jnp.sum(others.squares + spread, axis=0))
+    count, counts = others.count.sum(), others.count[:, None] > 0
+    # What does not count may be no number: nothing times that were none either.
+    means = jnp.where(counts, others.mean, 0.0)
+    mean = jnp.sum(others.count[:, None] * means, axis=0) / jnp.maximum(count, 1)
+    spread = others.count[:, None] * (means - mean) ** 2
+    squares = jnp.where(counts, others.squares, 0.0)
+    merged = _merged(statistics, count, mean, jnp.sum(squares + spread, axis=0))
+    return jax.tree.map(lambda new, old: jnp.where(count > 0, new, old), merged, statistics)
 
 
 def _merged(

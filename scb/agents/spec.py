@@ -22,6 +22,8 @@ from scb.keys import split_key
 
 # Of 32 bits, which is what an agent calculates with.
 _LARGEST = float(jnp.finfo(jnp.float32).max)
+# What is a factor or a share, of which more than 1 makes no sense.
+_SHARES = ("discount", "gae_lambda", "polyak", "epsilon_start", "epsilon_end", "epsilon_decay")
 # {name: its tables, with the algorithm itself}. In the order that lists and pages name them in.
 ALGORITHMS: dict[str, Tables] = {tables.algorithm.name: tables for tables in TABLES}
 
@@ -225,7 +227,7 @@ def check_algorithms(names: Sequence[str], kind: str) -> None:
 
 
 def check_lists(lists: Lists, hyperparameters: Any) -> None:
-    """Raises a UserError for an unknown hyperparameter, no list or an empty one, or what is no finite number."""
+    """Raises a UserError for an unknown hyperparameter, no list or an empty one, or a value that none can have."""
     known = [f.name for f in fields(hyperparameters)]
     for name, values in lists.items():
         if name not in known:
@@ -241,6 +243,9 @@ def check_lists(lists: Lists, hyperparameters: Any) -> None:
                     f"{name} has the value {value!r}, which is no number that an agent can take: give finite "
                     "numbers only."
                 )
+            if value < 0 or (name in _SHARES and value > 1):
+                allowed = "between 0 and 1" if name in _SHARES else "0 or larger"
+                raise UserError(f"{name} has the value {value!r}: it must be {allowed}.")
 
 
 @cache

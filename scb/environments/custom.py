@@ -1,6 +1,7 @@
 """Environments that are in no registry: `package.module:factory`, imported when one is made."""
 
 import importlib
+import inspect
 import re
 import sys
 from collections.abc import Sequence
@@ -42,6 +43,11 @@ class CustomFamily(Family):
                 f"environment {name!r} cannot be imported ({error}): give package.module:factory, of a module that "
                 "Python finds from here."
             ) from error
+        try:
+            # Before the call, inside of which a TypeError is a mistake of another kind.
+            inspect.signature(function).bind(**arguments)
+        except TypeError as error:
+            raise UserError(f"environment {name!r} does not take {arguments}: {error}.") from error
         made = function(**arguments)
         env, params = made if isinstance(made, tuple) and len(made) == 2 else (made, None)
         if not isinstance(env, environment.Environment):

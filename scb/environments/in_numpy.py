@@ -10,6 +10,7 @@ from gymnax.environments import spaces
 from scb.environments.linear import PolicyDistanceParts
 from scb.environments.synthetic import SyntheticBandit
 from scb.environments.synthetic_mdp import SyntheticMDP
+from scb.errors import UserError
 from scb.keys import root_key, split_key
 
 Array: TypeAlias = np.ndarray
@@ -113,7 +114,13 @@ class InNumpy:
             actions = range(self._choices)
             each = [self.step(contexts, np.full(len(contexts), action))[1] for action in actions]
             table = np.stack(each, axis=1).tolist()
-            return lambda row, action: float(table[row][action])
+
+            def of_table(row: int, action: Any) -> float:
+                if not 0 <= action < len(actions):
+                    raise _outside(action, len(actions))
+                return float(table[row][action])
+
+            return of_table
         if (distance := self._distance) is not None:
             best = distance.best(contexts)
 
@@ -138,13 +145,29 @@ class InNumpy:
         return self._networks["transition"](inputs), reward, terminated
 
 
+def _outside(action: Any, number: int) -> UserError:
+    return UserError(f"an action is {action}: it must be 0 or larger, and below {number}.")
+
+
 def _encoding(space: spaces.Box | spaces.Discrete) -> Callable[[Array], Array]:
     """[B, ...] actions -> [B, A] as networks take them, see `scb.environments.synthetic.encode_action`."""
     if isinstance(space, spaces.Discrete):
         choices = np.eye(space.n, dtype=np.float32)
-        return lambda action: choices[action]
+
+        def one_hot(action: Array) -> Array:
+            outside = (action < 0) | (action >= space.n)
+            if outside.any():
+                raise _outside(action[outside][0], space.n)
+            return choices[action]
+
+        return one_hot
     low, high = (
         np.broadcast_to(np.asarray(x, np.float32), space.shape) for x in (space.low, space.high)
     )
+
     # minimum and maximum are quicker than clip, of which there is one a step.
-    return lambda action: np.minimum(np.maximum(action, low), high).reshape(len(action), -1)
+    def clipped(action: Array) -> Array:
+        action = np.asarray(action, np.float32)
+        return np.minimum(np.maximum(action, low), high).reshape(len(action), -1)
+
+    return clipped

@@ -5,10 +5,11 @@ A new family of environments touches two files: a module with its `scb.environme
 settings for is trained with general ones.
 """
 
+from collections.abc import Iterable
 from typing import Any
 
 from scb.environments.spec import EnvironmentSpec, Family, Made
-from scb.errors import unknown_name
+from scb.errors import UserError, unknown_name
 
 _FAMILIES: dict[str, Family] = {}
 
@@ -42,6 +43,21 @@ def environment_spec(name: str) -> EnvironmentSpec:
         if family.owns(name):
             return family.spec(name)
     raise unknown_name("environment", name, environment_names())
+
+
+def check_backend(backend: str | None, names: Iterable[str]) -> None:
+    """Raises a UserError for physics that none of these environments has."""
+    names = list(names)
+    known = {x for name in names for x in environment_spec(name).backends}
+    if backend is not None and backend not in known:
+        raise UserError(
+            f"the backend is {backend!r}, and of {', '.join(names)} "
+            + (
+                f"those with a choice take {', '.join(sorted(known))}."
+                if known
+                else "none has a choice: leave it out."
+            )
+        )
 
 
 def make(name: str, backend: str | None = None, **arguments: Any) -> Made:

@@ -78,6 +78,8 @@ class EnvironmentSpec:
         try:
             return self.maker(**arguments)
         except TypeError as error:
+            if not arguments:  # then it is a mistake of the maker's own
+                raise
             raise UserError(
                 f"environment {self.name!r} does not take {arguments}: {error}."
             ) from error

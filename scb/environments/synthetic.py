@@ -91,6 +91,11 @@ class BanditConfig:
         one_of("bandit activation", self.activation, ACTIVATIONS)
         one_of("latent distribution", self.latent, LATENTS)
         at_least(1, self, "hidden_size", "latent_size")
+        if self.form == "linear" and self.latent != "normal":
+            raise UserError(
+                f"the contexts of the form linear are normally distributed, and the latent is {self.latent}: take "
+                "normal, or the form networks."
+            )
 
 
 _State = TypeVar("_State", bound=environment.EnvState)
@@ -125,6 +130,11 @@ class SyntheticEnvironment(environment.Environment[_State, _Params]):
         weights: Weights | None,
         name: str,
     ) -> None:
+        if config.form == "linear" and config.latent_size not in (None, observation_size):
+            raise UserError(
+                f"latent_size is {config.latent_size}, and the form linear makes the {observation_size} observations "
+                "of as many numbers: leave it out, or take the form networks."
+            )
         self.config = config
         self.observation_size = observation_size
         self._action_space = action_space

@@ -88,6 +88,18 @@ def test_a_number_out_of_range_is_told_its_range(refused, arguments, message):
         ("meta-train --horizons 0.5,x", "horizons '0.5,x' are no numbers"),
         ("align --bandits Pendulum-v1", "'Pendulum-v1' is none"),
         ("align --agents -4", "agents is -4: it must be at least 1."),
+        # Before the agents of the environment are trained.
+        ("align --minibatches 7", "num_minibatches is 7, which does not divide a batch of 200"),
+        ("align --steps 0 --out new", "steps is 0: it must be at least 1"),
+        ("evaluate --suite classic --steps 0 --out new", "steps is 0: it must be at least 1"),
+        (
+            "evaluate --suite classic --backend spring",
+            "Pendulum-v1 none has a choice: leave it out.",
+        ),
+        (
+            "evaluate --suite brax --backend sprig",
+            "those with a choice take generalized, mjx, posi",
+        ),
         ("align --contexts 0", "contexts is 0: it must be at least 1."),
         ("evaluate --objectives", "no objectives: give at least one"),
         ("evaluate --objectives ppo ppo", "objective 'ppo' is there twice"),

@@ -17,6 +17,7 @@ from lpo.comparison import (
 from lpo.objectives import Objective, load_objective
 from scb.agents.ppo import PPOHyperparameters
 from scb.agents.spec import AgentSpec
+from scb.environments.registry import environment_spec
 from scb.errors import UserError
 
 SEEDS = (7, 8, 9)
@@ -48,6 +49,30 @@ def test_a_difference_is_positive_where_the_objective_is_better_than_the_referen
     # -3 - -5 = 2 and -9 - -5 = -4; equal seeds leave the interval no width.
     assert (differences["dpo"].value, differences["dpo"].low, differences["dpo"].high) == (2, 2, 2)
     assert differences["none"].value == -4
+
+
+def test_agents_that_diverge_count_as_random_actions_and_are_told(monkeypatch):
+    def measured(*_, objectives, agents, **__):
+        ends = {7: -200.0, 8: None, 9: -300.0}
+        return [
+            {
+                "objective": o.name,
+                "seed": seed,
+                "step": step,
+                "return": x if o.name == "dpo" else -1,
+            }
+            for o in objectives
+            for seed in agents
+            for step, x in ((0, -1200.0), (10, ends[seed]))
+        ]
+
+    monkeypatch.setattr("lpo.comparison.measure", measured)
+    made = compare("Pendulum-v1", [load_objective("ppo"), load_objective("dpo")], SEEDS)
+    random = environment_spec("Pendulum-v1").random_return()
+    np.testing.assert_array_equal(made.curves[1].final, [-200.0, random, -300.0])
+    assert [c.failed for c in made.curves] == [0, 1]
+    assert made.caution.startswith("1 of 3 agents of dpo diverged")
+    json.dumps(made.as_dict(), allow_nan=False)
 
 
 def hoppers(objective: str, ends: list[float]) -> LearningCurves:

@@ -12,9 +12,11 @@ from scb import aggregation, warm_start
 from scb.agents.ppo import PPOConfig, PPOHyperparameters
 from scb.agents.spec import AgentSpec
 from scb.aggregation import Learners, Visited
+from scb.environments.registry import environment_spec
 from scb.environments.synthetic import BanditConfig, bandit_for
 from scb.errors import UserError
 from scb.experts import Expert
+from scb.keys import split_key
 from scb.measurement import Place
 from scb.warm_start import WarmStartConfig
 
@@ -138,13 +140,25 @@ def test_a_search_for_an_expert_is_told_what_its_pupils_earn(bandit, place, monk
     assert float(best[0]) == pytest.approx(float(turning(observation)[0]) / 2, abs=0.05)
 
 
-def test_agents_whose_training_breaks_are_the_worst(bandit, place, monkeypatch):
+def test_agents_whose_training_breaks_count_as_random_actions_and_are_not_followed(
+    bandit, place, monkeypatch
+):
     monkeypatch.setattr(aggregation, "TRAJECTORIES", 2)
     broken = jax.tree.map(lambda x: x * np.nan, bandit.init_weights(jax.random.key(0)))
     learners = Learners(bandit, SPECS, place, 2)
     earned, learned = learners(broken, jax.random.key(1))
-    assert earned == -np.inf and (learned["ppo"].returns == -np.inf).all()
-    assert learners.visits(broken, learned).observation.shape == (2, 200, 3)
+    random = environment_spec("Pendulum-v1").random_return()
+    assert earned == random and (learned["ppo"].returns == random).all()
+    with pytest.raises(UserError, match=r"all agents of .* diverge"):
+        learners.visits(broken, learned)
+    sound, _ = split_key(jax.random.key(2))
+    _, fine = learners(bandit.init_weights(sound), jax.random.key(1))
+    states = jax.tree.map(
+        lambda a, b: np.concatenate([a[:1], b[1:]]), fine["ppo"].states, learned["ppo"].states
+    )
+    one_of_two = {"ppo": fine["ppo"]._replace(states=states)}
+    visited = learners.visits(bandit.init_weights(sound), one_of_two)
+    assert visited.observation.shape == (1, 200, 3) and np.isfinite(visited.observation).all()
 
 
 def test_an_expert_below_random_actions_is_refused(bandit, place, monkeypatch):

@@ -16,9 +16,10 @@ from scb import artefacts, listing
 from scb.cli import main
 from scb.command_line import Output
 from scb.commands import Discover, Judgement, TrainConfig
+from scb.console import console
 from scb.curriculum import CurriculumConfig, paper_curriculum
 from scb.discovery import BanditDiscovery, DiscoveryConfig
-from scb.environments.registry import make
+from scb.environments.registry import environment_spec, make
 from scb.environments.synthetic import BanditConfig
 from scb.environments.zoo import bandit_metadata, load_bandit, zoo_names
 from scb.evolution import EvolutionConfig
@@ -168,7 +169,7 @@ def test_flags_become_a_configuration_and_what_is_left_out_keeps_its_default():
 EVERY_FLAG = """--preset=paper --environment=MountainCar-v0 --backend=spring --max-steps=5 --algorithms=ppo,dqn,ppo
 --mode=sequential '--hyperparameters={"ppo": {"learning_rate": [0.25]}}' --agents-per-candidate=3
 --evaluation-episodes=2 --mode-actions --curriculum=linear:2:4:0:2 --from-bandit=b.npz --reward-std=4.0
---select=best --hidden-size=3 --activation=relu --latent=uniform --latent-size=2 --form=linear
+--select=best --hidden-size=3 --activation=relu --form=linear
 --construction=q --expert=sac --expert-noise=0.2 --expert-errors=0.3 --expert-pupils=2
 --expert-episode-steps=5 --expert-sigma=0.1 --expert-learning-rate=0.2 --expert-decay=0.9 --expert-reach=1.5
 --expert-error-warmup=4 --expert-starts=2
@@ -195,7 +196,7 @@ def test_the_command_that_a_configuration_is_written_as_asks_for_it_again():
         if value == getattr(getattr(command.config, group), name)
     } | {name for name, value in paper.items() if value == config_dict(command.config)[name]}
     contradicting = {"fixed_hyperparameters", "init", "parameterization"}
-    contradicting |= {"min_spread", "stretch", "jitter"}
+    contradicting |= {"min_spread", "stretch", "jitter", "latent", "latent_size"}
     assert same == {"configs", *contradicting}
     for text in (
         "--environment=CartPole-v1",
@@ -203,6 +204,8 @@ def test_the_command_that_a_configuration_is_written_as_asks_for_it_again():
         "--min-spread=0.5",
         "--stretch=1.5",
         "--jitter=1.0",
+        "--latent=uniform",
+        "--latent-size=2",
         "--parameterization=TI --init=random",
     ):
         words = text.split()
@@ -358,6 +361,22 @@ def test_training_prints_the_sorted_returns_and_their_mean(bandit_file):
     # The seed decides everything.
     assert call(*train).out == result.out
     assert call(*train, "--seed", "1").out != result.out
+
+
+def test_agents_that_diverge_count_as_random_actions_and_are_told(bandit_file, monkeypatch):
+    def judged(spec, bandit, weights, judge_in, seed, agents, episodes, mode, rows):
+        return {"mode_actions": np.array([100.0, np.nan, 300.0])}
+
+    monkeypatch.setattr("scb.commands.judge", judged)
+    shown = call("train", "--bandit", bandit_file).out
+    random = environment_spec("CartPole-v1").random_return()
+    assert f"returns on CartPole-v1: {random:.0f} 100 300" in shown
+    assert shown.endswith("(n=3); 1 diverged, counted as random actions\n")
+
+
+def test_what_is_printed_has_no_markup(capsys):
+    console().print("139.4 [no interval] o10[/b]")
+    assert capsys.readouterr().out == "139.4 [no interval] o10[/b]\n"
 
 
 def test_training_keeps_agents_for_other_statistics_and_goes_on(bandit_file, tmp_path):

@@ -24,6 +24,9 @@ def wrong():
     return "a pendulum"
 
 number = 3
+
+def broken():
+    return 1 + "one"
 """
 
 
@@ -63,6 +66,13 @@ def test_an_environment_is_what_the_factory_returns(module):
 def test_what_is_no_factory_is_refused(module, name, message):
     with pytest.raises(UserError, match=message):
         make(name.format(module))
+
+
+def test_a_bug_inside_of_a_factory_is_not_taken_for_wrong_arguments(module):
+    with pytest.raises(TypeError, match="unsupported operand"):
+        make(f"{module}:broken")
+    with pytest.raises(UserError, match=r"does not take {'length': 3}"):
+        make(f"{module}:broken", length=3)
 
 
 @pytest.mark.slow

@@ -334,6 +334,9 @@ def test_a_generation_that_fails_altogether_leaves_the_mean_where_it_was(strateg
     assert column(outcome, "failed") == 8 * [8]
     # 0 would be the maximum. No number was measured, and the log has none.
     assert not [name for line in outcome.metrics for name in line if name.startswith("fitness/")]
+    with pytest.raises(UserError, match="no candidate of 8 generations had a finite fitness"):
+        outcome.check()
+    evolve(Parabola(), CONFIG, quiet=True).check()
 
 
 # -- what it cost, and what its end is worth

@@ -158,8 +158,8 @@ def test_any_agent_can_be_the_expert():
     expert = train_expert(Corridor(cells=4), CELLS, spec, jax.random.key(0), num_experts=2)
     assert expert.mean_return == 4.0
     assert actions(expert) == BEST
-    # Two agents of 480 steps, each judged by 20 episodes of 4.
-    assert expert.environment_steps == 2 * (480 + 20 * 4)
+    # Two agents of 480 steps, each judged by 20 episodes of 4, the better one by 20 more.
+    assert expert.environment_steps == 2 * (480 + 20 * 4) + 20 * 4
 
 
 # -- the best of several

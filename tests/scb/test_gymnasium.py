@@ -156,6 +156,25 @@ def test_a_single_step_pays_what_many_together_pay(name):
     np.testing.assert_allclose(rewards, expected, rtol=1e-3, atol=2e-4 * np.abs(expected).max())
 
 
+@pytest.mark.parametrize("number", [1, 3])
+def test_observations_are_of_their_space_whatever_precision_actions_have(file, number):
+    env = SyntheticEnv(file) if number == 1 else SyntheticVectorEnv(file, number)
+    env.reset(seed=0)
+    action = np.zeros(env.action_space.shape, np.float64)
+    assert env.observation_space.contains(env.step(action)[0])
+
+
+@pytest.mark.parametrize("action", [-1, 2])
+def test_an_action_that_is_none_is_refused(action):
+    for env in (
+        SyntheticEnv("Synthetic-CartPole-v1"),
+        SyntheticVectorEnv("Synthetic-CartPole-v1", 2),
+    ):
+        env.reset(seed=0)
+        with pytest.raises(UserError, match=f"an action is {action}: it must be 0 or larger, and"):
+            env.step(np.broadcast_to(action, env.action_space.shape))
+
+
 def test_a_bandits_episode_is_one_step():
     env = gymnasium.make(BANDIT)
     first, info = env.reset(seed=1)

@@ -40,6 +40,21 @@ def test_its_steps_are_counted(expert):
     assert expert.environment_steps == 30 * 2 * 8 * 2 + 3 * 20 * 2
 
 
+class Breaking(ContinuousCorridor):
+    """A corridor whose simulation breaks down where the action is large: in some episodes of a search."""
+
+    def step_env(self, key, state, action, params):
+        observation, *rest = super().step_env(key, state, action, params)
+        return jnp.where(jnp.abs(action[0]) > 0.3, jnp.nan, observation), *rest
+
+
+def test_episodes_that_break_down_are_counted_and_not_learned_from(capsys):
+    env, config = Breaking(cells=2), replace(SEARCH, generations=4, judge_every=4)
+    search_linear_expert(env, TWO_TARGETS, jax.random.key(0), config, quiet=False)
+    first, *_, last = capsys.readouterr().err.splitlines()
+    assert "failed" in first + last and "nan" not in first + last
+
+
 def test_it_says_how_far_it_is(capsys):
     env, config = ContinuousCorridor(cells=2), replace(SEARCH, generations=3, judge_every=2)
     search_linear_expert(env, TWO_TARGETS, jax.random.key(0), config, quiet=False)

@@ -367,3 +367,12 @@ def test_a_configuration_can_be_read(file):
     for configuration in configurations.values():
         assert configuration["episodes"] == 5
         assert configuration["agent"]["config"]["total_steps"] == 72
+
+
+def test_rows_in_memory_refuse_another_configuration_too():
+    rows = Rows()
+    row = {"environment": "e", "configuration": "", "seed": 0, "agent": 0, "return": 1.0}
+    digest = rows.cell({"environment": "e"}, {"a": 1}, 1).digest
+    rows.add([row | {"configuration": digest}])
+    with pytest.raises(UserError, match="the rows were measured under another configuration"):
+        rows.cell({"environment": "e"}, {"a": 2}, 1)

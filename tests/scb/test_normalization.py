@@ -56,6 +56,12 @@ def test_normalisation_by_hand_and_its_limit():
     )
 
 
+def test_what_does_not_count_may_be_no_number():
+    one = RunningStatistics(jnp.array([0.0]), jnp.array([[jnp.nan]]), jnp.array([[jnp.nan]]))
+    for before in (RunningStatistics.start(1), seen(np.array([[1.0], [5.0]]))):
+        jax.tree.map(np.testing.assert_array_equal, merge_statistics(before, one), before)
+
+
 def test_before_any_observation_nothing_changes():
     observation = jnp.array([0.5, -3.0])
     np.testing.assert_allclose(normalize(RunningStatistics.start(2), observation), observation)

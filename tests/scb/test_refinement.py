@@ -67,7 +67,10 @@ def test_pairs_are_ranked_by_their_difference_whoever_they_are_of():
     # Of three pairs the second is of an agent that earns a thousand times as much.
     ranks = paired_ranks(np.array([1.0, 3000.0, 2.0, 3.0, 2999.0, 7.0]))
     np.testing.assert_allclose(ranks, [-2 / 3, 1 / 3, -1, 2 / 3, -1 / 3, 1])
-    assert np.isfinite(paired_ranks(np.array([np.nan, -np.inf, 1.0, 2.0]))).all()
+    # Nothing is known of a pair of which one side diverged; the others differ by 10 and by -20.
+    ranks = paired_ranks(np.array([np.nan, -200.0, -300.0, -250.0, -210.0, -280.0]))
+    np.testing.assert_allclose(ranks, [0, 2 / 3, -1, 0, -2 / 3, 1])
+    assert not paired_ranks(np.array([np.nan, -np.inf, 1.0, 2.0])).any()
 
 
 PENDULUM = Place.named("Pendulum-v1")

@@ -1,4 +1,6 @@
 import json
+import sys
+from types import SimpleNamespace
 
 import jax.numpy as jnp
 import numpy as np
@@ -91,9 +93,21 @@ def test_what_is_no_run_cannot_be_resumed(tmp_path, content):
 
 
 def test_logging_to_wandb_needs_its_package(tmp_path, monkeypatch):
-    monkeypatch.setitem(__import__("sys").modules, "wandb", None)
+    monkeypatch.setitem(sys.modules, "wandb", None)
     with pytest.raises(UserError, match="needs the package wandb: install the extra"):
         Run.open(tmp_path / "run", CONFIG, wandb_project="bandits")
+    assert not (tmp_path / "run").exists()  # which would be in the way of the next try
+
+
+def test_a_resumed_run_goes_on_in_its_own_run_of_wandb(tmp_path, monkeypatch):
+    started = []
+    wandb = SimpleNamespace(init=lambda **named: started.append(named) or SimpleNamespace())
+    monkeypatch.setitem(sys.modules, "wandb", wandb)
+    for resume in (False, True):
+        Run.open(tmp_path / "run", CONFIG, resume, wandb_project="bandits")
+    Run.open(tmp_path / "other", CONFIG, wandb_project="bandits")
+    first, again, other = (x["id"] for x in started)
+    assert first == again != other and {x["resume"] for x in started} == {"allow"}
 
 
 # -- logs

@@ -181,6 +181,21 @@ def test_tried_actions_lie_about_the_experts_and_everywhere(noisy_dataset):
     assert len(np.unique(tried[:, 1:])) > 512 * 9
 
 
+def test_actions_near_the_experts_are_near_what_it_does_in_the_stretched_state():
+    env, params = make("Pendulum-v1")
+    # In a state of its own a torque in proportion to the velocity, which stretching multiplies.
+    slope = Expert(lambda observation: observation[2:] / 8, mean_return=0.0, environment_steps=0)
+    config = WarmStartConfig(
+        num_states=512, num_actions=11, near_actions=6, stretch=4.0, jitter=1.0
+    )
+    dataset, _ = expert_dataset(slope, Place(env.name, env, params), jax.random.key(4), config)
+    best, tried = np.asarray(dataset.expert_action), np.asarray(dataset.action)[..., 0]
+    inside = np.abs(best[:, 0]) < 0.2  # where the bounds of 2 take nothing
+    assert inside.sum() > 20
+    apart = (tried[:, 1:7] - best)[inside]
+    assert apart.std() == pytest.approx(0.6, rel=0.15)
+
+
 def test_what_the_expert_does_there_is_without_noise(noisy_dataset):
     np.testing.assert_array_equal(noisy_dataset.expert_action, 0.5)
 
@@ -454,8 +469,8 @@ def test_the_expert_is_the_best_of_those_that_were_trained():
     spec = AgentSpec("ppo", TINY, PPOHyperparameters())
     best = train_expert(env, params, spec, key, 32)
     assert best.mean_return >= 7
-    # 32 agents with one batch of 2 x 8 steps, each judged by 20 episodes of at most 100.
-    assert best.environment_steps == 32 * (16 + 20 * 100)
+    # 32 agents with one batch of 2 x 8 steps, each judged by 20 episodes of at most 100, the best by 20 more.
+    assert best.environment_steps == 32 * (16 + 20 * 100) + 20 * 100
     # The agent that is handed out earns what it says.
     actions = jax.jit(jax.vmap(best.policy))(np.eye(10))
     assert actions.sum() == best.mean_return
