@@ -13,7 +13,7 @@ PYTEST := $(BIN)/python -m pytest -q -n auto --dist loadfile
 .PHONY: help run test test-all lint format bench sb3 torture experiments docs clean
 
 help: ## list the commands
-	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-11s %s\n", $$1, $$2 }' Makefile
+	@awk -F ':.*## ' '/^[a-z0-9-]+:.*## / { printf "make %-11s %s\n", $$1, $$2 }' Makefile
 
 run: $(INSTALLED) ## learn an objective, train PPO with it, judge it: runs/quick/report.html
 	@$(BIN)/lpo run --preset quick $(if $(wildcard runs/quick/config.json),--resume,--out) runs/quick

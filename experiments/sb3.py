@@ -22,6 +22,7 @@ from matplotlib.ticker import EngFormatter
 
 from experiments.claims import DECIDING, Claim, of_agents
 from experiments.harness import Experiment, Report, Save, packed, unpacked
+from experiments.rendering import text
 from scb import plotting
 from scb.environments.registry import environment_spec
 from scb.errors import UserError, at_least, one_of
@@ -169,11 +170,29 @@ def facts(report: Report) -> dict[str, Any]:
         "tables": tables,
         "every": sorted({n for x in report["steps"].values() for n in x}),
         "counts": sorted(counts),
+        "ends": "; ".join(_ends(tables, report["steps"])),
+        "several": len({algorithm for of_it in tables.values() for algorithm in of_it}) > 1,
         "deciding": DECIDING,
         "expert": {name: environment_spec(name).reference() for name in tables},
         "random": {name: environment_spec(name).random_return() for name in tables},
         "seed": REPORTING.start,
     }
+
+
+def _ends(
+    tables: Mapping[str, Mapping[str, Mapping[str, list[Estimate]]]],
+    steps: Mapping[str, Sequence[int]],
+) -> Iterator[str]:
+    """Of each algorithm in each environment what it ends with, in words."""
+    for name, algorithms in tables.items():
+        for algorithm, places in algorithms.items():
+            ends = [
+                f"{text(row[-1], 0)} trained in {'the bandit of ' if place == 'bandit' else ''}{name}"
+                + ("" if place == "bandit" else " itself")
+                for place, row in places.items()
+            ]
+            number = thousands(steps[algorithm][-1])
+            yield f"{algorithm.upper()} after {number} steps: {', '.join(ends)}"
 
 
 def draw(report: Mapping[str, Any]) -> Figure:

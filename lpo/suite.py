@@ -6,7 +6,7 @@ from a bootstrap that resamples seeds within every environment.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -65,6 +65,15 @@ class SuiteScores:
     def differences(self) -> list[Estimate]:
         """Each aggregate minus the first objective's, paired by seed."""
         return self._estimates(1.0)
+
+    def without(self, *environments: str) -> "SuiteScores | None":
+        """The scores of the others, such as those on which no objective was learned; None where none is left."""
+        kept = [i for i, name in enumerate(self.environments) if name not in environments]
+        if not kept:
+            return None
+        of_each = ("environments", "random", "reference", "sources")
+        chosen = {name: [getattr(self, name)[i] for i in kept] for name in of_each}
+        return replace(self, scores=self.scores[:, kept], **chosen)
 
     def _estimates(self, times_reference: float) -> list[Estimate]:
         def aggregate(runs: np.ndarray) -> np.ndarray:

@@ -18,7 +18,7 @@ from lpo.alignment import Regime, correlation_text, known_drifts, measure_alignm
 from lpo.comparison import Comparison, LearningCurves, check_names, compare, ppo_spec
 from lpo.fitness import LABELS
 from lpo.objectives import Objective, load_objective
-from lpo.suite import run_suite
+from lpo.suite import SuiteScores, run_suite
 from lpo.suite import suite as suite_environments
 from scb import plotting
 from scb.artefacts import package_versions
@@ -232,12 +232,12 @@ class Evaluate(Comparing):
         for environment, comparison in comparisons.items():
             table.add_row(environment, *(str(estimate(c.final)) for c in comparison.curves))
         printer.print(table)
-        first = scores.objectives[0]
-        table = Table("objective", "normalised score, IQM [95 %]", f"difference to {first}")
-        found = zip(scores.objectives, scores.aggregate(), scores.differences(), strict=True)
-        for objective, score, difference in found:
-            table.add_row(objective, str(score), "" if objective == first else str(difference))
-        printer.print(table)
+        printer.print(_scores_table(scores, "over all of them"))
+        homes = learned_in(objectives)
+        elsewhere = scores.without(*homes)
+        if elsewhere is not None and len(elsewhere.environments) < len(scores.environments):
+            where = f"without {', '.join(homes)}, for which one of them was learned"
+            printer.print(_scores_table(elsewhere, where))
         if scores.left_out:
             printer.print(f"left out, nobody beat random actions: {', '.join(scores.left_out)}")
         if folder is not None:
@@ -249,6 +249,7 @@ class Evaluate(Comparing):
                 **config_dict(config),
                 "seeds": seeds,
                 **scores.as_dict(),
+                "elsewhere": None if elsewhere is None else elsewhere.as_dict(),
                 "versions": package_versions(),
             }
             write_json(folder / "suite.json", content)
@@ -349,6 +350,23 @@ class Align(Measuring):
         printer.print(table)
         if folder is not None:
             plotting.save(figures.alignment_heatmap(report), folder / "alignment.png")
+
+
+def learned_in(objectives: Sequence[Objective]) -> list[str]:
+    """The environments that objectives were learned for: themselves, or what their bandits stand for."""
+    tasks = [task for objective in objectives for task in objective.learned_on]
+    return sorted({environment_spec(task).evaluation_environment for task in tasks})
+
+
+def _scores_table(scores: SuiteScores, where: str) -> Table:
+    first, *_ = scores.objectives
+    table = Table(
+        "objective", "normalised score, IQM [95 %]", f"difference to {first}", title=where
+    )
+    found = zip(scores.objectives, scores.aggregate(), scores.differences(), strict=True)
+    for objective, score, difference in found:
+        table.add_row(objective, str(score), "" if objective == first else str(difference))
+    return table
 
 
 def _moving(curves: LearningCurves) -> tuple[str, ...]:

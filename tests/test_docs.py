@@ -103,8 +103,11 @@ def test_a_table_of_objectives_says_what_was_measured(data, page):
 @pytest.mark.parametrize("suite", ["classic", "minatar", "brax"])
 def test_a_table_of_a_suite_says_what_was_measured(suite):
     report, text = read(f"suite_{suite}"), (DOCS / "suites.md").read_text()
-    for aggregate in report["aggregate"]:
-        assert f"| {rendering.text(aggregate, 2)} |" in text
+    for scores in (report, report.get("elsewhere")):
+        for aggregate in scores["aggregate"] if scores else ():
+            assert f"| {rendering.text(aggregate, 2)} |" in text
+        for difference in scores["differences"][1:] if scores else ():
+            assert f"| {rendering.text(difference, 2, sign=True)} |" in text
 
 
 def test_what_readme_says_of_objectives_stands_in_the_results():

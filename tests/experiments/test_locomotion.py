@@ -170,7 +170,7 @@ def test_a_confirmation_is_decided_by_its_own_agents_when_all_are_there(monkeypa
     for seed in range(4):  # which say the opposite, and are not asked
         made["environments"]["hopper"]["agents"]["dpo"][str(seed)]["returns"] = "0 0 -9000"
     assert module.confirmed(made) == [(asked, 9, None)]
-    assert "There are 9 yet" in module.EXPERIMENT.page(made)
+    assert "9 of 10 pairs are trained" in module.EXPERIMENT.page(made)
     more = report(14)["environments"]["hopper"]["agents"]
     for name, agents in made["environments"]["hopper"]["agents"].items():
         agents["13"] = more[name]["13"]

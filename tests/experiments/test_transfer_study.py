@@ -71,7 +71,7 @@ def test_one_search_decides_nothing_and_several_do(report):
     assert any(x.startswith("no gate (Pendulum") for x in found["worse"])
     # One search of the noise in common with the default is none that decides.
     assert found["behind"] == ["no gate"]
-    assert "initialisation, by the whole interval of several searches: no gate.**" in (
+    assert "end behind the default on Pendulum, with either initialisation: no gate.**" in (
         module.EXPERIMENT.page(report)
     )
 

@@ -9,6 +9,7 @@ from lpo import figures, suite, training_commands
 from lpo.comparison import Comparison, LearningCurves, learning_curves
 from lpo.objectives import load_objective
 from lpo.suite import RESAMPLES, SuiteScores, run_suite, suite_scores, suites
+from lpo.training_commands import learned_in
 from scb import plotting
 from scb.agents.ppo import PPOHyperparameters
 from scb.agents.spec import AgentSpec, environment_agent
@@ -79,6 +80,25 @@ def test_published_brax_returns_are_of_one_physics():
     there = [curves("hopper", "ppo", [600.0, 700.0], backend="generalized")]
     assert suite.reference_of("hopper", Comparison(here))[0] == 650.0
     assert suite.reference_of("hopper", Comparison(there))[0] == 2521.9
+
+
+def test_scores_without_an_environment_are_those_of_the_others():
+    catch, cart = "Catch-bsuite", "CartPole-v1"
+    known = {
+        catch: comparison(catch, ppo=[1.0, 2.0], dpo=[2.0, 2.0]),
+        cart: comparison(cart, ppo=[500.0, 300.0], dpo=[400.0, 400.0]),
+    }
+    random = {catch: 0.0, cart: 20.0}
+    rest = suite_scores(known, random).without(cart)
+    alone = suite_scores({catch: known[catch]}, random)
+    assert rest.as_dict() == alone.as_dict() and rest.sources == alone.sources
+    assert suite_scores(known, random).without(cart, catch) is None
+
+
+def test_an_objective_was_learned_for_what_its_bandits_stand_for():
+    names = ("ppo", "lpo-pendulum", "lpo-multi", "lpo-pendulum-ee")
+    homes = [learned_in([load_objective(name)]) for name in names]
+    assert homes == [[], ["Pendulum-v1"], ["CartPole-v1", "Pendulum-v1"], ["Pendulum-v1"]]
 
 
 def test_an_environment_that_nobody_learned_is_left_out_and_said_so():
