@@ -65,7 +65,7 @@ def test_an_interrupted_experiment_measures_only_what_is_missing(tmp_path):
     assert report["parts"] == {"a": 1, "b": 1} and report["measured"] == 2
     written = (tmp_path / "docs" / "counting.md").read_text()
     assert "**The paper** (no figure): parts are measured once." in written
-    assert "**Here** it *holds*: 2 measured." in written
+    assert "**The paper's claim *holds* here:** 2 measured." in written
     assert "quick preset has fewer" in written
     assert (tmp_path / "docs" / "figures" / "counting.png").exists()
 

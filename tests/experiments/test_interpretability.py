@@ -47,7 +47,7 @@ def test_claims_follow_the_figures(report):
         x |= share(0.5 if "velocity" in name else 0.01)
     for name in ("position (m)", "angle (rad)"):
         changed["environments"]["CartPole-v1"]["importance"][name] |= share(0.02)
-    assert "at least 50%" in interpretability.EXPERIMENT.block("verdict", changed)
+    assert "50% or more" in interpretability.EXPERIMENT.block("verdict", changed)
     found = [x.outcome for x in interpretability.EXPERIMENT.judged(changed)]
     assert found == ["holds"] * 4 + ["does not hold"]
     # A share whose interval reaches over the tenth is undecided, wherever its point is.
