@@ -175,8 +175,36 @@ def facts(report: Mapping[str, Any]) -> dict[str, Any]:
         "machines": list(map(json.loads, sorted(machines))),
         "differing": differing,
         "shipped": shipped(),
+        "starts": starts(runs),
         "end": _end,
     }
+
+
+def starts(runs: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Of every environment with runs of both starts, the first of each to reach the target, by total steps.
+
+    Returns:
+      [{"environment", "warm", "random": the run or None, "tried": generations of the longest random search}].
+    """
+    found = []
+    for environment in dict.fromkeys(run["environment"] for run in runs):
+        of_each = {
+            start: [r for r in runs if (r["environment"], r["start"]) == (environment, start)]
+            for start in STARTS
+        }
+        if not all(of_each.values()):
+            continue
+        first = {
+            start: min(
+                (r for r in of_it if r["reached"]),
+                key=lambda r: r["reached"]["steps"],
+                default=None,
+            )
+            for start, of_it in of_each.items()
+        }
+        tried = max(run["generations"] for run in of_each["random"])
+        found.append({"environment": environment, "tried": tried, **first})
+    return found
 
 
 def shipped() -> list[dict[str, Any]]:

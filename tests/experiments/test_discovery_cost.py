@@ -230,3 +230,17 @@ def test_runs_that_were_read_before_stay_but_where_the_same_folder_is_read_again
     assert discovery_cost.EXPERIMENT.main([str(run_folder(folder)), *places]) == 0
     runs = json.loads((tmp_path / "cost.json").read_text())["runs"]
     assert {run["name"]: run["generations"] for run in runs} == {"a": 4, "b": 4}
+
+
+def test_what_a_warm_start_saves_is_told_where_both_reach_the_target(tmp_path):
+    # The target is -170: the warm run is there before generation 2, after 220 steps, the random one after 440.
+    warm = run_folder(tmp_path / "a")
+    late = run_folder(tmp_path / "b", "random", judged={0: -400.0, 2: -300.0})
+    never = run_folder(tmp_path / "c", "random", judged={0: -400.0}, final=-300.0)
+    report = discovery_cost.collect([warm, late, never])
+    page = discovery_cost.EXPERIMENT.page(report)
+    assert "**On Pendulum-v1 a random start took 2 times the steps of a warm one" in page
+    assert "Not reached from random weights" not in page
+    page = discovery_cost.EXPERIMENT.page(discovery_cost.collect([warm, never]))
+    assert "Not reached from random weights: Pendulum-v1 in 4 generations." in page
+    assert "Not reached" not in discovery_cost.EXPERIMENT.page(discovery_cost.collect([warm]))
