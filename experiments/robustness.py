@@ -30,7 +30,7 @@ from scb.agents.spec import AgentSpec
 from scb.environments.registry import environment_spec
 from scb.errors import UserError, at_least
 from scb.measurement import Agents, Place, measure
-from scb.plotting import BLUE, VERMILLION, estimate_row
+from scb.plotting import BLUE, VERMILLION, estimate_row, figure_title
 from scb.rows import Rows
 from scb.seeds import REPORTING, VALIDATING
 from scb.statistics import Statistic, normalized_score, stratified_estimate, worst_decile
@@ -227,6 +227,7 @@ def draw(report: Mapping[str, Any]) -> Figure:
         axes.set(xlabel=label)
         axes.set_yticks(range(len(rows)), [row["name"] for row in rows])
     axes.invert_yaxis()
+    figure_title(figure, "PPO with drawn hyperparameters: scores of all environments, 95 % intervals")
     return figure
 
 

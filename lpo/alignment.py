@@ -342,7 +342,8 @@ def measure_alignment(
 
 
 def correlation_text(correlation: Mapping[str, float | None]) -> str:
-    """Such as "0.93 [0.81, 0.98]"."""
-    interval = f"[{correlation['low']:.2f}, {correlation['high']:.2f}]"
+    """Such as "0.93 [0.81, 0.98]"; where all earn the same there is nothing to rank."""
     value = correlation["spearman"]
-    return f"undefined {interval}" if value is None else f"{value:.2f} {interval}"
+    if value is None:
+        return "none: all alike"
+    return f"{value:.2f} [{correlation['low']:.2f}, {correlation['high']:.2f}]"
