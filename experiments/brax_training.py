@@ -33,10 +33,12 @@ from scb.statistics import estimate
 OURS, PUBLISHED = "ours", "published"
 BRAX = ("hopper", "walker2d", "swimmer", "halfcheetah", "humanoidstandup")
 LOOKS: dict[str, dict[str, Any]] = {
-    "trained in the bandit": {"color": plotting.BLUE, "linestyle": "-"},
-    "trained in the environment": {"color": plotting.VERMILLION, "linestyle": "--"},
+    OURS: {"color": plotting.BLUE, "linestyle": "-"},
+    PUBLISHED: {"color": plotting.PURPLE, "linestyle": "-."},
+    "environment": {"color": plotting.VERMILLION, "linestyle": "--"},
 }
-PAPER = "the paper, environment"
+WORDS = {OURS: "our bandit", PUBLISHED: "the published bandit", "environment": "the environment"}
+PAPER = "the environment, in the paper (at the end)"
 ROUGHLY = 50  # times as many steps are roughly two orders of magnitude
 
 
@@ -266,33 +268,42 @@ def _times(row: Mapping[str, Any], steps: float | None) -> str:
 
 
 def draw(report: Mapping[str, Any]) -> Figure:
-    """A row a bandit, a column an algorithm; steps on a logarithmic axis."""
+    """A row an environment, a column an algorithm; steps on a logarithmic axis."""
     algorithms = list(next(iter(report["bandits"].values())))
-    figure = Figure(figsize=(3.1 * len(algorithms), 2.9 * len(report["bandits"]) + 0.4))
+    # {environment: {where its agents train: {algorithm: curves}}}
+    places: dict[str, dict[str, Any]] = {}
+    for name, curves in report["bandits"].items():
+        environment = _environment_of(name)
+        of_it = places.setdefault(environment, {"environment": report["environments"][environment]})
+        of_it[name.rpartition(", ")[2]] = curves
+    figure = Figure(figsize=(2.7 * len(algorithms), 2.4 * len(places) + 0.9))
     panels: Any = figure.subplots(
-        len(report["bandits"]), len(algorithms), squeeze=False, sharey="row"
+        len(places), len(algorithms), squeeze=False, sharey="row", sharex="col"
     )
-    for row, (name, curves) in zip(panels, report["bandits"].items(), strict=True):
-        own = report["environments"][_environment_of(name)]
+    for row, (environment, found) in zip(panels, places.items(), strict=True):
         for axes, algorithm in zip(row, algorithms, strict=True):
-            for found, look in zip((curves, own), LOOKS.values(), strict=True):
-                if (found := found.get(algorithm)) is None:
+            for place, look in LOOKS.items():
+                if (curve := found.get(place, {}).get(algorithm)) is None:
                     continue
                 # A logarithmic axis has no zero: the untrained agent is left out.
-                shown = np.asarray(found["steps"]) > 0
-                steps = np.asarray(found["steps"])[shown]
-                estimates = [estimate(x) for x in np.transpose(found["returns"])[shown]]
+                shown = np.asarray(curve["steps"]) > 0
+                steps = np.asarray(curve["steps"])[shown]
+                estimates = [estimate(x) for x in np.transpose(curve["returns"])[shown]]
                 plotting.estimate_curve(axes, steps, estimates, **look)
-            paper = zoo_table_page.paper_return(name.split(" ")[0], algorithm)
+            paper = zoo_table_page.paper_return(environment.split(" ")[0], algorithm)
             # The paper's physics.
-            if algorithm not in own and paper is not None and "(generalized)" in name:
+            if algorithm not in found["environment"] and paper and "(generalized)" in environment:
                 axes.axhline(paper, color=plotting.GREY, linestyle=":")
             axes.set_xscale("log")
-            axes.set_title(f"{name}\n{algorithm.upper()}", fontsize=9)
-            axes.set_xlabel("training steps")
-        row[0].set_ylabel("return in the environment")
-    plotting.legend_of(figure, {**LOOKS, PAPER: {"color": plotting.GREY, "linestyle": ":"}}, 3)
-    plotting.figure_title(figure, "Interquartile mean over agents with its 95 % interval")
+        row[0].set_ylabel(f"return on\n{environment}")
+    for axes, algorithm in zip(panels[0], algorithms, strict=True):
+        axes.set_title(algorithm.upper())
+    for axes in panels[-1]:
+        axes.set_xlabel("training steps")
+    legend = {WORDS[place]: look for place, look in LOOKS.items()}
+    legend[PAPER] = {"color": plotting.GREY, "linestyle": ":"}
+    plotting.legend_of(figure, legend, 4)
+    plotting.figure_title(figure, "Agents by where they trained: interquartile mean, 95 % interval")
     return figure
 
 

@@ -227,7 +227,9 @@ def draw(report: Mapping[str, Any]) -> Figure:
         axes.set(xlabel=label)
         axes.set_yticks(range(len(rows)), [row["name"] for row in rows])
     axes.invert_yaxis()
-    figure_title(figure, "PPO with drawn hyperparameters: scores of all environments, 95 % intervals")
+    figure_title(
+        figure, "PPO with drawn hyperparameters: scores of all environments, 95 % intervals"
+    )
     return figure
 
 
