@@ -125,9 +125,11 @@ def counted(
     returns: Mapping[str, np.ndarray], judge_in: Place
 ) -> tuple[dict[str, np.ndarray], int]:
     """(what `judge` found, where an agent that diverged counts as random actions do; how many agents did)."""
+    failed = max(int((~np.isfinite(x)).sum()) for x in returns.values())
+    if not failed:
+        return dict(returns), 0
     random = environment_spec(judge_in.name).random_return(judge_in.backend)
-    found = {name: with_failures_as(random, x) for name, x in returns.items()}
-    return {k: values for k, (values, _) in found.items()}, max(n for _, n in found.values())
+    return {name: with_failures_as(random, x)[0] for name, x in returns.items()}, failed
 
 
 def told(failed: int) -> str:
