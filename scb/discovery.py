@@ -6,7 +6,7 @@ their return in the evaluation environment. The same search finds the paper's fu
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, cast
@@ -155,6 +155,13 @@ class DiscoveryConfig:
         if self.parameterization != "I" and self.start is not None:
             raise UserError("a synthetic MDP cannot start from a bandit: leave the start out.")
         fitted = self.init == "expert" and self.start is None
+        for entry in () if fitted else fields(self.warm_start):
+            value = getattr(self.warm_start, entry.name)
+            if value != entry.default:
+                raise UserError(
+                    f"{entry.name} is {value}, and nothing is fitted to an expert: leave it out, or choose init "
+                    "expert and no bandit to start from."
+                )
         if fitted and self.bandit.form == "linear":
             check_linear(self.warm_start.construction)
         if self.refinement.rounds and self.bandit.form != "linear":

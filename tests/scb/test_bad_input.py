@@ -104,6 +104,14 @@ pytestmark = pytest.mark.usefixtures("small_agents")
             "discover --form linear --strategy Open_ES",
             "Open_ES has one deviation for all weights, and those of this bandit have different",
         ),
+        (
+            "discover --init random --expert linear --stretch 3",
+            "stretch is 3.0, and nothing is fitted to an expert: leave it out, or choose init ex",
+        ),
+        (
+            "discover --from-bandit Synthetic-Pendulum-v1 --num-experts 3",
+            "num_experts is 3, and nothing is fitted to an expert",
+        ),
         ("discover --out elsewhere --resume FOLDER", "--out is elsewhere and --resume"),
         ("train --seed 4294967296 --out new", "a seed is 4294967296: each must be 0 or larger"),
         (
@@ -114,6 +122,14 @@ pytestmark = pytest.mark.usefixtures("small_agents")
         (
             "discover --form linear --strategy Open_ES",
             "Open_ES has one deviation for all weights, and those of this bandit have different",
+        ),
+        (
+            "discover --init random --expert linear --stretch 3",
+            "stretch is 3.0, and nothing is fitted to an expert: leave it out, or choose init ex",
+        ),
+        (
+            "discover --from-bandit Synthetic-Pendulum-v1 --num-experts 3",
+            "num_experts is 3, and nothing is fitted to an expert",
         ),
         ("discover --out elsewhere --resume FOLDER", "--out is elsewhere and --resume"),
         ("train --seed 4294967296 --out new", "a seed is 4294967296: each must be 0 or larger"),

@@ -168,9 +168,9 @@ def test_flags_become_a_configuration_and_what_is_left_out_keeps_its_default():
 
 EVERY_FLAG = """--preset=paper --environment=MountainCar-v0 --backend=spring --max-steps=5 --algorithms=ppo,dqn,ppo
 --mode=sequential '--hyperparameters={"ppo": {"learning_rate": [0.25]}}' --agents-per-candidate=3
---evaluation-episodes=2 --mode-actions --curriculum=linear:2:4:0:2 --from-bandit=b.npz --reward-std=4.0
+--evaluation-episodes=2 --mode-actions --curriculum=linear:2:4:0:2 --init=expert --reward-std=4.0
 --select=best --hidden-size=3 --activation=relu --form=linear
---construction=q --expert=sac --expert-noise=0.2 --expert-errors=0.3 --expert-pupils=2
+--expert=sac --expert-noise=0.2 --expert-errors=0.3 --expert-pupils=2
 --expert-episode-steps=5 --expert-sigma=0.1 --expert-learning-rate=0.2 --expert-decay=0.9 --expert-reach=1.5
 --expert-error-warmup=4 --expert-starts=2
 --near-actions=2 --num-experts=3
@@ -195,7 +195,7 @@ def test_the_command_that_a_configuration_is_written_as_asks_for_it_again():
         for name, value in paper[group].items()
         if value == getattr(getattr(command.config, group), name)
     } | {name for name, value in paper.items() if value == config_dict(command.config)[name]}
-    contradicting = {"fixed_hyperparameters", "init", "parameterization"}
+    contradicting = {"fixed_hyperparameters", "start", "parameterization", "construction"}
     contradicting |= {"min_spread", "stretch", "jitter", "latent", "latent_size"}
     assert same == {"configs", *contradicting}
     for text in (
@@ -205,6 +205,8 @@ def test_the_command_that_a_configuration_is_written_as_asks_for_it_again():
         "--stretch=1.5",
         "--jitter=1.0",
         "--latent=uniform",
+        "--construction=q",
+        "--from-bandit=b.npz",
         "--latent-size=2",
         "--parameterization=TI --init=random",
     ):
