@@ -20,6 +20,9 @@ def with_parameters(length=7):
     env, params = gymnax.make("Pendulum-v1")
     return env, params.replace(max_steps_in_episode=length)
 
+def pole():
+    return gymnax.make("CartPole-v1")
+
 def wrong():
     return "a pendulum"
 
@@ -80,16 +83,16 @@ def test_a_bandit_is_discovered_for_it_and_says_what_its_returns_are_to_be_compa
     module, tmp_path, capsys, monkeypatch, small_agents
 ):
     monkeypatch.setattr("scb.commands.judge_all", lambda *_: {})  # it takes the longest
-    name = f"{module}:with_parameters"
+    name = f"{module}:pole"
     flags = ["--population-size=2", "--generations=1", "--mean-evaluations=2", "--judge-agents=2"]
     flags += ["--agents-per-candidate=1", "--evaluation-episodes=1", "--judge-episodes=1"]
-    flags += ["--expert-steps=500", "--fit-steps=10", "--algorithms=ppo", "--expert=ppo"]
+    flags += ["--expert-steps=4000", "--fit-steps=10", "--algorithms=ppo", "--expert=ppo"]
     out = tmp_path / "run"
     status = main(["discover", f"--environment={name}", *flags, f"--out={out}"])
     said = capsys.readouterr()
     assert status == 0, said.err
-    assert f"to compare with, on {name}: random actions: -" in said.out
-    assert "the expert that the bandit was fitted to, in 20 episodes: -" in said.out
-    path = out / f"Synthetic-{module}-with_parameters.npz"
+    assert f"to compare with, on {name}: random actions: 2" in said.out
+    assert "the expert that the bandit was fitted to, in 20 episodes: " in said.out
+    path = out / f"Synthetic-{module}-pole.npz"
     assert bandit_metadata(str(path))["config"]["evaluation_environment"] == name
     assert environment_spec(str(path)).evaluation_environment == name
