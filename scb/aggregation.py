@@ -171,7 +171,7 @@ def best_round(
       quiet: nothing on the terminal.
 
     Returns:
-      (the fit, whose report tells its round and what its agents earn, by which it was chosen; environment steps of all).
+      (the fit, whose report tells its round and what its agents earn, which chose it; environment steps of all).
     """
     console = progress_console(quiet)
     (latest, report), best, kept, steps = start, -np.inf, start, 0
