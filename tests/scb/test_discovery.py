@@ -483,9 +483,10 @@ def test_an_expert_start_is_fitted_once_and_from_the_seed_alone(monkeypatch):
         "reward_r2",
         "energy_distance",
     }
-    # Two experts of two batches of 2 x 8 steps, each judged by 20 episodes of at most 500; 256
-    # trajectories of 200 steps, and 16 states with 2 actions of 3 steps.
-    assert report["environment_steps"] == 2 * (2 * 16 + 20 * 500) + 256 * 200 + 16 * 2 * 3
+    # Two experts of two batches of 2 x 8 steps, each judged by 20 episodes of at most 500, the better one by 20
+    # more; 256 trajectories of 200 steps, and 16 states with 2 actions of 3 steps.
+    experts = 2 * (2 * 16 + 20 * 500) + 20 * 500
+    assert report["environment_steps"] == experts + 256 * 200 + 16 * 2 * 3
     assert 8 <= report["expert_return"] <= 500
 
 
