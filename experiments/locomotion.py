@@ -185,10 +185,29 @@ def paired(
     return of_agents(partial(paired_difference, ours, theirs), len(ours)) if len(ours) else None
 
 
+def looked_at(report: Report) -> dict[str, Any]:
+    """{environment: its entry} without the agents of confirmations that are not complete.
+
+    Who looks at a difference while it grows sees it pass its margin sooner or later.
+    """
+    pending = [asked for asked, _, judged in confirmed(report) if judged is None]
+    found = {}
+    for environment, entry in report["environments"].items():
+        apart = {
+            str(s) for asked in pending if asked.environment == environment for s in asked.seeds
+        }
+        agents = {
+            name: {seed: agent for seed, agent in of_it.items() if seed not in apart}
+            for name, of_it in entry["agents"].items()
+        }
+        found[environment] = {**entry, "agents": {k: of_it for k, of_it in agents.items() if of_it}}
+    return {environment: entry for environment, entry in found.items() if entry["agents"]}
+
+
 def claims(report: Report) -> list[Claim]:
     """Of every objective but the reference: no worse at the end and over the last quarter, and better over all."""
     found = []
-    for environment, entry in report["environments"].items():
+    for environment, entry in looked_at(report).items():
         reference, *others = as_comparison(environment, entry).curves
         for curves in others:
             found += [_as_good(curves, reference, of) for of in AS_GOOD]
@@ -227,7 +246,7 @@ def facts(report: Report) -> dict[str, Any]:
     """The curves by environment."""
     return {
         "comparisons": {
-            name: as_comparison(name, entry) for name, entry in report["environments"].items()
+            name: as_comparison(name, entry) for name, entry in looked_at(report).items()
         },
         "deciding": DECIDING,
         "confirmations": [(asked, AS_GOOD[asked.of], *rest) for asked, *rest in confirmed(report)],
@@ -238,7 +257,7 @@ def facts(report: Report) -> dict[str, Any]:
         },
         "diagnosed": {
             name: {curve.objective: widths(curve)[1] for curve in curves}
-            for name in report["environments"]
+            for name in looked_at(report)
             if (curves := _diagnosed(report, name))
         },
     }
@@ -247,7 +266,7 @@ def facts(report: Report) -> dict[str, Any]:
 def draw(report: Mapping[str, Any]) -> dict[str, Figure]:
     """Learning curves of each environment, and what an iteration does to the policy where that is known."""
     drawn = {}
-    for name, entry in report["environments"].items():
+    for name, entry in looked_at(report).items():
         drawn[f"locomotion_{name}"] = figures.learning_curves(as_comparison(name, entry).curves)
         if curves := _diagnosed(report, name):
             drawn[f"locomotion_{name}_updates"] = figures.diagnosis(curves)
@@ -265,7 +284,7 @@ def widths(curves: LearningCurves) -> tuple[float, float]:
 
 
 def _diagnosed(report: Mapping[str, Any], environment: str) -> list[LearningCurves]:
-    curves = as_comparison(environment, report["environments"][environment]).curves
+    curves = as_comparison(environment, looked_at(report)[environment]).curves
     return [curve for curve in curves if curve.diagnosed]
 
 
