@@ -32,7 +32,6 @@ from scb.environments.synthetic import SyntheticBandit
 from scb.environments.zoo import bandit_metadata, open_bandit, zoo_names
 from scb.errors import UserError
 from scb.files import make_folder, write_json
-from scb.statistics import with_failures_as
 
 CLASSIC_CONTROL = tuple(sorted(families()["classic"].suite))
 DATA = Path("docs/data")
@@ -354,8 +353,9 @@ def unpacked(lines: Sequence[str]) -> NDArray[np.floating]:
 
 def finite(returns: Any, instead: float) -> tuple[list[float], int]:
     """([N] returns to two digits, how many were no number): those count as `instead`, the return of random actions."""
-    values, failed = with_failures_as(instead, returns)
-    return np.round(values, 2).tolist(), failed
+    values = np.asarray(returns, np.float64)
+    bad = ~np.isfinite(values)
+    return np.round(np.where(bad, instead, values), 2).tolist(), int(bad.sum())
 
 
 def run_name(file: Path) -> str:

@@ -22,7 +22,7 @@ from experiments.claims import DECIDING, Claim, Judged, judge, of_agents
 from experiments.harness import Experiment, Report, packed
 from experiments.parts import InParts, Keys, Part, lacking
 from lpo import figures
-from lpo.comparison import LearningCurves, compare, ppo_spec
+from lpo.comparison import Comparison, LearningCurves, compare, ppo_spec
 from lpo.full_size import as_comparison
 from lpo.objectives import CLIPS, load_objective
 from scb.errors import at_least
@@ -185,25 +185,6 @@ def paired(
     return of_agents(partial(paired_difference, ours, theirs), len(ours)) if len(ours) else None
 
 
-def looked_at(report: Report) -> dict[str, Any]:
-    """{environment: its entry} without the agents of confirmations that are not complete.
-
-    Who looks at a difference while it grows sees it pass its margin sooner or later.
-    """
-    pending = [asked for asked, _, judged in confirmed(report) if judged is None]
-    found = {}
-    for environment, entry in report["environments"].items():
-        apart = {
-            str(s) for asked in pending if asked.environment == environment for s in asked.seeds
-        }
-        agents = {
-            name: {seed: agent for seed, agent in of_it.items() if seed not in apart}
-            for name, of_it in entry["agents"].items()
-        }
-        found[environment] = {**entry, "agents": {k: of_it for k, of_it in agents.items() if of_it}}
-    return {environment: entry for environment, entry in found.items() if entry["agents"]}
-
-
 def claims(report: Report) -> list[Claim]:
     """Of every objective but the reference: no worse at the end and over the last quarter, and better over all."""
     found = []
@@ -223,31 +204,54 @@ def _as_good(curves: LearningCurves, reference: LearningCurves, of: str) -> Clai
     return Claim(text, paired(curves, reference, of), 0.0, margin, reason, places=0)
 
 
+def _asked(report: Report) -> Iterator[tuple[Confirmation, list[str]]]:
+    """Every confirmation of what a report has agents of, and its seeds of which both agents are there."""
+    for asked in CONFIRMATIONS:
+        agents = report["environments"].get(asked.environment, {}).get("agents", {})
+        if REFERENCE in agents and asked.objective in agents:
+            both = agents[REFERENCE].keys() & agents[asked.objective].keys()
+            yield asked, [str(s) for s in asked.seeds if str(s) in both]
+
+
 def confirmed(report: Report) -> list[tuple[Confirmation, int, Judged | None]]:
     """Of every confirmation: how many of its pairs of agents there are, and once all are, what became of it."""
     found: list[tuple[Confirmation, int, Judged | None]] = []
-    for asked in CONFIRMATIONS:
-        entry = report["environments"].get(asked.environment, {"agents": {}})
-        names = (REFERENCE, asked.objective)
-        if any(name not in entry["agents"] for name in names):
-            continue
-        agents = {name: entry["agents"][name] for name in names}
-        seeds = [str(s) for s in asked.seeds if all(str(s) in agents[name] for name in names)]
+    for asked, seeds in _asked(report):
         judged = None
         if len(seeds) == len(asked.seeds):
-            fresh = {name: {s: agents[name][s] for s in seeds} for name in names}
+            entry = report["environments"][asked.environment]
+            names = (REFERENCE, asked.objective)
+            fresh = {name: {s: entry["agents"][name][s] for s in seeds} for name in names}
             reference, curves = as_comparison(asked.environment, {**entry, "agents": fresh}).curves
             (judged,) = judge([_as_good(curves, reference, asked.of)])
         found.append((asked, len(seeds), judged))
     return found
 
 
+def looked_at(report: Report) -> dict[str, Any]:
+    """{environment: its entry} without the agents of confirmations that are not complete.
+
+    Who looks at a difference while it grows sees it pass its margin sooner or later.
+    """
+    pending = [asked for asked, seeds in _asked(report) if len(seeds) < len(asked.seeds)]
+    found = {}
+    for environment, entry in report["environments"].items():
+        apart = {
+            str(s) for asked in pending if asked.environment == environment for s in asked.seeds
+        }
+        agents = {
+            name: {seed: agent for seed, agent in of_it.items() if seed not in apart}
+            for name, of_it in entry["agents"].items()
+        }
+        found[environment] = {**entry, "agents": {k: of_it for k, of_it in agents.items() if of_it}}
+    return {environment: entry for environment, entry in found.items() if entry["agents"]}
+
+
 def facts(report: Report) -> dict[str, Any]:
     """The curves by environment."""
+    comparisons = {name: as_comparison(name, entry) for name, entry in looked_at(report).items()}
     return {
-        "comparisons": {
-            name: as_comparison(name, entry) for name, entry in looked_at(report).items()
-        },
+        "comparisons": comparisons,
         "deciding": DECIDING,
         "confirmations": [(asked, AS_GOOD[asked.of], *rest) for asked, *rest in confirmed(report)],
         "sweeps": {
@@ -257,8 +261,8 @@ def facts(report: Report) -> dict[str, Any]:
         },
         "diagnosed": {
             name: {curve.objective: widths(curve)[1] for curve in curves}
-            for name in looked_at(report)
-            if (curves := _diagnosed(report, name))
+            for name, comparison in comparisons.items()
+            if (curves := _diagnosed(comparison))
         },
     }
 
@@ -267,8 +271,9 @@ def draw(report: Mapping[str, Any]) -> dict[str, Figure]:
     """Learning curves of each environment, and what an iteration does to the policy where that is known."""
     drawn = {}
     for name, entry in looked_at(report).items():
-        drawn[f"locomotion_{name}"] = figures.learning_curves(as_comparison(name, entry).curves)
-        if curves := _diagnosed(report, name):
+        comparison = as_comparison(name, entry)
+        drawn[f"locomotion_{name}"] = figures.learning_curves(comparison.curves)
+        if curves := _diagnosed(comparison):
             drawn[f"locomotion_{name}_updates"] = figures.diagnosis(curves)
     return drawn
 
@@ -283,9 +288,8 @@ def widths(curves: LearningCurves) -> tuple[float, float]:
     return first, last
 
 
-def _diagnosed(report: Mapping[str, Any], environment: str) -> list[LearningCurves]:
-    curves = as_comparison(environment, looked_at(report)[environment]).curves
-    return [curve for curve in curves if curve.diagnosed]
+def _diagnosed(comparison: Comparison) -> list[LearningCurves]:
+    return [curve for curve in comparison.curves if curve.diagnosed]
 
 
 EXPERIMENT = Experiment(

@@ -186,9 +186,9 @@ def _ends(
     """Of each algorithm in each environment what it ends with, in words."""
     for name, algorithms in tables.items():
         for algorithm, places in algorithms.items():
+            where = {"bandit": f"the bandit of {name}"}
             ends = [
-                f"{text(row[-1], 0)} trained in {'the bandit of ' if place == 'bandit' else ''}{name}"
-                + ("" if place == "bandit" else " itself")
+                f"{text(row[-1], 0)} trained in {where.get(place, f'{name} itself')}"
                 for place, row in places.items()
             ]
             number = thousands(steps[algorithm][-1])

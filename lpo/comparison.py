@@ -17,9 +17,9 @@ from scb.agents.spec import AgentSpec, environment_agent
 from scb.environments.registry import environment_spec
 from scb.errors import UserError
 from scb.files import plain
-from scb.measurement import MODE, SAMPLED, Place, measure
+from scb.measurement import MODE, SAMPLED, Place, as_random, measure
 from scb.rows import Rows, pivot
-from scb.statistics import Estimate, estimate, paired_difference, with_failures_as
+from scb.statistics import Estimate, estimate, paired_difference
 
 _ARRAYS = ("lengths", "speeds", "diagnosis")
 
@@ -222,10 +222,7 @@ def compare(
     steps = np.asarray(list(dict.fromkeys(row["step"] for row in found)))
     columns = ("return", "length", "speed", *(DIAGNOSIS if diagnose else ()))
     measured = {value: pivot(found, "objective", "seed", "step", value=value) for value in columns}
-    finite = np.isfinite(measured["return"])
-    if not finite.all():
-        random = environment_spec(place.name).random_return(place.backend)
-        measured["return"], _ = with_failures_as(random, measured["return"])
+    measured["return"], failed = as_random(measured["return"], place)
     return Comparison(
         [
             LearningCurves(
@@ -241,7 +238,7 @@ def compare(
                 measured["length"][i],
                 measured["speed"][i],
                 {name: measured[name][i] for name in DIAGNOSIS} if diagnose else None,
-                int((~finite[i].all(axis=1)).sum()),
+                int(failed[i].any(axis=1).sum()),
             )
             for i, objective in enumerate(objectives)
         ]

@@ -234,8 +234,8 @@ class Evaluate(Comparing):
         printer.print(table)
         printer.print(_scores_table(scores, "over all of them"))
         homes = learned_in(objectives)
-        elsewhere = scores.without(*homes)
-        if elsewhere is not None and len(elsewhere.environments) < len(scores.environments):
+        elsewhere = scores.without(*homes) if {*homes} & {*scores.environments} else None
+        if elsewhere is not None:
             where = f"without {', '.join(homes)}, for which one of them was learned"
             printer.print(_scores_table(elsewhere, where))
         if scores.left_out:

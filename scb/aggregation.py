@@ -14,14 +14,12 @@ import numpy as np
 from scb.agents.agent import Agent
 from scb.agents.spec import AgentSpec
 from scb.console import progress_console
-from scb.environments.registry import environment_spec
 from scb.environments.synthetic import SyntheticBandit, Weights
 from scb.errors import UserError
 from scb.evolution import map_population
 from scb.experts import EPISODES
 from scb.keys import named_key, split_key
-from scb.measurement import Judge, Place, train_and_judge
-from scb.statistics import with_failures_as
+from scb.measurement import Judge, Place, as_random, train_and_judge
 
 TRAJECTORIES = 256
 LENGTH = 200
@@ -87,7 +85,7 @@ class Learners:
         number: int,
         episodes: int = EPISODES,
     ) -> None:
-        self._bandit, self._specs, self._number = bandit, specs, number
+        self._bandit, self._specs, self._place, self._number = bandit, specs, place, number
         self.agents = {name: spec.agent(bandit) for name, spec in specs.items()}
         judge = Judge(place.env, place.params, episodes, mode=True)
         each = -(-TRAJECTORIES // (number * len(specs)))
@@ -115,7 +113,6 @@ class Learners:
 
         self._training = {name: training(agent) for name, agent in self.agents.items()}
         self._visiting = {name: visiting(agent) for name, agent in self.agents.items()}
-        self._random = environment_spec(place.name).random_return(place.backend)
         limit = int(place.params.max_steps_in_episode)
         self.steps = number * len(specs) * episodes * limit
 
@@ -126,7 +123,7 @@ class Learners:
             key_draw, key_agents = split_key(named_key(key, name))
             drawn, keys = spec.sample(key_draw, self._number), split_key(key_agents, self._number)
             earned, states = self._training[name](drawn, keys, params)
-            returns, _ = with_failures_as(self._random, earned)
+            returns, _ = as_random(np.asarray(earned), self._place)
             learned[name] = Learned(returns, states, keys)
         mean = np.concatenate([of.returns for of in learned.values()]).mean()
         return float(mean), learned

@@ -244,9 +244,10 @@ class BanditDiscovery:
     def _check_strategy(self) -> None:
         """A UserError, before anything is computed, where the strategy does not fit the weights."""
         shapes = jax.eval_shape(self.bandit.init_weights, root_key(0))
-        strategy = strategy_for(self.config.evolution, jax.tree.map(jnp.zeros_like, shapes))
-        if self.bandit.config.form == "linear":
-            strategy.check_units(jax.tree.map(jnp.zeros_like, shapes))
+        weights = jax.tree.map(jnp.zeros_like, shapes)
+        strategy = strategy_for(self.config.evolution, weights)
+        if self.units(weights) is not None:
+            strategy.check_units(weights)
 
     def _spec(self, name: str) -> AgentSpec:
         config = self.config

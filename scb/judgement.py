@@ -12,10 +12,10 @@ from scb.environments.registry import environment_spec
 from scb.environments.synthetic import BanditConfig, SyntheticBandit, Weights, bandit_for
 from scb.environments.synthetic_mdp import SyntheticMDP
 from scb.errors import UserError
-from scb.measurement import MODE, SAMPLED, Agents, Place, measure
+from scb.measurement import MODE, SAMPLED, Agents, Place, as_random, measure
 from scb.rows import Rows, pivot
 from scb.seeds import VALIDATING
-from scb.statistics import estimate, with_failures_as
+from scb.statistics import estimate
 
 EPISODES, BRAX_EPISODES = 50, 5  # of each agent that judges a bandit; Brax's physics are slow
 
@@ -125,11 +125,9 @@ def counted(
     returns: Mapping[str, np.ndarray], judge_in: Place
 ) -> tuple[dict[str, np.ndarray], int]:
     """(what `judge` found, where an agent that diverged counts as random actions do; how many agents did)."""
-    failed = max(int((~np.isfinite(x)).sum()) for x in returns.values())
-    if not failed:
-        return dict(returns), 0
-    random = environment_spec(judge_in.name).random_return(judge_in.backend)
-    return {name: with_failures_as(random, x)[0] for name, x in returns.items()}, failed
+    found = {name: as_random(x, judge_in) for name, x in returns.items()}
+    values = {name: x for name, (x, _) in found.items()}
+    return values, max(int(failed.sum()) for _, failed in found.values())
 
 
 def told(failed: int) -> str:

@@ -171,6 +171,15 @@ class Agents:
         )
 
 
+def as_random(returns: np.ndarray, place: Place) -> tuple[np.ndarray, np.ndarray]:
+    """(returns, which were no finite number): those of agents that diverged are those of random actions there."""
+    failed = ~np.isfinite(returns)
+    if failed.any():
+        random = environment_spec(place.name).random_return(place.backend)
+        returns = np.where(failed, random, returns)
+    return returns, failed
+
+
 def check_seeds(seeds: Sequence[int]) -> None:
     """Raises a UserError where there are no seeds, or one is not a number of 32 bits."""
     if not seeds:

@@ -47,13 +47,6 @@ class Estimate:
         return asdict(self)
 
 
-def with_failures_as(instead: float, returns: ArrayLike) -> tuple[NDArray[np.floating], int]:
-    """(returns, how many were no finite number): those of agents that diverged count as `instead`, such as random's."""
-    values = np.asarray(returns, np.float64)
-    failed = ~np.isfinite(values)
-    return np.where(failed, instead, values), int(failed.sum())
-
-
 def iqm(x: ArrayLike, axis: int | None = None) -> NDArray[np.floating]:
     """Interquartile mean: the mean after dropping the lowest and the highest quarter.
 

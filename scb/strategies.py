@@ -101,9 +101,11 @@ class Strategy:
     def check_units(self, solution: Any) -> None:
         """Raises a UserError where the strategy has no deviation for each weight, which units ask for."""
         weights = sum(math.prod(leaf.shape) for leaf in jax.tree.leaves(solution))
-        state = self.has_mean and jax.eval_shape(
-            lambda: self._algorithm.init(root_key(0), solution, self._params)
-        )
+        state = None
+        if self.has_mean:
+            state = jax.eval_shape(
+                lambda: self._algorithm.init(root_key(0), solution, self._params)
+            )
         if np.shape(getattr(state, "std", 0.0)) != (weights,):
             raise UserError(
                 f"{self._name} has one deviation for all weights, and those of this bandit have different sizes: "

@@ -168,7 +168,7 @@ def test_settings_that_differ_are_told(tmp_path):
         run_folder(tmp_path / "b", "random", population_size=64),
     ]
     text = discovery_cost.EXPERIMENT.page(discovery_cost.collect(folders))
-    assert "The runs of Pendulum-v1 differ in population size (32; 64)." in text
+    assert "| Pendulum-v1 | population size (32; 64) |" in text
 
 
 def test_the_figure_has_a_row_an_environment_and_a_line_a_run(tmp_path):
