@@ -39,7 +39,7 @@ LOOKS: dict[str, dict[str, Any]] = {
 }
 WORDS = {OURS: "our bandit", PUBLISHED: "the published bandit", "environment": "the environment"}
 PAPER = "the environment, in the paper (at the end)"
-ROUGHLY = 50  # times as many steps are roughly two orders of magnitude
+LEAST_TIMES = 50  # half of the hundred that two orders of magnitude are, for the paper says "roughly"
 
 
 @dataclass(frozen=True)
@@ -216,11 +216,11 @@ def claims(report: Report) -> list[Claim]:
     found = []
     for row in matches(report):
         times = np.array([_ratio(row, x) for x in row["each_low"]])
-        told = None not in row["each_low"] or _ratio(row, None) >= ROUGHLY
+        told = None not in row["each_low"] or _ratio(row, None) >= LEAST_TIMES
         name = f"{row['bandit']}, {row['algorithm'].upper()}"
-        text = f"{name}: the environment takes {ROUGHLY} times the steps, roughly two orders of magnitude"
+        text = f"{name}: the environment takes {LEAST_TIMES} times the steps or more"
         evidence = partial(estimate, times, statistic=np.median) if told else None
-        found.append(Claim(text, evidence, ROUGHLY, places=0))
+        found.append(Claim(text, evidence, LEAST_TIMES, places=0))
         standing = environment_spec(row["environment"]).standing_still(row["backend"])
         if standing is not None:
             text = f"{name}: agents from the bandit earn more than standing still"
@@ -253,6 +253,7 @@ def facts(report: Report) -> dict[str, Any]:
         "matches": found,
         "ordered": sorted(found, key=lambda row: _ratio(row, row["steps"])),
         "times": _times,
+        "least_times": LEAST_TIMES,
         "short": [f"{x['bandit']}, {x['algorithm'].upper()}" for x in found if x["steps"] is None],
         "lost": lost,
     }
