@@ -44,7 +44,7 @@ from scb.environments.synthetic import (
 )
 from scb.environments.synthetic_mdp import PARAMETERIZATIONS, synthetic_for
 from scb.environments.zoo import bandit_metadata, load_bandit, open_bandit, save_bandit
-from scb.errors import UserError, at_least, one_of, positive
+from scb.errors import UserError, at_least, one_of, positive, unused
 from scb.evolution import EnvironmentSteps, EvolutionConfig, Outcome, evolve
 from scb.fitting import check_linear, standardize_reward
 from scb.judgement import check_fits
@@ -155,15 +155,24 @@ class DiscoveryConfig:
         if self.parameterization != "I" and self.start is not None:
             raise UserError("a synthetic MDP cannot start from a bandit: leave the start out.")
         fitted = self.init == "expert" and self.start is None
-        for entry in () if fitted else fields(self.warm_start):
-            value = getattr(self.warm_start, entry.name)
-            if value != entry.default:
-                raise UserError(
-                    f"{entry.name} is {value}, and nothing is fitted to an expert: leave it out, or choose init "
-                    "expert and no bandit to start from."
+        if not fitted:
+            unused(
+                self.warm_start,
+                "nothing is fitted to an expert",
+                [entry.name for entry in fields(self.warm_start)],
+                "choose init expert and no bandit to start from",
+            )
+        if self.bandit.form == "linear":
+            because, networks = "the form linear has no networks", "take the form networks"
+            unused(self.bandit, because, ("hidden_size", "activation"), networks)
+            if fitted:
+                check_linear(self.warm_start.construction)
+                unused(
+                    self.warm_start,
+                    "the form linear is fitted in closed form, to the expert's actions alone",
+                    ("fit_steps", "num_actions", "near_actions"),
+                    networks,
                 )
-        if fitted and self.bandit.form == "linear":
-            check_linear(self.warm_start.construction)
         if self.refinement.rounds and self.bandit.form != "linear":
             raise UserError(
                 f"there are {self.refinement.rounds} refinement rounds, and only a linear bandit's policy is refined: "
@@ -261,11 +270,17 @@ class BanditDiscovery:
     def _weights_of(self, name: str) -> Weights:
         start = open_bandit(name)
         check_fits(start, self.place.env, self.place.params, self.config.environment)
-        if start.weight_shapes() != self.bandit.weight_shapes():
-            raise UserError(
-                f"{name} has other layer sizes than the bandit to discover: start from one of the form "
-                f"{self.config.bandit.form} whose hidden_size is {self.config.bandit.hidden_size}."
+        networks = () if start.linear else ("hidden_size", "activation", "latent_size")
+        for field in ("form", "latent", *networks):
+            has, wanted = (
+                getattr(x, field) if field == "latent_size" else getattr(x.config, field)
+                for x in (start, self.bandit)
             )
+            if has != wanted:
+                raise UserError(
+                    f"{name} has the {field} {has}, and the bandit to discover {wanted}: ask for {has}, or start from "
+                    "another."
+                )
         return start.default_params.weights
 
     def initial_solution(self, key: jax.Array) -> Weights:

@@ -2,7 +2,9 @@
 
 import math
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import fields
 from difflib import get_close_matches
+from typing import Any
 
 
 class UserError(Exception):
@@ -37,6 +39,19 @@ def _check(
         if value is not None and not holds(value):
             finite = ", and finite" if isinstance(value, float) else ""
             raise UserError(f"{name} is {value}: it must be {allowed}{finite}.")
+
+
+def unused(config: Any, because: str, names: Iterable[str], otherwise: str) -> None:
+    """Raises a UserError where a dataclass' field by one of these names is not at its default, and nothing uses it.
+
+    Args:
+      because: why nothing does, after "and".
+      otherwise: what else to do than to leave it out, after "or".
+    """
+    defaults = {field.name: field.default for field in fields(config)}
+    for name in names:
+        if (value := getattr(config, name)) != defaults[name]:
+            raise UserError(f"{name} is {value}, and {because}: leave it out, or {otherwise}.")
 
 
 def one_of(kind: str, name: str, known: Iterable[str]) -> None:

@@ -12,7 +12,7 @@ from gymnax.environments import spaces
 from jax.tree_util import Partial
 
 from scb.aggregation import TRAJECTORIES, Visited, trajectory
-from scb.errors import UserError, at_least, one_of, positive
+from scb.errors import UserError, at_least, one_of, positive, unused
 from scb.experts import Expert
 from scb.fitting import CONSTRUCTIONS, ExpertDataset
 from scb.keys import named_key, split_key
@@ -73,13 +73,13 @@ class DatasetConfig:
         positive(self, "stretch")
         if not 0 <= self.discount <= 1:
             raise UserError(f"discount is {self.discount}: it must be between 0 and 1.")
-        for field, none in (("min_spread", 0), ("stretch", 1), ("jitter", 0)):
-            value = getattr(self, field)
-            if value != none and self.construction != "action_distance":
-                raise UserError(
-                    f"{field} is {value}, which the construction {self.construction} cannot use: "
-                    f"take action_distance, or a {field} of {none}."
-                )
+        distance = self.construction == "action_distance"
+        unused(
+            self,
+            f"the construction {self.construction} cannot use it",
+            ("discount", "horizon") if distance else ("min_spread", "stretch", "jitter"),
+            "take advantage or q" if distance else "take action_distance",
+        )
         if self.near_actions >= self.num_actions:
             raise UserError(
                 f"near_actions is {self.near_actions} of {self.num_actions} actions, one of them the expert's: take "

@@ -16,6 +16,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.transforms import offset_copy
 from numpy.typing import ArrayLike, NDArray
 
 from scb.statistics import Estimate, Statistic, estimate
@@ -61,8 +62,10 @@ class Look:
 def estimate_row(
     axes: Axes, position: float, values: NDArray[np.floating], found: Estimate, color: str
 ) -> None:
-    """On one line of a horizontal plot: the estimate with its interval, and behind it each value a dot."""
-    axes.plot(values, np.full(values.size, position), ".", color=color, alpha=0.25)
+    """On one line of a horizontal plot: the estimate with its interval, and just below it each value a dot."""
+    below = offset_copy(axes.transData, axes.get_figure(), y=-5, units="points")
+    level = np.full(values.size, position)
+    axes.plot(values, level, ".", color=color, alpha=0.4, markeredgewidth=0, transform=below)
     axes.errorbar(
         found.value,
         position,

@@ -206,8 +206,9 @@ def config_dict(config: Any) -> dict[str, Any]:
 class Checkpoints:
     """Orbax checkpoints of a pytree of arrays, each with a digest, restored newest first.
 
-    A checkpoint that cannot be read, or whose digest does not fit (cut in half, altered), is passed
-    over for the one before it, and the caller is told.
+    A checkpoint that cannot be read, or whose digest does not fit (cut in half, altered), is removed where one
+    before it can be read, which is taken, and the caller is told. Where none can, all stay, and it is an error:
+    perhaps it is not they that are at fault, but other versions of packages.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -237,15 +238,19 @@ class Checkpoints:
         # Orbax and tensorstore raise many kinds where a disk is full or a folder is gone.
         except Exception as error:
             raise UserError(
-                f"checkpoint {step} could not be written to {self.folder} "
-                f"({(str(error).splitlines() or [type(error).__name__])[0][:200]}): the one before it is there; make "
-                "room, and go on with --resume."
+                f"checkpoint {step} could not be written to {self.folder} ({_told(error)}): the one before it is "
+                "there; make room, and go on with --resume."
             ) from error
 
     def restore(self, template: Any) -> tuple[int, Any, list[int]]:
-        """(step, state, steps of unreadable newer checkpoints); step 0 and the template where none can be read."""
+        """(step, state, steps of unreadable newer checkpoints); step 0 and the template where there is none.
+
+        Raises:
+          UserError: there are checkpoints, and none can be read.
+        """
         expected = _leaves(template)
         damaged: list[int] = []
+        why = "altered"
         for step in sorted(self._manager.all_steps(), reverse=True):
             try:
                 restored = self._manager.restore(
@@ -257,13 +262,18 @@ class Checkpoints:
                 intact = _digest(restored["state"]) == restored["digest"]["sha256"]
                 state = _from_leaves(template, restored["state"])
             # Orbax and tensorstore raise many kinds for a file that is cut or altered.
-            except Exception:
-                intact = False
+            except Exception as error:
+                intact, why = False, _told(error)
             if intact:
                 break
             damaged.append(step)
         else:
             step, state = 0, template
+            if damaged:
+                raise UserError(
+                    f"no checkpoint in {self.folder} can be read ({why}): resume with the versions of packages that "
+                    "wrote them, or remove that folder to start again at generation 0."
+                )
         self._discard(damaged)
         return step, state, damaged
 
@@ -294,13 +304,15 @@ def continued(
     if processes.first():
         checkpoints = Checkpoints(folder)
         step, state, damaged = checkpoints.restore(template)
-        if damaged and not step:
-            console.print("no checkpoint could be read: starting again at generation 0.")
-        for number in damaged if step else ():
+        for number in damaged:
             console.print(
                 f"checkpoint {number} is damaged: resuming from checkpoint {step} before it."
             )
     return checkpoints, processes.told(step), processes.agreed(state)
+
+
+def _told(error: Exception) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0][:200]
 
 
 class Stopwatch:

@@ -29,7 +29,7 @@ from scb.console import progress_console
 from scb.curriculum import paper_curriculum
 from scb.environments.registry import environment_spec
 from scb.environments.synthetic import SyntheticBandit, Weights
-from scb.errors import UserError, at_least, one_of, positive
+from scb.errors import UserError, at_least, one_of, positive, unused
 from scb.expert_data import DatasetConfig, expert_dataset, labelled
 from scb.experts import Expert, PolicySearchConfig, evolve_expert, train_expert
 from scb.fitting import fit_bandit
@@ -94,6 +94,14 @@ class _Search(NamedTuple):
     find: Callable[..., Expert]  # (place, key, config, quiet; worth, folder)
     linear: bool = False  # for continuous actions; cuts episodes and asks pupils where told to
 
+
+_OF_LINEAR_SEARCHES = ("expert_episode_steps", "expert_pupils", "expert_starts", "expert_sigma")
+_OF_LINEAR_SEARCHES += (
+    "expert_learning_rate",
+    "expert_decay",
+    "expert_error_warmup",
+    "expert_reach",
+)
 
 SEARCHES = {
     "evolution": _Search("evolution", _evolved),
@@ -185,22 +193,9 @@ def expert_agent(
         )
     algorithm = _chosen(name, config)
     linear = algorithm in SEARCHES and SEARCHES[algorithm].linear
-    for field, instead in (
-        ("expert_episode_steps", "has whole episodes"),
-        ("expert_pupils", "asks no pupils"),
-        ("expert_starts", "has one"),
-        ("expert_sigma", "has its own"),
-        ("expert_learning_rate", "has its own"),
-        ("expert_decay", "has none"),
-        ("expert_error_warmup", "has no errors"),
-        ("expert_reach", "has none"),
-    ):
-        value = getattr(config, field)
-        if not linear and value != getattr(WarmStartConfig, field):
-            raise UserError(
-                f"{field} is {value}, and the expert of {name} is found by {algorithm}, which {instead}: leave it out, "
-                "or choose linear."
-            )
+    found = f"the expert of {name} is found by {algorithm}"
+    if not linear:
+        unused(config, f"{found}, which has no such setting", _OF_LINEAR_SEARCHES, "choose linear")
     if algorithm in SEARCHES:
         search = SEARCHES[algorithm]
         if search.linear and isinstance(space, spaces.Discrete):
@@ -208,12 +203,12 @@ def expert_agent(
                 f"the expert of {search.what} has continuous actions and {name} discrete ones: choose evolution, or "
                 "an algorithm."
             )
-        if config.expert_steps is not None:
-            raise UserError(
-                f"expert_steps is {config.expert_steps}, but {search.what} finds the expert of {name} "
-                "and trains no agent: leave it out, or choose an algorithm for the expert."
-            )
+        trained = ("expert_steps", "num_experts")
+        unused(config, f"{found}, which trains no agent", trained, "choose an algorithm for it")
         return None
+    unused(
+        config, f"{found}, which is trained", ("expert_generations",), "choose evolution or linear"
+    )
     check_algorithms([algorithm], kind_of_actions(space))
     spec = environment_agent(algorithm, name).with_values(**WARM_START.get((algorithm, name), {}))
     return spec.with_values(total_steps=config.expert_steps)

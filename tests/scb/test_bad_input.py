@@ -90,8 +90,31 @@ pytestmark = pytest.mark.usefixtures("small_agents")
         ("discover --expert pop", "unknown expert 'pop': did you mean ppo"),
         ("discover --expert dqn", "dqn does not fit the environment's continuous actions"),
         ("discover --expert sac --expert-steps 4", "prefill is 8, which leaves nothing of 4"),
-        ("discover --expert evolution --expert-steps 10", "expert_steps is 10, but evolution"),
-        ("discover --min-spread 1 --construction q", "min_spread is 1.0, which the construction q"),
+        (
+            "discover --expert evolution --expert-steps 10",
+            "expert_steps is 10, and the expert of Pendulum-v1 is found by evolution, which trains no",
+        ),
+        (
+            "discover --min-spread 1 --construction q",
+            "min_spread is 1.0, and the construction q cannot use it: leave it out, or take action_distance.",
+        ),
+        ("discover --discount 0.9", "discount is 0.9, and the construction action_distance cannot"),
+        (
+            "discover --expert-generations 9",
+            "expert_generations is 9, and the expert of Pendulum-v1 is found by ppo, which is trained",
+        ),
+        (
+            "discover --expert linear --num-experts 3",
+            "num_experts is 3, and the expert of Pendulum-v1 is found by linear, which trains no agent",
+        ),
+        (
+            "discover --form linear --hidden-size 8 --init random",
+            "hidden_size is 8, and the form linear has no networks: leave it out, or take the form",
+        ),
+        (
+            "discover --form linear --fit-steps 8",
+            "fit_steps is 8, and the form linear is fitted in closed form, to the expert's actions",
+        ),
         ("discover --min-spread -1", "min_spread is -1.0: it must be 0 or larger, and finite"),
         ("discover --min-spread nan", "min_spread is nan: it must be 0 or larger, and finite"),
         ("discover --judge-agents -1", "judge_agents is -1: it must be 0 or larger"),

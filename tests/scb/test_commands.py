@@ -169,12 +169,11 @@ def test_flags_become_a_configuration_and_what_is_left_out_keeps_its_default():
 EVERY_FLAG = """--preset=paper --environment=MountainCar-v0 --backend=spring --max-steps=5 --algorithms=ppo,dqn,ppo
 --mode=sequential '--hyperparameters={"ppo": {"learning_rate": [0.25]}}' --agents-per-candidate=3
 --evaluation-episodes=2 --mode-actions --curriculum=linear:2:4:0:2 --init=expert --reward-std=4.0
---select=best --hidden-size=3 --activation=relu --form=linear
+--select=best --form=linear
 --expert=sac --expert-noise=0.2 --expert-errors=0.3 --expert-pupils=2
 --expert-episode-steps=5 --expert-sigma=0.1 --expert-learning-rate=0.2 --expert-decay=0.9 --expert-reach=1.5
 --expert-error-warmup=4 --expert-starts=2
---near-actions=2 --num-experts=3
---expert-steps=9 --expert-generations=8 --discount=0.5 --num-states=7 --num-actions=6 --horizon=4 --fit-steps=3
+--num-experts=3 --expert-steps=9 --expert-generations=8 --num-states=7
 --aggregation-rounds=2 --aggregation-agents=3
 --refinement-rounds=1 --refinement-generations=2 --refinement-agents=4 --no-refinement-visits
 --strategy=Open_ES --population-size=6 --generations=9 --sigma=0.2 --sigma-decay=0.9 --sigma-limit=0.1
@@ -196,7 +195,9 @@ def test_the_command_that_a_configuration_is_written_as_asks_for_it_again():
         if value == getattr(getattr(command.config, group), name)
     } | {name for name, value in paper.items() if value == config_dict(command.config)[name]}
     contradicting = {"fixed_hyperparameters", "start", "parameterization", "construction"}
-    contradicting |= {"min_spread", "stretch", "jitter", "latent", "latent_size"}
+    contradicting |= {"min_spread", "stretch", "jitter", "discount", "horizon"}
+    contradicting |= {"latent", "latent_size", "hidden_size", "activation"}
+    contradicting |= {"fit_steps", "num_actions", "near_actions"}
     assert same == {"configs", *contradicting}
     for text in (
         "--environment=CartPole-v1",
@@ -205,7 +206,9 @@ def test_the_command_that_a_configuration_is_written_as_asks_for_it_again():
         "--stretch=1.5",
         "--jitter=1.0",
         "--latent=uniform",
-        "--construction=q",
+        "--construction=q --discount=0.5 --horizon=4",
+        "--num-actions=6 --near-actions=2 --fit-steps=3",
+        "--hidden-size=3 --activation=relu",
         "--from-bandit=b.npz",
         "--latent-size=2",
         "--parameterization=TI --init=random",

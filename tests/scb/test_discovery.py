@@ -536,19 +536,34 @@ def test_the_starts_reward_can_be_standardized(environment):
 
 
 @pytest.mark.parametrize(
-    ("environment", "size", "message"),
+    ("environment", "other", "message"),
     [
-        ("CartPole-v1", 8, r"has other layer sizes .* whose hidden_size is 4"),
+        (
+            "CartPole-v1",
+            {"hidden_size": 8},
+            "has the hidden_size 8, and the bandit to discover 4: ask for 8",
+        ),
+        (
+            "CartPole-v1",
+            {"activation": "relu"},
+            "has the activation relu, and the bandit to discover tanh",
+        ),
+        (
+            "CartPole-v1",
+            {"latent": "uniform"},
+            "has the latent uniform, and the bandit to discover normal",
+        ),
+        ("CartPole-v1", {"latent_size": 2}, "has the latent_size 2, and the bandit to discover 4"),
         (
             "Acrobot-v1",
-            4,
+            {},
             r"bandit Synthetic-Acrobot-v1 has 6 observations and 3 discrete actions, CartPole-v1 has 4 "
             r"observations and 2 discrete actions: take the bandit of that environment",
         ),
     ],
 )
-def test_a_start_of_other_shapes_is_refused_at_once(tmp_path, environment, size, message):
-    path, _ = saved(tmp_path, environment, hidden_size=size)
+def test_a_start_of_another_form_is_refused_at_once(tmp_path, environment, other, message):
+    path, _ = saved(tmp_path, environment, **{"hidden_size": 4, **other})
     with pytest.raises(UserError, match=message):
         BanditDiscovery(replace(CONFIG, start=str(path)))
 

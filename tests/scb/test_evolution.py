@@ -539,7 +539,6 @@ def cut_in_half(folder):
                 "checkpoint 6 is damaged: resuming from checkpoint 3 before it.",
             ],
         ),
-        (["8", "6", "3"], ["no checkpoint could be read: starting again at generation 0."]),
     ],
 )
 def test_a_damaged_checkpoint_is_told_and_the_one_before_is_taken(

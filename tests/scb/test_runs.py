@@ -237,15 +237,20 @@ def test_a_checkpoint_whose_numbers_were_altered_is_passed_over(tmp_path):
     assert (step, damaged) == (1, [2])
 
 
-def test_where_all_checkpoints_are_damaged_none_is_restored(tmp_path):
+def test_where_no_checkpoint_can_be_read_it_is_told_and_they_stay(tmp_path):
     checkpoints = Checkpoints(tmp_path)
-    checkpoints.save(1, state(1))
+    for step in (1, 2):
+        checkpoints.save(step, state(step))
     checkpoints.close()
-    cut_in_half(tmp_path / "checkpoints" / "1")
     again = Checkpoints(tmp_path)
-    step, tree, damaged = again.restore(state(0))
-    assert (step, damaged) == (0, [1])
-    np.testing.assert_array_equal(tree["mean"], state(0)["mean"])
+    # As another version's state is.
+    with pytest.raises(UserError, match=r"no checkpoint in .* can be read \(.*\): resume with"):
+        again.restore({**state(0), "momentum": np.zeros(3)})
+    assert_is(again.restore(state(0)), 2)
+    cut_in_half(tmp_path / "checkpoints" / "1")
+    cut_in_half(tmp_path / "checkpoints" / "2")
+    with pytest.raises(UserError, match="or remove that folder to start again"):
+        again.restore(state(0))
     again.close()
 
 
