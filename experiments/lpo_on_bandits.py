@@ -46,15 +46,14 @@ SCALES = {"Flax's initialisation": 1.0, "small last layer": 0.01}
 
 
 def search_curve(metrics: Sequence[Mapping[str, Any]], seconds: Sequence[float]) -> dict[str, Any]:
-    """What a search's log says: the judged mean over generations, steps and minutes.
+    """What a search's log says: the judged mean over generations (None where all its agents failed), steps and minutes.
 
     The time of a generation is the median of those that judged nothing: judging is no part of the
     search. The first, which compiles, is left out of it too.
     """
-    judged = ["mean/fitness_iqm" in line for line in metrics]
+    judged = [any(name.startswith("mean/") for name in line) for line in metrics]
     plain = [s for s, j in list(zip(seconds, judged, strict=True))[1:] if not j] or list(seconds)
-    points = [(g, x["fitness_iqm"]) for g, x in judgements(metrics)]
-    points = [(g, x) for g, x in points if x is not None]
+    points = [(g, x.get("fitness_iqm")) for g, x in judgements(metrics)]
     return {
         "generations": [g for g, _ in points],
         "returns": [x for _, x in points],
@@ -173,7 +172,7 @@ def draw(report: Mapping[str, Any]) -> Figure:
         per = curves[0]["steps_per_generation"]
         minutes = float(np.median([c["seconds_per_generation"] for c in curves])) / 60
         generations = np.asarray(curves[0]["generations"], float)
-        returns = [estimate(x) for x in np.transpose([c["returns"] for c in curves])]
+        returns = plotting.over_searches([c["returns"] for c in curves])
         # No step is taken and no time passes before generation 0, which a logarithm cannot show.
         for panel, first, each, label in (
             (panels[0], 0, 1.0, name),
@@ -251,9 +250,8 @@ def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None
             raise UserError("the report is of other searches: choose another --out.")
         for seed in seeds[len(entry["curves"]) :]:
             cost = learned(source, seed).metadata["cost"]
-            # A run folder of before November 2026 has the second name.
-            names = ("environment_steps_judgements", "environment_steps_validation")
-            entry["steps_to_judge"] = next(cost[name] for name in names if name in cost)
+            judging = "environment_steps_judgements"
+            entry["steps_to_judge"] = sum(n for name, n in cost.items() if name.startswith(judging))
             entry["curves"].append(search_curve(*read_log(runs / f"{source}-{seed}")))
             save()
 

@@ -145,7 +145,7 @@ def curve(metrics: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]:
     """What a search distribution's mean was worth over the generations, from a run's log.
 
     Returns:
-      {"generation", "fitness" (interquartile mean over agents; None where one failed), "mean" (over agents),
+      {"generation", "fitness" (interquartile mean over agents; None where all failed), "mean" (over agents),
       "failed" (mean number of candidates without a finite fitness since the last judgement)}.
     """
     judged = judgements(metrics)

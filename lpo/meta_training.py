@@ -128,7 +128,7 @@ def learn_objective(
     if not processes.told(path.with_suffix(".json").exists()):  # it is written last
         outcome = evolve(problem, config.evolution, run)
         run.close()
-        outcome.check()
+        outcome.check(best=bool(config.validation))
         mean = outcome.best_mean if config.validation else outcome.mean
         story = _story(problem, outcome, mean, command)
         if processes.first():

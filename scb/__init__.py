@@ -15,7 +15,7 @@ from scb import start as start  # before what imports gymnax
 from scb.agents.dqn import DQN, DQNConfig, DQNHyperparameters
 from scb.agents.ppo import PPO, PPOConfig, PPOHyperparameters
 from scb.agents.sac import SAC, SACConfig, SACHyperparameters
-from scb.agents.td3 import TD3, TD3Config, TD3Hyperparameters, ddpg_config
+from scb.agents.td3 import TD3, TD3Config, TD3Hyperparameters, ddpg_config, ddpg_hyperparameters
 from scb.environments.registry import make
 from scb.environments.synthetic import BanditConfig, BanditParams, SyntheticBandit
 from scb.environments.synthetic_mdp import MDPConfig, SyntheticMDP
@@ -46,6 +46,7 @@ __all__ = [
     "TD3Hyperparameters",
     "UserError",
     "ddpg_config",
+    "ddpg_hyperparameters",
     "load_bandit",
     "make",
     "save_bandit",

@@ -137,7 +137,7 @@ class Discover(LongRun):
         folder = self.open()
         outcome = problem.search(folder)
         folder.close()
-        outcome.check()
+        outcome.check(best)
         weights = outcome.best_mean if best else outcome.mean
         results = {}
         if self.judgement.judge_agents:
@@ -207,7 +207,8 @@ class TrainConfig:
 
     Attributes:
       bandit: a zoo name such as Synthetic-Pendulum-v1, or path.npz (a synthetic MDP's too).
-      algorithm: such as ppo, sac, dqn, ddqn, ddpg or td3.
+      algorithm: such as ppo, sac, dqn, ddqn, ddpg or td3; dqn draws whether it is double, and is with fixed
+        hyperparameters.
       evaluation_environment: where to evaluate; the bandit's own where left out.
       backend: Brax's physics: generalized, positional or spring.
       agents: how many to train, with the paper's 10 000 steps each.

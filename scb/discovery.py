@@ -271,14 +271,14 @@ class BanditDiscovery:
         start = open_bandit(name)
         check_fits(start, self.place.env, self.place.params, self.config.environment)
         networks = () if start.linear else ("hidden_size", "activation", "latent_size")
-        for field in ("form", "latent", *networks):
+        for what in ("form", "latent", *networks):
             has, wanted = (
-                getattr(x, field) if field == "latent_size" else getattr(x.config, field)
+                getattr(x if what == "latent_size" else x.config, what)
                 for x in (start, self.bandit)
             )
             if has != wanted:
                 raise UserError(
-                    f"{name} has the {field} {has}, and the bandit to discover {wanted}: ask for {has}, or start from "
+                    f"{name} has the {what} {has}, and the bandit to discover {wanted}: ask for {has}, or start from "
                     "another."
                 )
         return start.default_params.weights

@@ -139,7 +139,7 @@ class Outcome:
       mean: the mean of the final search distribution.
       best_mean: the mean at that generation whose evaluation (`evaluate_mean`, interquartile mean)
         was best. Chosen under noise: report it on fresh seeds only.
-      best_mean_generation: which one that was.
+      best_mean_generation: which one that was; -1, and the mean that of the start, where none could be judged.
       metrics: the run's log.
       seconds: wall-clock of all generations.
       validate: {"fitness": [N], ...} of a solution, by `evaluate_mean` with N = `mean_evaluations`
@@ -153,12 +153,17 @@ class Outcome:
     seconds: float
     validate: Callable[[Any], dict[str, np.ndarray]]
 
-    def check(self) -> None:
-        """Raises a UserError where no candidate of any generation had a finite fitness."""
+    def check(self, best: bool = False) -> None:
+        """Raises a UserError where no candidate had a finite fitness; or, where the best is taken, no judged mean."""
         if self.metrics and not any("fitness/mean" in line for line in self.metrics):
             raise UserError(
                 f"no candidate of {len(self.metrics)} generations had a finite fitness, so nothing was found: lower "
                 "the learning rates, or start from something else."
+            )
+        if best and self.best_mean_generation < 0:
+            raise UserError(
+                "all agents of every judgement diverged, so no mean is best: take the final one, or lower the "
+                "learning rates."
             )
 
     def cost(self, problem: Problem, config: EvolutionConfig, best: bool) -> dict[str, Any]:
@@ -167,10 +172,12 @@ class Outcome:
         # The last mean is judged too; a strategy that keeps a population has none to begin with.
         judgements = -(-config.num_generations // config.evaluate_mean_every) + has_mean(config)
         agents = judgements * config.mean_evaluations if evaluations else 0
+        judging = problem.judgement_steps()
         return {
             "environment_steps_training": evaluations * steps.training,
             "environment_steps_evaluation": evaluations * steps.evaluation,
-            "environment_steps_judgements": agents * problem.judgement_steps().total,
+            "environment_steps_judgements_training": agents * judging.training,
+            "environment_steps_judgements_evaluation": agents * judging.evaluation,
             "seconds": round(self.seconds, 1),
             **({"generation": self.best_mean_generation} if best else {}),
             "machine": machine_description(),
@@ -325,9 +332,12 @@ def evolve(
         # pairs.
         returns = judged(mean, key_mean)
         outcome = {name: float(np.mean(v)) for name, v in returns.items()}
-        # The interquartile mean too: of agents with random hyperparameters a few fail far below the rest.
+        # The interquartile mean too: of agents with random hyperparameters a few fail far below the rest, and
+        # those that diverged count as below the worst of the others.
         middles = {
-            f"{name}_iqm": float(iqm(v)) for name, v in returns.items() if np.isfinite(v).all()
+            f"{name}_iqm": float(iqm(rank_failed_last(v)))
+            for name, v in returns.items()
+            if np.isfinite(v).any()
         }
         score = middles.get("fitness_iqm", -np.inf)
         if score > float(state["best_mean_fitness"]):

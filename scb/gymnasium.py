@@ -107,7 +107,8 @@ class SyntheticVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
       file: NAME.npz, or the name of a bandit of the zoo.
       num_envs: how many.
       autoreset_mode: SameStep, NextStep or Disabled, see `gymnasium.vector.AutoresetMode`. With NextStep,
-        Gymnasium's usual one, every other step of a bandit is a reset, which pays nothing.
+        Gymnasium's usual one, every other step of a bandit is a reset, which pays nothing; but some of its wrappers
+        of many environments count nothing else: RecordEpisodeStatistics, NormalizeObservation.
 
     Raises:
       UserError: the file cannot be read, or is none of them; an unknown mode.
@@ -130,12 +131,14 @@ class SyntheticVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self._observations = np.zeros(self.observation_space.shape or (), np.float32)
         self._times = np.zeros(num_envs, int)
         self._over = np.ones(num_envs, bool)
+        self._begun = False
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
         """Begins new episodes; of `options`, "reset_mask" [num_envs] says where, all being left out."""
         super().reset(seed=seed)
+        self._begun = True
         mask = (options or {}).get("reset_mask")
         self._begin(np.ones(self.num_envs, bool) if mask is None else np.asarray(mask, bool))
         return self._observations.copy(), {}
@@ -144,7 +147,7 @@ class SyntheticVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self, actions: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         waiting = self._over.copy()
-        if waiting.any() and self._mode is not AutoresetMode.NEXT_STEP:
+        if waiting.any() and not (self._begun and self._mode is AutoresetMode.NEXT_STEP):
             raise UserError(
                 f"{waiting.sum()} of {self.num_envs} episodes have not begun, or are over: call reset first."
             )

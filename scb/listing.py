@@ -11,8 +11,10 @@ from scb.console import console
 from scb.environments.registry import environment_spec
 from scb.environments.zoo import bandit_metadata, zoo_names
 
-# What a search's cost calls its steps of the environment; a warm start's are all of them.
-_IN_ENVIRONMENT = ("environment_steps_evaluation", "environment_steps_judgements")
+# What a search's cost calls its steps: agents train in the bandit, and are evaluated in the environment. A warm start's
+# are all of the environment.
+_IN_BANDIT = ("environment_steps_training", "environment_steps_judgements_training")
+_IN_ENVIRONMENT = ("environment_steps_evaluation", "environment_steps_judgements_evaluation")
 
 
 def list_command(json: bool = False) -> None:
@@ -52,7 +54,7 @@ def entry(name: str) -> dict[str, Any]:
         "found": found(metadata),
         "minutes": round(_total(cost, earlier, "seconds") / 60, 2),
         "environment_steps": int(_total(cost, earlier, "environment_steps", *_IN_ENVIRONMENT)),
-        "bandit_steps": int(_total(cost, earlier, "environment_steps_training")),
+        "bandit_steps": int(_total(cost, earlier, *_IN_BANDIT)),
         "results": metadata["results"],
         "command": metadata["command"],
     }

@@ -296,7 +296,9 @@ def measure(
             earned, diagnosis = program(hyperparameters, agents.keys[which], *arrays)
             for name, i in lacking:
                 position = batch.index((name, i))
-                drawn = {n: float(getattr(agents.hyperparameters, n)[i]) for n in agents.drawn}
+                # An objective takes the place of a drawn clip.
+                own = [n for n in agents.drawn if not (parameters and n == "drift")]
+                drawn = {n: float(getattr(agents.hyperparameters, n)[i]) for n in own}
                 cells[name].add(
                     agents.names[i],
                     [

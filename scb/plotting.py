@@ -19,7 +19,7 @@ from matplotlib.lines import Line2D
 from matplotlib.transforms import offset_copy
 from numpy.typing import ArrayLike, NDArray
 
-from scb.statistics import Estimate, Statistic, estimate
+from scb.statistics import Estimate, Statistic, estimate, iqm
 
 BLACK, ORANGE, SKY_BLUE, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"
 BLUE, VERMILLION, PURPLE = "#0072B2", "#D55E00", "#CC79A7"
@@ -100,14 +100,21 @@ def search_curve(
     """
     if not curves:
         return
-    fitness = np.array([c["fitness"] for c in curves], float)
-    found = [
+    found = over_searches([c["fitness"] for c in curves], statistic)
+    estimate_curve(axes, curves[0]["generation"], found, color, linestyle, label)
+
+
+def over_searches(
+    values: Sequence[Sequence[float | None]], statistic: Statistic = iqm
+) -> list[Estimate]:
+    """At each of G points the statistic of several searches' [G] values that are numbers; NaN where none is."""
+    columns = np.array(values, float).T
+    return [
         Estimate(np.nan, None, None, 0)
         if np.isnan(column).all()
         else estimate(column[~np.isnan(column)], statistic)
-        for column in fitness.T
+        for column in columns
     ]
-    estimate_curve(axes, curves[0]["generation"], found, color, linestyle, label)
 
 
 def estimate_curve(

@@ -37,7 +37,7 @@ class DQNConfig(OffPolicyConfig):
 
 @struct.dataclass
 class DQNHyperparameters:
-    """Traced numbers; defaults are the paper's underlined values.
+    """Traced numbers; defaults are the paper's underlined values, which make it double DQN.
 
     Attributes:
       double: 1.0 to pick the next action by the network and judge it by the target (double

@@ -43,7 +43,7 @@ class SACHyperparameters:
     Attributes:
       learning_rate: of all three optimisers.
       discount: of the return.
-      polyak: share of the target network that an update keeps.
+      polyak: share of the target network that an iteration keeps: it moves once after all its gradient steps.
       target_entropy_ratio: for discrete actions, the entropy that the temperature is adjusted to,
         as a share of the uniform policy's. For continuous ones it is -A, in the squashed space.
     """

@@ -1,7 +1,6 @@
 """Twin delayed DDPG (Fujimoto et al., 2018); DDPG (Lillicrap et al., 2015) is its case of one critic and no delay."""
 
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import jax
@@ -39,7 +38,7 @@ class TD3Config(OffPolicyConfig):
 
 
 def ddpg_config(**fields: Any) -> TD3Config:
-    """DDPG as a configuration of TD3; its target noise is the hyperparameter 0."""
+    """DDPG as a configuration of TD3; `ddpg_hyperparameters` belong to it, for those of TD3 smooth its targets."""
     return TD3Config(num_critics=1, policy_delay=1, **fields)
 
 
@@ -48,7 +47,7 @@ class TD3Hyperparameters:
     """Traced numbers; defaults are the paper's underlined values.
 
     Attributes:
-      polyak: share of the target networks that an update keeps.
+      polyak: share of the target networks that an iteration keeps: they move once after all its gradient steps.
       exploration_noise: standard deviation of the noise on actions that gather experience, in units
         of half the action space's width.
       target_noise: of the noise on the next action in the target, likewise.
@@ -62,6 +61,11 @@ class TD3Hyperparameters:
     target_noise: ArrayLike = 0.2
     target_noise_clip: ArrayLike = 0.5
     max_grad_norm: ArrayLike = 10.0
+
+
+def ddpg_hyperparameters(**fields: Any) -> TD3Hyperparameters:
+    """DDPG's, whose targets are not smoothed."""
+    return TD3Hyperparameters(**{"target_noise": 0.0, **fields})
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,6 +164,6 @@ DDPG_ALGORITHM = Algorithm(
     "ddpg",
     TD3,
     ddpg_config,
-    partial(TD3Hyperparameters, target_noise=0.0),
+    ddpg_hyperparameters,
     actions=("continuous",),
 )

@@ -4,8 +4,9 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from matplotlib import colormaps
 from matplotlib.axes import Axes
-from matplotlib.colors import ListedColormap
+from matplotlib.colors import ListedColormap, to_hex
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
@@ -39,6 +40,13 @@ def action_map(
     return action_grid(axes, plane, actions, num_actions, bounds)
 
 
+def action_colors(number: int) -> list[str]:
+    """A colour for each of so many discrete actions."""
+    if number <= len(DISCRETE):
+        return list(DISCRETE[:number])
+    return [to_hex(x) for x in colormaps["tab20"](np.linspace(0.0, 1.0, number))]
+
+
 def action_grid(
     axes: Axes,
     plane: Plane,
@@ -49,9 +57,7 @@ def action_grid(
     """`action_map` of [P, P] actions that are known, x fastest."""
     x, y = (np.linspace(low, high, len(actions)) for low, high in plane.limits)
     low, high = (-0.5, num_actions - 0.5) if num_actions else (bounds or (None, None))
-    colors: Any = ListedColormap(DISCRETE[:num_actions]) if num_actions else "PuOr"
-    if num_actions and num_actions > len(DISCRETE):
-        colors = "tab20"
+    colors: Any = ListedColormap(action_colors(num_actions)) if num_actions else "PuOr"
     axes.grid(False)
     _label_axes(axes, plane)
     return axes.pcolormesh(
@@ -101,8 +107,8 @@ def explained(parts: Mapping[str, Any]) -> Figure:
     """Optimal actions with an episode, states of bandit and environment, and importance, side by side.
 
     Args:
-      parts: "name", "environment", "plane", "best", "num_actions", "bounds", "episode" [T, O],
-        "contexts" [N, O], "visited" [N, O], "names", "importance", "action" (its name), as
+      parts: "name", "plane", "best", "num_actions", "bounds", "episode" [T, O], "contexts" [N, O],
+        "visited" [N, O], "names", "importance", "action" (its name), "summary", as
         `scb.analysis.explain.explain` gives them.
     """
     plane: Plane = parts["plane"]

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from scb import plotting
-from scb.analysis.figures import DISCRETE, trajectory_line
+from scb.analysis.figures import action_colors, trajectory_line
 from scb.analysis.planes import Plane
 from scb.analysis.states import thinned
 from scb.interactive import plotly, save_page, slider
@@ -121,8 +121,8 @@ def _best_actions(parts: Mapping[str, Any], x: Any, y: Any, observations: Any) -
         # One band of colour an action, without blending.
         edges = np.arange(number + 1) / number
         colors = [
-            (float(edge), DISCRETE[i % len(DISCRETE)])
-            for i in range(number)
+            (float(edge), color)
+            for i, color in enumerate(action_colors(number))
             for edge in edges[i : i + 2]
         ]
         scale = {

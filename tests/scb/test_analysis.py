@@ -155,6 +155,11 @@ def test_unknown_environments_have_numbered_observations():
     assert observation_names("CartPole-v1", 3)[0] == "observation 0"
 
 
+@pytest.mark.parametrize("number", [2, 4, 6, 18])
+def test_every_discrete_action_has_a_colour_of_its_own(number):
+    assert len(set(figures.action_colors(number))) == number
+
+
 def test_a_jump_of_the_angle_is_not_drawn_as_a_line():
     from matplotlib.figure import Figure
 

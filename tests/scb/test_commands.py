@@ -97,7 +97,7 @@ def test_a_discovery_leaves_a_bandit_with_its_story(discovered):
     # most.
     assert metadata["cost"]["environment_steps_training"] == 2 * 4 * 2 * 16
     assert metadata["cost"]["environment_steps_evaluation"] == 2 * 4 * 2 * 500
-    assert metadata["cost"]["environment_steps_judgements"] > 0
+    assert metadata["cost"]["environment_steps_judgements_evaluation"] > 0
     assert metadata["cost"]["seconds"] > 0
     assert {p.name for p in folder.iterdir()} >= {"config.json", "metrics.jsonl", "checkpoints"}
 

@@ -317,9 +317,27 @@ def test_failed_candidates_are_counted_and_never_poison_the_search(strategy, bro
         assert line["fitness/mean"] == pytest.approx(line["candidates/valid"], rel=1e-5)
         assert line["fitness/min"] <= line["fitness/mean"] <= line["fitness/max"] <= 0.0
     assert distance(outcome.mean) < START / 2
-    # A mean that cannot be judged is not chosen: the start stays the best.
+    # A mean that cannot be judged is not chosen: the start stays the best, and who wants the best is told.
     assert outcome.best_mean_generation == -1
     np.testing.assert_array_equal(outcome.best_mean["x"], [0.0, 0.0])
+    outcome.check()
+    with pytest.raises(
+        UserError, match="all agents of every judgement diverged, so no mean is best"
+    ):
+        outcome.check(best=True)
+
+
+def test_one_agent_that_diverged_does_not_void_a_judgement():
+    class Diverging(Parabola):
+        def evaluate_mean(self, candidate, key):
+            fitness = super().evaluate_mean(candidate, key)["fitness"]
+            return {"fitness": jnp.where(jax.random.uniform(key) < 0.3, jnp.nan, fitness)}
+
+    outcome = evolve(Diverging(), replace(CONFIG, mean_evaluations=16), quiet=True)
+    judged = [line["mean/fitness_iqm"] for line in outcome.metrics if "mean/fitness" in line]
+    assert np.isfinite(judged).all() and outcome.best_mean_generation > 0
+    assert distance(outcome.best_mean) < distance({"x": jnp.zeros(2)})
+    outcome.check(best=True)
 
 
 class Broken(Parabola):
@@ -356,7 +374,9 @@ def test_the_cost_counts_the_judgements_of_the_mean(strategy, judgements):
     one, agent = Parabola().steps(), Parabola().judgement_steps()
     assert cost["environment_steps_training"] == 64 * one.training
     assert cost["environment_steps_evaluation"] == 64 * one.evaluation
-    assert cost["environment_steps_judgements"] == judgements * 4 * agent.total > 0
+    judged = judgements * 4
+    assert cost["environment_steps_judgements_training"] == judged * agent.training
+    assert cost["environment_steps_judgements_evaluation"] == judged * agent.evaluation
     assert "generation" not in cost
     assert outcome.cost(Parabola(), config, best=True)["generation"] == outcome.best_mean_generation
 

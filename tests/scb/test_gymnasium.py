@@ -280,7 +280,15 @@ def test_with_next_step_every_other_step_of_a_bandit_is_a_reset():
         (lambda: gymnasium.make("scb/Synthetic", file="missing.npz"), "missing.npz"),
         (lambda: gymnasium.make_vec(BANDIT, autoreset_mode="never"), "autoreset mode"),
         (lambda: gymnasium.make_vec(BANDIT, num_envs=0), "num_envs is 0"),
-        (lambda: SyntheticVectorEnv("Synthetic-Pendulum-v1").step(np.zeros((1, 1))), "reset first"),
+        *(
+            (
+                lambda mode=mode: SyntheticVectorEnv("Synthetic-Pendulum-v1", 1, mode).step(
+                    np.zeros((1, 1))
+                ),
+                "reset first",
+            )
+            for mode in ("SameStep", "NextStep", "Disabled")
+        ),
     ],
 )
 def test_what_cannot_be_made_is_refused(made, message):

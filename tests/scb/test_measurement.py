@@ -278,6 +278,18 @@ def test_agents_of_one_seed_share_out_what_is_drawn_and_their_rows_say_it(bandit
     np.testing.assert_allclose(rates, [0.001, 0.001, 0.01, 0.01])
 
 
+def test_rows_say_the_clip_that_was_drawn_where_no_objective_took_its_place(bandit):
+    spec = AgentSpec("ppo", CONFIG, PPOHyperparameters(), {"drift": (0.1, 0.4)})
+    agents = Agents.drawn_from(spec, seed=7, number=2)
+    place = Place.named("CartPole-v1")
+    size = {"episodes": 1, "points": 1}
+    own = measure(spec, place, place, agents, **size)
+    assert {round(row["drift"], 3) for row in own} == {0.1, 0.4}
+    assert not any(
+        "drift" in row for row in measure(spec, place, place, agents, objectives=CLIPS, **size)
+    )
+
+
 def test_a_traced_number_of_iterations_trains_as_long(bandit):
     agent = SPEC.agent(bandit.env)
     judge = Judge(bandit.env, bandit.params, episodes=2)
