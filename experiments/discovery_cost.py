@@ -94,7 +94,7 @@ def _run(folder: Path) -> dict[str, Any] | str:
     # Before every generation, and after the last.
     minutes = list(accumulate([x / 60 for x in seconds], initial=warm["minutes"] or 0.0))
     steps = [x + (warm["steps"] or 0) for x in (0, *(row["steps/total"] for row in rows))]
-    judged = [(g, x) for g, x in judgements(rows) if x["fitness"] is not None]
+    judged = [(g, x) for g, x in judgements(rows) if _judged(x) is not None]
     points = [[g, round(minutes[g], 3), steps[g], _judged(x)] for g, x in judged]
     if not points:
         return "it has not been judged yet"
@@ -133,9 +133,9 @@ def _run(folder: Path) -> dict[str, Any] | str:
     }
 
 
-def _judged(found: Mapping[str, Any]) -> float:
+def _judged(found: Mapping[str, Any]) -> float | None:
     """The interquartile mean over the agents, which targets are stated in; the mean where none was logged."""
-    return float(found.get(f"fitness{_IQM}", found["fitness"]))
+    return found.get(f"fitness{_IQM}", found["fitness"])
 
 
 def _warm_start(folder: Path, environment: str) -> dict[str, Any]:

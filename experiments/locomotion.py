@@ -23,7 +23,7 @@ from experiments.harness import Experiment, Report, packed
 from experiments.parts import InParts, Keys, Part, lacking
 from lpo import figures
 from lpo.comparison import Comparison, LearningCurves, compare, ppo_spec
-from lpo.full_size import as_comparison
+from lpo.full_size import REFERENCE, Confirmation, as_comparison, looked_at, with_pairs
 from lpo.objectives import CLIPS, load_objective
 from scb.errors import at_least
 from scb.files import plain
@@ -32,31 +32,11 @@ from scb.seeds import reporting, validation
 from scb.statistics import Estimate, iqm, paired_difference
 
 BACKEND = "generalized"
-REFERENCE = "ppo"
 MARGIN = 0.05  # of what the reference earns: what is not worse by more is as good
 AS_GOOD = {
     "final": "ends no lower than PPO",
     "late": "earns no less over the last quarter than PPO",
 }
-
-
-@dataclass(frozen=True)
-class Confirmation:
-    """One claim, stated before any of its agents was trained, and decided when all have been.
-
-    Attributes:
-      environment, objective: whose it is.
-      seeds: of its agents, none of which suggested the claim.
-      of: what is said of them, as `AS_GOOD` has it.
-    """
-
-    environment: str
-    objective: str
-    seeds: Sequence[int]
-    of: str = "final"
-
-
-CONFIRMATIONS = (Confirmation("hopper", "ta-lpo", reporting(30, offset=20)),)
 
 
 @dataclass(frozen=True)
@@ -199,24 +179,15 @@ def claims(report: Report) -> list[Claim]:
 
 def _as_good(curves: LearningCurves, reference: LearningCurves, of: str) -> Claim:
     text = f"{curves.environment}: {curves.objective} {AS_GOOD[of]}"
-    margin = round(MARGIN * float(getattr(reference, of).mean()), 1)
+    margin = round(MARGIN * abs(float(getattr(reference, of).mean())), 1)
     reason = "a twentieth of what PPO's clip earns"
     return Claim(text, paired(curves, reference, of), 0.0, margin, reason, places=0)
-
-
-def _asked(report: Report) -> Iterator[tuple[Confirmation, list[str]]]:
-    """Every confirmation of what a report has agents of, and its seeds of which both agents are there."""
-    for asked in CONFIRMATIONS:
-        agents = report["environments"].get(asked.environment, {}).get("agents", {})
-        if REFERENCE in agents and asked.objective in agents:
-            both = agents[REFERENCE].keys() & agents[asked.objective].keys()
-            yield asked, [str(s) for s in asked.seeds if str(s) in both]
 
 
 def confirmed(report: Report) -> list[tuple[Confirmation, int, Judged | None]]:
     """Of every confirmation: how many of its pairs of agents there are, and once all are, what became of it."""
     found: list[tuple[Confirmation, int, Judged | None]] = []
-    for asked, seeds in _asked(report):
+    for asked, seeds in with_pairs(report):
         judged = None
         if len(seeds) == len(asked.seeds):
             entry = report["environments"][asked.environment]
@@ -226,25 +197,6 @@ def confirmed(report: Report) -> list[tuple[Confirmation, int, Judged | None]]:
             (judged,) = judge([_as_good(curves, reference, asked.of)])
         found.append((asked, len(seeds), judged))
     return found
-
-
-def looked_at(report: Report) -> dict[str, Any]:
-    """{environment: its entry} without the agents of confirmations that are not complete.
-
-    Who looks at a difference while it grows sees it pass its margin sooner or later.
-    """
-    pending = [asked for asked, seeds in _asked(report) if len(seeds) < len(asked.seeds)]
-    found = {}
-    for environment, entry in report["environments"].items():
-        apart = {
-            str(s) for asked in pending if asked.environment == environment for s in asked.seeds
-        }
-        agents = {
-            name: {seed: agent for seed, agent in of_it.items() if seed not in apart}
-            for name, of_it in entry["agents"].items()
-        }
-        found[environment] = {**entry, "agents": {k: of_it for k, of_it in agents.items() if of_it}}
-    return {environment: entry for environment, entry in found.items() if entry["agents"]}
 
 
 def facts(report: Report) -> dict[str, Any]:

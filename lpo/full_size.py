@@ -4,7 +4,8 @@
 """
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -13,14 +14,63 @@ import numpy as np
 
 from lpo.comparison import Comparison, LearningCurves
 from scb.agents.ppo import DIAGNOSIS
+from scb.seeds import reporting
 
 PATH = Path(__file__).with_name("measured") / "locomotion.json"
+REFERENCE = "ppo"
+
+
+@dataclass(frozen=True)
+class Confirmation:
+    """One claim, stated before any of its agents was trained, and decided when all have been.
+
+    Attributes:
+      environment, objective: whose it is.
+      seeds: of its agents, none of which suggested the claim.
+      of: what is said of them, "final" or "late".
+    """
+
+    environment: str
+    objective: str
+    seeds: Sequence[int]
+    of: str = "final"
+
+
+CONFIRMATIONS = (Confirmation("hopper", "ta-lpo", reporting(30, offset=20)),)
 
 
 def full_size(environment: str) -> Comparison | None:
     """What was measured there at the paper's full number of steps, the first objective PPO's own; None for nothing."""
-    found = _kept()["environments"].get(environment)
+    found = looked_at(_kept()).get(environment)
     return None if found is None else as_comparison(environment, found)
+
+
+def with_pairs(report: Mapping[str, Any]) -> Iterator[tuple[Confirmation, list[str]]]:
+    """Every confirmation of what a report has agents of, and its seeds of which both agents are there."""
+    for asked in CONFIRMATIONS:
+        agents = report["environments"].get(asked.environment, {}).get("agents", {})
+        if REFERENCE in agents and asked.objective in agents:
+            both = agents[REFERENCE].keys() & agents[asked.objective].keys()
+            yield asked, [str(s) for s in asked.seeds if str(s) in both]
+
+
+def looked_at(report: Mapping[str, Any]) -> dict[str, Any]:
+    """{environment: its entry} without the agents of confirmations that are not complete.
+
+    Who looks at a difference while it grows sees it pass its margin sooner or later.
+    """
+    pending = [asked for asked, seeds in with_pairs(report) if len(seeds) < len(asked.seeds)]
+    found = {}
+    for environment, entry in report["environments"].items():
+        apart = {
+            str(s) for asked in pending if asked.environment == environment for s in asked.seeds
+        }
+        agents = {
+            name: {seed: agent for seed, agent in of_it.items() if seed not in apart}
+            for name, of_it in entry["agents"].items()
+        }
+        found[environment] = {**entry, "agents": {k: of_it for k, of_it in agents.items() if of_it}}
+    return {environment: entry for environment, entry in found.items() if entry["agents"]}
 
 
 def longer(comparison: Comparison) -> Comparison | None:

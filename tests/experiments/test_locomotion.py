@@ -164,8 +164,8 @@ def test_the_width_of_a_policy_is_read_off_its_entropy():
 
 
 def test_a_confirmation_is_decided_by_its_own_agents_when_all_are_there(monkeypatch):
-    asked = module.Confirmation("hopper", "dpo", range(4, 14))
-    monkeypatch.setattr(module, "CONFIRMATIONS", (asked,))
+    asked = full_size.Confirmation("hopper", "dpo", range(4, 14))
+    monkeypatch.setattr(full_size, "CONFIRMATIONS", (asked,))
     made = report(13)
     for seed in range(4):  # which say the opposite, and are not asked
         made["environments"]["hopper"]["agents"]["dpo"][str(seed)]["returns"] = "0 0 -9000"
@@ -174,6 +174,8 @@ def test_a_confirmation_is_decided_by_its_own_agents_when_all_are_there(monkeypa
     # Until then they are in nothing else: of the seeds 0 to 3 the difference is below.
     assert [len(c.seeds) for c in module.facts(made)["comparisons"]["hopper"].curves] == [4, 4, 4]
     assert {x.estimate.n for x in claims.judge(module.claims(made)) if x.estimate} == {4}
+    monkeypatch.setattr(full_size, "_kept", lambda: made)
+    assert [len(c.seeds) for c in full_size.full_size("hopper").curves] == [4, 4, 4]
     more = report(14)["environments"]["hopper"]["agents"]
     for name, agents in made["environments"]["hopper"]["agents"].items():
         agents["13"] = more[name]["13"]
