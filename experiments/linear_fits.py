@@ -8,7 +8,7 @@ too; agents train in it and are judged in the environment. No evolution is invol
 command adds searches.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache, partial
 from typing import Any
@@ -17,9 +17,10 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from experiments.claims import Claim
-from experiments.harness import Experiment, Report, packed, unpacked
+from experiments.harness import Experiment, Report, finite, packed, unpacked
 from experiments.parts import InParts, Part
 from experiments.rendering import either
+from experiments.searches import ENOUGH
 from scb import plotting
 from scb.agents.spec import bandit_agent
 from scb.environments.registry import environment_spec
@@ -56,7 +57,7 @@ class Options:
 
     environments: tuple[str, ...] = ("hopper",)
     """of Brax"""
-    seeds: int = 3
+    seeds: int = ENOUGH
     """searches of each kind"""
     first_seed: int = 20
     """of the searches"""
@@ -111,14 +112,18 @@ def _searched(environment: str, name: str, seed: int, options: Options) -> dict[
             agents = Agents.drawn_from(spec, REPORTING.start, number)
             size = {"episodes": options.episodes, "side_by_side": number}
             returns = pivot(measure(spec, trained_in, place, agents, **size), "agent")
-            found["returns"][contexts][algorithm] = packed([np.nan_to_num(returns)])[0]
+            random = environment_spec(environment).random_return(BACKEND)
+            found["returns"][contexts][algorithm] = packed([finite(returns, random)[0]])[0]
     print(f"{environment}, {name}, seed {seed}: {found}", flush=True)
     return found
 
 
-def earned(entry: Mapping[str, Any], expert: str, contexts: str, algorithm: str) -> np.ndarray:
-    """[searches, agents] returns."""
-    return unpacked([found["returns"][contexts][algorithm] for found in entry[expert].values()])
+def earned(
+    entry: Mapping[str, Any], expert: str, contexts: str, algorithm: str, seeds: Iterable[str] = ()
+) -> np.ndarray:
+    """[searches, agents] returns, of the searches of these seeds, or of all."""
+    searches = [entry[expert][seed] for seed in seeds or sorted(entry[expert])]
+    return unpacked([found["returns"][contexts][algorithm] for found in searches])
 
 
 def claims(report: Report) -> list[Claim]:
@@ -135,12 +140,12 @@ def claims(report: Report) -> list[Claim]:
                 "errors earn them more than no errors in jittered contexts",
             ),
         ):
-            groups = (earned(entry, expert, contexts, "ppo"), earned(entry, other, others, "ppo"))
-            same = len(groups[0]) == len(groups[1])
-            if len(groups[0]) < 3 or not same:
-                found.append(Claim(f"{environment}: {text}", None, places=0))
-                continue
-            evidence = partial(pooled_estimate, *groups, paired_groups=True)
+            seeds = sorted(entry[expert].keys() & entry[other].keys())
+            evidence = None
+            if len(seeds) >= ENOUGH:
+                ours = earned(entry, expert, contexts, "ppo", seeds)
+                theirs = earned(entry, other, others, "ppo", seeds)
+                evidence = partial(pooled_estimate, ours, theirs, paired_groups=True)
             found.append(Claim(f"{environment}: {text}", evidence, places=0))
     return found
 

@@ -7,6 +7,8 @@ from experiments import linear_fits as module
 from experiments.claims import FAILS, HOLDS, UNTESTED
 from experiments.harness import packed
 
+FIVE = range(20, 25)
+
 
 def entry(seeds, **ppo):
     """Searches whose PPO agents earn this in jittered contexts, give or take a little, and half of it in others."""
@@ -40,16 +42,29 @@ def outcomes(found):
     return [x.outcome for x in module.EXPERIMENT.judged(found)]
 
 
-def test_what_earns_agents_more_is_shown_by_three_searches():
-    assert outcomes(report(1, 2, 3)) == [HOLDS] * 4
+def test_what_earns_agents_more_is_shown_by_five_searches():
+    assert outcomes(report(*FIVE)) == [HOLDS] * 4
     # Errors earn less than noise in the same contexts, but more than noise had in contexts without jitter.
-    assert outcomes(report(1, 2, 3, errors=500.0)) == [HOLDS, FAILS, HOLDS, HOLDS]
-    assert outcomes(report(1, 2)) == [UNTESTED] * 4
+    assert outcomes(report(*FIVE, errors=500.0)) == [HOLDS, FAILS, HOLDS, HOLDS]
+    assert outcomes(report(*FIVE[:4])) == [UNTESTED] * 4
+
+
+def test_searches_are_paired_by_seed_in_whatever_order_they_ended():
+    found = report(*FIVE)
+    entry = found["environments"]["hopper"]
+    for level, seed in enumerate(FIVE):
+        for kind in entry.values():
+            arms = kind[str(seed)]["returns"]
+            arms["stretched and jittered"]["ppo"] = packed([np.full(12, 100.0 * level)])[0]
+    before = [x.estimate for x in module.EXPERIMENT.judged(found)]
+    entry["errors"] = dict(reversed(entry["errors"].items()))
+    assert [x.estimate for x in module.EXPERIMENT.judged(found)] == before
+    assert before[1].low == before[1].high == 0.0
 
 
 def test_the_page_has_a_row_for_every_expert_and_contexts():
-    page = module.EXPERIMENT.page(report(1, 2, 3))
-    assert "| errors | stretched and jittered | 3000 | 1500 [" in page and page.count("| 3 |") == 9
+    page = module.EXPERIMENT.page(report(*FIVE))
+    assert "| errors | stretched and jittered | 3000 | 1500 [" in page and page.count("| 5 |") == 9
     assert (
         "hopper: a search has 30 or 40 generations" in page and "12 agents of PPO and 4 of" in page
     )
@@ -62,7 +77,7 @@ def test_the_page_has_a_row_for_every_expert_and_contexts():
 
 
 def test_the_figure_has_an_interval_for_every_expert_and_contexts():
-    (figure,) = module.EXPERIMENT.figures(report(1, 2, 3)).values()
+    (figure,) = module.EXPERIMENT.figures(report(*FIVE)).values()
     ppo, td3 = figure.axes
     # Agents, an interval and an estimate each; and what standing still earns.
     assert len(ppo.lines) == len(td3.lines) == 9 * 3 + 1
