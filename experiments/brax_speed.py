@@ -15,7 +15,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from experiments.harness import Experiment, Report, Save
+from experiments.harness import Experiment, Report, Save, settled
 from experiments.timing import OWN, in_turn, without_compilation_cache
 from scb.environments.brax_physics import CHUNK
 from scb.environments.registry import environment_spec, families
@@ -73,7 +73,7 @@ def measure(options: Options, report: dict[str, Any], save: Save) -> None:
     """An environment at a time."""
     import brax.envs  # it prints what it misses
 
-    report |= {"num_envs": options.num_envs, "steps": options.steps, "repeats": options.repeats}
+    settled(report, num_envs=options.num_envs, steps=options.steps, repeats=options.repeats)
     found = report.setdefault("environments", {})
     steps = options.num_envs * options.steps
     for name in options.environments:

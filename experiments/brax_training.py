@@ -263,11 +263,11 @@ def facts(report: Report) -> dict[str, Any]:
 
 def _ratio(row: Mapping[str, Any], steps: float | None) -> float:
     """The environment's steps as a multiple of the bandit's; where they were not enough, of those that were trained."""
-    return float((steps or row["trained"]) / row["bandit_steps"])
+    return float((row["trained"] if steps is None else steps) / row["bandit_steps"])
 
 
 def _times(row: Mapping[str, Any], steps: float | None) -> str:
-    return f"{'' if steps else 'more than '}{_ratio(row, steps):.0f}"
+    return f"{'more than ' if steps is None else ''}{_ratio(row, steps):.0f}"
 
 
 def draw(report: Mapping[str, Any]) -> Figure:

@@ -240,7 +240,9 @@ class Experiment:
         given = {**plan, **further, "rows": rows} if self.presets else options
         if isinstance(self.measure, InParts) and jobs.executor != "here":
             kept = out.with_suffix(".parts")
-            elsewhere(self.measure.parts(given, report), report, save, jobs, kept)
+            elsewhere(
+                self.measure.parts(given, report), report, save, jobs, kept, settings=str(given)
+            )
             shutil.rmtree(kept)
         else:
             self.measure(given, report, save)
@@ -307,6 +309,21 @@ def read(path: Path, missing_is_new: bool = False, keys: Iterable[str] = ()) -> 
             f"{path} is no report of this command ({error}): measure first, or choose another --out."
         ) from error
     return report
+
+
+def settled(report: dict[str, Any], **settings: Any) -> None:
+    """Notes in a report what it is measured with.
+
+    Raises:
+      UserError: what it holds was measured with something else.
+    """
+    for name, value in settings.items():
+        value = json.loads(json.dumps(value))
+        if report.setdefault(name, value) != value:
+            raise UserError(
+                f"the report holds what was measured with {name} {report[name]}, and {value} is asked for: choose "
+                "another --out."
+            )
 
 
 def bandit_of(environment: str) -> tuple[SyntheticBandit, str]:

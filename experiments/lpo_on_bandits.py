@@ -22,7 +22,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, LogLocator, NullFormatter, StrMethodFormatter
 
 from experiments.claims import OF_THE_WAY, Claim, of_the_way
-from experiments.harness import Experiment, Preset, Report, Save
+from experiments.harness import Experiment, Preset, Report, Save, settled
 from experiments.locomotion import paired
 from experiments.searches import judgements, objective_of_run, read_log
 from lpo import figures
@@ -31,7 +31,6 @@ from lpo.full_size import full_size
 from lpo.objectives import CLIPS, Objective, load_objective
 from scb import plotting
 from scb.agents.spec import AgentSpec, environment_agent
-from scb.errors import UserError
 from scb.rows import Rows
 from scb.seeds import REPORTING, reporting, validation
 from scb.statistics import Estimate, estimate, iqm, pooled_estimate
@@ -84,7 +83,7 @@ def claims(report: Report) -> list[Claim]:
         alike = _above(finals, *learned) if same else None
         found.append(Claim(text, alike, 0.0, of_the_way("Pendulum-v1"), OF_THE_WAY, places=1))
     curves = on_hopper()
-    margin = round(0.1 * float(curves["ppo"].final.mean()), 1)
+    margin = round(0.1 * abs(float(curves["ppo"].final.mean())), 1)
     for name in (BANDIT, ENVIRONMENT):
         # Of one search each, which decides nothing.
         evidence = paired(curves[name], curves["ppo"], "final") if name in curves else None
@@ -245,9 +244,8 @@ def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None
     for source, search in plan["searches"].items():
         seeds = range(search["seeds"])
         groups[f"LPO ({source})"] = [partial(learned, source, seed) for seed in seeds]
-        entry = found.setdefault(source, {"settings": search["settings"], "curves": []})
-        if entry["settings"] != search["settings"]:
-            raise UserError("the report is of other searches: choose another --out.")
+        entry = found.setdefault(source, {"curves": []})
+        settled(entry, settings=search["settings"])
         for seed in seeds[len(entry["curves"]) :]:
             cost = learned(source, seed).metadata["cost"]
             judging = "environment_steps_judgements"

@@ -180,12 +180,14 @@ def elsewhere(
     folder: Path,
     tell: Callable[[str], None] = print,
     every: float = 1.0,
+    settings: str = "",
 ) -> None:
     """Measures what the report lacks as jobs, so many at a time, and saves as they end.
 
     Args:
       folder: for what jobs find and say; that of another start of the same command is continued.
       every: seconds between two looks at the jobs.
+      settings: of the measurement: what was found with others is not taken.
 
     Raises:
       UserError: some of them failed; what the others found is in the report.
@@ -193,7 +195,7 @@ def elsewhere(
     make_folder(folder)
     # Two that stand in one place are one: its job would only wait for the other's.
     named = {part.name: part for part in parts if not part.there(report)}
-    kept = {part: folder / f"{_digest(part)}.json" for part in named.values()}
+    kept = {part: folder / f"{_digest(part, settings)}.json" for part in named.values()}
 
     def taken(part: Part) -> bool:
         if kept[part].exists():
@@ -234,5 +236,5 @@ def elsewhere(
         )
 
 
-def _digest(part: Part) -> str:
-    return hashlib.sha256(part.name.encode()).hexdigest()[:16]
+def _digest(part: Part, settings: str) -> str:
+    return hashlib.sha256(f"{part.name} {settings}".encode()).hexdigest()[:16]

@@ -29,7 +29,7 @@ from typing import Any
 
 import numpy as np
 
-from experiments.harness import Experiment, Report, Save
+from experiments.harness import Experiment, Report, Save, settled
 from lpo import objectives
 from lpo.commands import MetaTrain
 from scb.commands import Discover
@@ -82,7 +82,7 @@ class Options:
 
 def measure(options: Options, report: dict[str, Any], save: Save) -> None:
     """Kills first; what a report holds already is not done again."""
-    report["seed"] = options.seed
+    settled(report, seed=options.seed)
     with tempfile.TemporaryDirectory() as folder:
         for name in options.commands:
             command = COMMANDS[name]

@@ -21,14 +21,14 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from experiments.claims import TENTH, Claim
-from experiments.harness import Experiment, Report, finite, packed, plan_of, unpacked
+from experiments.harness import Experiment, Report, finite, packed, plan_of, settled, unpacked
 from experiments.parts import InParts, Part
 from lpo.comparison import check_names, ppo_spec
 from lpo.objectives import Objective, load_objective
 from lpo.suite import suite
 from scb.agents.spec import AgentSpec
 from scb.environments.registry import environment_spec
-from scb.errors import UserError, at_least
+from scb.errors import at_least
 from scb.measurement import Agents, Place, measure
 from scb.plotting import BLUE, VERMILLION, estimate_row, figure_title
 from scb.rows import Rows
@@ -72,11 +72,7 @@ class Options:
 def parts(options: Options, report: dict[str, Any]) -> Iterator[Part]:
     """One setting of one environment with one objective at a time."""
     first = FIRST_TO_CHOOSE if options.validation else FIRST_SEED
-    if report.setdefault("first_seed", first) != first:
-        raise UserError(
-            f"the report holds agents of seeds from {report['first_seed']} on, and these would be from {first} on: "
-            "give --out another file."
-        )
+    settled(report, first_seed=first)
     loaded = [None if x == DRAWN else load_objective(x) for x in options.objectives]
     check_names([x for x in loaded if x])
     objectives = {DRAWN if x is None else x.name: x for x in loaded}

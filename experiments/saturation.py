@@ -17,14 +17,14 @@ import jax.numpy as jnp
 import numpy as np
 from matplotlib.figure import Figure
 
-from experiments.harness import Experiment, Report, Save, finite, packed, unpacked
+from experiments.harness import Experiment, Report, Save, finite, packed, settled, unpacked
 from experiments.zoo_table import Candidate, candidates
 from experiments.zoo_table_page import BANDITS
 from scb import plotting
 from scb.agents.spec import bandit_agent
 from scb.aggregation import Learners
 from scb.environments.registry import environment_spec
-from scb.errors import UserError, at_least, one_of
+from scb.errors import at_least, one_of
 from scb.importer import PUBLISHED_BANDITS
 from scb.keys import named_key, root_key
 from scb.measurement import Place
@@ -109,9 +109,7 @@ def measured(candidate: Candidate, options: Options) -> dict[str, Any]:
 
 def measure(options: Options, report: dict[str, Any], save: Save) -> None:
     """A bandit at a time; what the report holds of the same one is not measured again."""
-    size = {"agents": options.agents, "episodes": options.episodes}
-    if report.setdefault("size", size) != size:
-        raise UserError(f"the report is of {report['size']}, not {size}: choose another --out.")
+    settled(report, size={"agents": options.agents, "episodes": options.episodes})
     found = report.setdefault("environments", {})
     for environment in options.environments:
         entry = found.setdefault(environment, {})

@@ -21,7 +21,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
 from experiments.claims import DECIDING, Claim, of_agents
-from experiments.harness import Experiment, Report, Save, packed, unpacked
+from experiments.harness import Experiment, Report, Save, packed, settled, unpacked
 from experiments.rendering import text
 from scb import plotting
 from scb.environments.registry import environment_spec
@@ -83,7 +83,7 @@ def measure(options: Options, report: dict[str, Any], save: Save) -> None:
     if not options.python.exists():
         raise UserError(f"{options.python} is not there: run `make sb3`, or give another --python.")
     agents = report.setdefault("agents", {})
-    report |= {"steps": STEPS, "episodes": EPISODES}
+    settled(report, steps=STEPS, episodes=EPISODES)
 
     def trained(job: Mapping[str, Any]) -> dict[str, Any]:
         command = [str(options.python), str(PEER_SCRIPT), json.dumps(job)]

@@ -23,7 +23,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from experiments.harness import Experiment, Report
+from experiments.harness import Experiment, Report, settled
 from experiments.parts import InParts, Part
 from lpo.inner_loop import MetaTrainingConfig
 from lpo.meta_training import MetaTraining
@@ -55,13 +55,15 @@ class Options:
     def __post_init__(self) -> None:
         at_least(1, self, "candidates")
         at_least(3, self, "generations")
-        if min(self.processes, default=0) < 1:
-            raise UserError("--processes are numbers from 1 on: give one at least.")
+        if min(self.processes, default=0) < 1 or not {1} < set(self.processes):
+            raise UserError(
+                f"--processes are {self.processes}: give 1, which the others are compared with, and larger numbers."
+            )
 
 
 def parts(options: Options, report: dict[str, Any]) -> Iterator[Part]:
     """Numbers of processes, then what is not divided among them."""
-    report |= {"candidates": options.candidates, "devices": DEVICES}
+    settled(report, candidates=options.candidates, devices=DEVICES)
     for number in options.processes:
         yield Part(("generations", str(number)), partial(_generations, number, options))
     for number in options.processes:

@@ -12,7 +12,7 @@ import numpy as np
 
 from experiments.rendering import text
 from lpo.commands import MetaTrain
-from lpo.objectives import Objective, load_objective
+from lpo.objectives import Objective
 from scb.command_line import Output
 from scb.curriculum import CurriculumConfig, paper_curriculum
 from scb.discovery import BanditDiscovery, DiscoveryConfig, discover
@@ -83,10 +83,7 @@ def meta_training(settings: Mapping[str, Any]) -> MetaTrain:
 
 
 def objective_of_run(settings: Mapping[str, Any], folder: Path) -> Objective:
-    """The objective of a run folder of that command: read, or learned first, or its run resumed."""
-    path = folder / "objective.npz"
-    if path.with_suffix(".json").exists():  # it is written last
-        return load_objective(path)
+    """The objective of a run folder of that command, and of no other: read, or learned first, or its run resumed."""
     resume = folder if (folder / "config.json").exists() else None
     return replace(meta_training(settings), output=Output(folder, resume)).objective()
 

@@ -21,14 +21,14 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from experiments.claims import FAILS, HOLDS, UNDECIDED, Claim, judge
-from experiments.harness import Experiment, Report, plan_of
+from experiments.harness import Experiment, Report, plan_of, settled
 from experiments.parts import InParts, Keys, Part, lacking
 from experiments.searches import meta_training, objective_of_run
 from lpo.comparison import compare, ppo_spec
 from lpo.objectives import Objective, load_objective
 from lpo.suite import suite
 from scb.environments.registry import environment_spec
-from scb.errors import UserError, unknown_name
+from scb.errors import unknown_name
 from scb.plotting import BLUE, GREY, VERMILLION, estimate_row
 from scb.rows import Rows
 from scb.seeds import REPORTING
@@ -210,11 +210,8 @@ def parts(options: Options, report: dict[str, Any]) -> Iterator[Part]:
         if name not in VARIATIONS:
             raise unknown_name("variation", name, list(VARIATIONS))
     searches = {"generations": options.generations, "population_size": options.population_size}
-    if report.get("searches", searches) != searches:
-        raise UserError(
-            f"the report is of other searches ({report['searches']}): choose another --out."
-        )
-    report |= {"searches": searches, "evaluations": [asdict(e) for e in EVALUATIONS]}
+    settled(report, searches=searches)
+    report["evaluations"] = [asdict(e) for e in EVALUATIONS]
     seeds = [str(seed) for seed in options.meta_seeds]
     for name, seed in (
         *((name, NO_SEARCH) for name in REFERENCES),

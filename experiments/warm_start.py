@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from experiments.harness import Experiment, Save
+from experiments.harness import Experiment, Save, settled
 from experiments.rendering import number, text
 from scb.agents.spec import algorithms_for, bandit_agent
 from scb.environments.synthetic import BanditConfig, bandit_for
@@ -71,7 +71,7 @@ class Options:
 
 def measure(options: Options, report: dict[str, Any], save: Save) -> None:
     """An environment at a time."""
-    report |= {"seed": SEED, "agents": options.agents, "episodes": options.episodes}
+    settled(report, seed=SEED, agents=options.agents, episodes=options.episodes)
     report.setdefault("environments", {})
     for name in options.environment:
         judge_in = Place.named(name)

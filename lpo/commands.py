@@ -37,7 +37,7 @@ def _meta_training(
     population: int, generations: int, given: Mapping[str, str]
 ) -> MetaTrainingConfig:
     """A preset of meta-training."""
-    if "environment" in given and "tasks" in given:
+    if given.get("environment", given.get("tasks")) != given.get("tasks", given.get("environment")):
         raise UserError(
             f"the environment {given['environment']} and the tasks {given['tasks']} are both given: name all in "
             "the tasks."

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from experiments.harness import Experiment
-from experiments.parts import InParts, Jobs, Measurement, Part, elsewhere
+from experiments.parts import InParts, Jobs, Measurement, Part, _digest, elsewhere
 from scb.errors import UserError
 
 
@@ -86,12 +86,21 @@ def test_jobs_measure_what_is_missing_and_say_what_failed(tmp_path, capsys):
 def test_what_an_earlier_start_found_is_taken(tmp_path, monkeypatch):
     (part,) = parts_of(tmp_path, "a")
     monkeypatch.setattr(Jobs, "executor_in", lambda *_: pytest.fail("nothing is missing"))
-    monkeypatch.setattr("experiments.parts._digest", lambda part: "kept")
+    monkeypatch.setattr("experiments.parts._digest", lambda part, settings: "kept")
     Measurement(part, tmp_path / "kept.json")()
     report, saved = {}, []
     elsewhere([part], report, lambda: saved.append(1), Jobs("local"), tmp_path, lambda _: None)
     assert report["found"]["a"]["number"] == 1 and saved == [1]
     assert not (tmp_path / "kept.json").exists()
+
+
+def test_what_was_found_with_other_settings_is_not_taken(tmp_path):
+    (part,) = parts_of(tmp_path, "a")
+    Measurement(part, tmp_path / f"{_digest(part, 'few')}.json")()
+    for settings, number in (("many", 2), ("few", 2)):
+        report, jobs = {}, Jobs("local")
+        elsewhere([part], report, lambda: None, jobs, tmp_path, lambda _: None, 0.1, settings)
+        assert part.there(report) and len(times(tmp_path)) == number
 
 
 def test_what_is_named_twice_is_one_job(tmp_path):

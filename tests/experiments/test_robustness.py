@@ -122,7 +122,7 @@ def test_validation_is_on_other_seeds_and_in_a_report_of_its_own(report, tmp_pat
     out.write_text(json.dumps(report))
     assert module.EXPERIMENT.main(["--validation", "--out", str(out)]) == 2
     error = capsys.readouterr().err
-    assert f"agents of seeds from {module.FIRST_SEED} on, and these would be from" in error
+    assert f"measured with first_seed {module.FIRST_SEED}, and" in error
     assert module.FIRST_SEED in REPORTING and module.FIRST_TO_CHOOSE in VALIDATING
     assert json.loads(out.read_text()) == report
 

@@ -65,7 +65,7 @@ def test_impossible_options_are_refused(options, message):
 
 def test_a_report_of_another_size_is_not_gone_on_with():
     report = {"size": {"agents": 4, "episodes": 1}}
-    with pytest.raises(UserError, match=r"the report is of .*'agents': 4.*choose another --out"):
+    with pytest.raises(UserError, match=r"with size .*'agents': 4.*choose another --out"):
         saturation.measure(Options(environments=()), report, lambda: None)
 
 

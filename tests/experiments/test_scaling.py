@@ -44,6 +44,9 @@ def test_the_page_says_what_a_core_is_worth_and_from_where_gathering_costs():
     assert "at no number of processes" in scaling.EXPERIMENT.page(report({"2": 2.0, "4": 2.0}))
 
 
-def test_processes_that_cannot_be_are_refused(capsys):
-    assert scaling.EXPERIMENT.main(["--processes", "0"]) == 2
-    assert "from 1 on" in capsys.readouterr().err
+@pytest.mark.parametrize("processes", [["0", "1", "2"], ["1"], ["2", "3"]])
+def test_processes_that_cannot_be_compared_are_refused(processes, capsys):
+    assert scaling.EXPERIMENT.main(["--processes", *processes]) == 2
+    assert (
+        "give 1, which the others are compared with, and larger numbers" in capsys.readouterr().err
+    )
