@@ -100,6 +100,8 @@ class MetaTrainingConfig:
         if self.fitness not in FITNESSES:
             raise unknown_name("fitness", self.fitness, FITNESSES)
         at_least(1, self.evolution, "num_generations")
+        if isinstance(self.tasks, str):
+            raise UserError(f"the tasks are {self.tasks!r}, a text: give a tuple of names.")
         if not self.tasks:
             raise UserError("the list of tasks is empty: give at least one bandit or environment.")
         for name in self.tasks:
@@ -110,8 +112,7 @@ class MetaTrainingConfig:
                     f"fitness {self.fitness!r} asks for a bandit, and {name!r} is none: use 'return' or 'area', or "
                     f"train on {environment_spec(name).bandit!r}."
                 )
-        if len(self.tasks) > 1:
-            check_backend(self.backend, self.homes)
+        check_backend(self.backend, self.homes)
         known = {n: environment_spec(n).reference(self.backend) is not None for n in self.homes}
         if self.validation and len(known) > 1 and not all(known.values()):
             raise UserError(
@@ -182,9 +183,9 @@ class TaskTraining:
         spec = environment_spec(environment)
         self.home = spec.evaluation_environment
         judged_in = environment_spec(self.home) if config.judgement.at_home else spec
-        # Of several tasks some may have a choice of physics; a single one is told where it has none.
-        backend = judged_in.physics(config.backend) if len(config.tasks) > 1 else config.backend
-        self.evaluation_env, self.evaluation_params = judged_in.make(backend)
+        # Some have no choice of physics, bandits among them.
+        physics = judged_in.physics(config.backend)
+        self.evaluation_env, self.evaluation_params = judged_in.make(physics)
         self.env, self.env_params = self.evaluation_env, self.evaluation_params
         if config.judgement.at_home:  # a bandit, which has no physics
             self.env, self.env_params = spec.make()

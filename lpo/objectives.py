@@ -24,7 +24,7 @@ _CLIP_NAME = re.compile(r"ppo-(\d*\.?\d+)$")
 
 @dataclass(frozen=True)
 class Objective:
-    """A drift with its parameters: what `PPO` takes as its objective.
+    """A drift with its parameters: what `scb.PPO` and its hyperparameters take.
 
     Attributes:
       name: as on the command line; a file's is the objective's.

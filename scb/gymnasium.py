@@ -88,8 +88,11 @@ class SyntheticEnv(gymnasium.Env[np.ndarray, Any]):
         if self._observation is None:
             raise UserError("the episode has not begun, or is over: call reset first.")
         if self._functions.one_step:
+            reward = self._reward(self._next - 1, np.asarray(action))
+            if reward != reward:
+                raise UserError(f"an action is {action}, which gives no reward: it must be finite.")
             observation, self._observation = self._observation[0].copy(), None
-            return observation, self._reward(self._next - 1, np.asarray(action)), True, False, {}
+            return observation, reward, True, False, {}
         after, reward, terminations = self._functions.step(
             self._observation, np.asarray(action)[None]
         )
@@ -151,7 +154,14 @@ class SyntheticVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             raise UserError(
                 f"{waiting.sum()} of {self.num_envs} episodes have not begun, or are over: call reset first."
             )
-        after, rewards, terminated = self._functions.step(self._observations, np.asarray(actions))
+        actions = np.asarray(actions)
+        if (number := len(actions) if actions.ndim else 0) != self.num_envs:
+            raise UserError(f"there are {number} actions for {self.num_envs} environments.")
+        after, rewards, terminated = self._functions.step(self._observations, actions)
+        if np.isnan(rewards).any():
+            raise UserError(
+                f"an action is {actions[np.isnan(rewards)][0]}, which gives no reward: it must be finite."
+            )
         self._times += 1
         truncated = ~terminated & (self._times >= self._functions.max_steps)
         rewards = rewards.astype(np.float64)

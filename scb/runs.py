@@ -88,9 +88,7 @@ class Run:
             make_folder(folder)
             _lock(folder)
             return cls(folder, resumed=True, wandb_project=wandb_project)
-        if folder.exists() and (
-            not folder.is_dir() or any(path.name != _LOCK for path in folder.iterdir())
-        ):
+        if folder.exists() and not _has_room(folder):
             raise UserError(
                 f"{folder} already exists and is not empty: choose another --out, or continue it with --resume."
             )
@@ -163,6 +161,20 @@ class Run:
             self._wandb.finish()
         if held := _held.pop(self.folder.resolve(), None):
             held.close()
+
+
+def _has_room(folder: Path) -> bool:
+    """Whether a run may start there: nothing is in it, or a run that ended before it had found anything.
+
+    Such as one whose expert was none: its configuration is all that it left.
+    """
+    if not folder.is_dir():
+        return False
+    held = {path.name for path in folder.iterdir()} - {_LOCK}
+    try:
+        return not held or (held == {"config.json"} and "command" in read_config(folder))
+    except UserError:
+        return False
 
 
 def _lock(folder: Path) -> None:

@@ -1,4 +1,7 @@
-"""A process that is told to end (SIGTERM, as schedulers do before they kill) saves what it has, and ends with 143."""
+"""A process that is told to end saves what it has first.
+
+By SIGTERM, as schedulers do before they kill, it ends with 143, and by SIGINT, as Ctrl-C sends it, with 130.
+"""
 
 import contextlib
 import os
@@ -7,7 +10,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 
-STATUS = 128 + signal.SIGTERM
+SAID = {signal.SIGTERM: "told to end", signal.SIGINT: "interrupted"}
 
 # Held while a checkpoint is written, so that no other thread ends the process or writes the same one meanwhile.
 writing = threading.RLock()
@@ -31,7 +34,7 @@ def saving(save: Callable[[], str]) -> Iterator[None]:
 
 
 def watch(program: str) -> None:
-    """From now on SIGTERM ends this process so. Of a main thread; once is enough."""
+    """From now on these signals end this process so. Of a main thread; once is enough."""
     global _pipe
     read, _pipe = os.pipe()
     os.set_blocking(_pipe, False)
@@ -40,17 +43,18 @@ def watch(program: str) -> None:
 
 
 def arm() -> None:
-    """Takes the signal back from what has taken it since `watch`; nothing where nobody watches."""
+    """Takes the signals back from what has taken them since `watch`; nothing where nobody watches."""
     if _pipe is None:
         return
     # Python would call a handler when the computation at hand is over. What is written for the signal's number
     # to the file descriptor is there at once.
     signal.set_wakeup_fd(_pipe, warn_on_full_buffer=False)
-    signal.signal(signal.SIGTERM, lambda *_: None)
+    for number in SAID:
+        signal.signal(number, lambda *_: None)
 
 
 def _wait(program: str, read: int) -> None:
-    while os.read(read, 1) != bytes([signal.SIGTERM]):
+    while (number := os.read(read, 1)[0]) not in SAID:
         pass
     with writing:
         said = []
@@ -61,5 +65,5 @@ def _wait(program: str, read: int) -> None:
             except Exception as error:
                 said.append(f"what was done since the last checkpoint is lost ({error}).")
         end = " ".join(said) or "a run with --out continues with --resume."
-        print(f"{program}: told to end; {end}", file=sys.stderr, flush=True)
-        os._exit(STATUS)
+        print(f"{program}: {SAID[signal.Signals(number)]}; {end}", file=sys.stderr, flush=True)
+        os._exit(128 + number)

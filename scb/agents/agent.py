@@ -73,6 +73,13 @@ class Agent(ABC):
     env: environment.Environment[Any, Any]
     config: AgentConfig
 
+    def __post_init__(self) -> None:
+        if not hasattr(self.env, "step_env"):
+            raise UserError(
+                f"the environment is a {type(self.env).__name__}: give a gymnax 1.x environment, such as the first of "
+                "scb.make(NAME)."
+            )
+
     @property
     def one_step(self) -> bool:
         """Whether every episode is a single step, so that there is never anything to bootstrap."""

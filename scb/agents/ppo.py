@@ -198,6 +198,14 @@ class PPO(Agent):
     config: PPOConfig
     drift: DriftFunction = clipped_surrogate_drift
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not callable(self.drift):
+            raise UserError(
+                f"the drift is a {type(self.drift).__name__}, which is no function: of an objective give "
+                "objective.drift, and objective.parameters as the hyperparameters' drift."
+            )
+
     def _networks(self, env_params: Any) -> tuple[Any, Any]:
         # Any: flax types `apply` as a union with mutated collections, which these never have.
         space = self.env.action_space(env_params)
@@ -210,10 +218,24 @@ class PPO(Agent):
             policy = networks.GaussianPolicy(size, sizes, activation)
         return policy, networks.ValueNetwork(sizes, activation)
 
+    def _check_parameters(self, parameters: Any) -> None:
+        """A UserError where the hyperparameters still hold a clip, which the drift cannot take."""
+        if not isinstance(parameters, float):
+            return
+        one = jnp.zeros(1)
+        try:
+            jax.eval_shape(self.drift, parameters, one, one, one)
+        except Exception as error:  # what a drift raises for parameters of another kind is its own
+            raise UserError(
+                f"the hyperparameters' drift is {parameters}, which the drift cannot take: give the objective's "
+                "parameters."
+            ) from error
+
     def init(
         self, key: jax.Array, hyperparameters: PPOHyperparameters, env_params: Any
     ) -> PPOState:
         """A fresh agent, its environments at their first observation."""
+        self._check_parameters(hyperparameters.drift)
         key_policy, key_value, key_reset, key_train = split_key(key, 4)
         policy, value = self._networks(env_params)
         size = self.observation_size(env_params)

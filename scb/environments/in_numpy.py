@@ -116,6 +116,8 @@ class InNumpy:
             table = np.stack(each, axis=1).tolist()
 
             def of_table(row: int, action: Any) -> float:
+                if action.shape or action.dtype.kind not in "iu":
+                    raise _misshapen(action[None], "a whole number")
                 if not 0 <= action < len(actions):
                     raise _outside(action, len(actions))
                 return float(table[row][action])
@@ -149,12 +151,20 @@ def _outside(action: Any, number: int) -> UserError:
     return UserError(f"an action is {action}: it must be 0 or larger, and below {number}.")
 
 
+def _misshapen(actions: Array, allowed: str) -> UserError:
+    return UserError(
+        f"an action of shape {actions.shape[1:]} and type {actions.dtype} was given: it must be {allowed}."
+    )
+
+
 def _encoding(space: spaces.Box | spaces.Discrete) -> Callable[[Array], Array]:
     """[B, ...] actions -> [B, A] as networks take them, see `scb.environments.synthetic.encode_action`."""
     if isinstance(space, spaces.Discrete):
         choices = np.eye(space.n, dtype=np.float32)
 
         def one_hot(action: Array) -> Array:
+            if action.ndim != 1 or action.dtype.kind not in "iu":
+                raise _misshapen(action, "a whole number")
             outside = (action < 0) | (action >= space.n)
             if outside.any():
                 raise _outside(action[outside][0], space.n)
@@ -168,6 +178,8 @@ def _encoding(space: spaces.Box | spaces.Discrete) -> Callable[[Array], Array]:
     # minimum and maximum are quicker than clip, of which there is one a step.
     def clipped(action: Array) -> Array:
         action = np.asarray(action, np.float32)
+        if action.shape[1:] != space.shape:
+            raise _misshapen(action, f"of shape {space.shape}")
         return np.minimum(np.maximum(action, low), high).reshape(len(action), -1)
 
     return clipped

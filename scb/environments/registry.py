@@ -42,6 +42,11 @@ def environment_spec(name: str) -> EnvironmentSpec:
     for family in _FAMILIES.values():
         if family.owns(name):
             return family.spec(name)
+    if ":" in name or "." in name:
+        raise UserError(
+            f"unknown environment {name!r}: one of your own is package.module:factory, such as my_package.arms:make; a "
+            "bandit's file ends with .npz."
+        )
     raise unknown_name("environment", name, environment_names())
 
 

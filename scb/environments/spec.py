@@ -74,6 +74,10 @@ class EnvironmentSpec:
           UserError: arguments, or a choice of physics, that the environment doesn't take.
         """
         if backend is not None:
+            if not self.backends and self.family != "custom":
+                raise UserError(
+                    f"the backend is {backend!r}, and {self.name} has no choice of physics: leave it out."
+                )
             arguments["backend"] = backend
         try:
             return self.maker(**arguments)

@@ -79,9 +79,15 @@ def test_a_number_out_of_range_is_told_its_range(refused, arguments, message):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ("train --backend spring", "'Pendulum-v1' does not take {'backend': 'spring'}"),
+        (
+            "train --backend spring",
+            "the backend is 'spring', and Pendulum-v1 has no choice of physics",
+        ),
         # Nor is a folder left behind, which would be in the corrected command's way.
-        ("train --backend spring --out new", "'Pendulum-v1' does not take {'backend': 'spring'}"),
+        (
+            "train --backend spring --out new",
+            "the backend is 'spring', and Pendulum-v1 has no choice of physics",
+        ),
         ("meta-train --environment Pendulum-v1 --fitness transfer", "asks for a bandit"),
         ("meta-train --tasks ,", "the list of tasks is empty"),
         ("meta-train --environment a --tasks b,c", "the environment a and the tasks b,c are both"),

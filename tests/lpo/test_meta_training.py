@@ -440,8 +440,8 @@ def test_environments_take_no_reward_noise(config):
     ("environment", "fitness", "made"),
     [
         # A bandit has no physics: the backend is for the environment that it stands for.
-        ("Synthetic-hopper", "transfer", [("hopper", "x"), ("Synthetic-hopper", None)]),
-        ("hopper", "return", [("hopper", "x")]),
+        ("Synthetic-hopper", "transfer", [("hopper", "spring"), ("Synthetic-hopper", None)]),
+        ("hopper", "return", [("hopper", "spring")]),
     ],
 )
 def test_physics_go_to_the_environment_and_not_to_its_bandit(
@@ -454,7 +454,7 @@ def test_physics_go_to_the_environment_and_not_to_its_bandit(
         return bandit(), bandit().default_params
 
     monkeypatch.setattr(EnvironmentSpec, "make", record)
-    MetaTraining(replace(config, tasks=(environment,), fitness=fitness, backend="x"))
+    MetaTraining(replace(config, tasks=(environment,), fitness=fitness, backend="spring"))
     assert calls == made
 
 
@@ -511,7 +511,10 @@ def test_a_configuration_that_cannot_be_is_refused(arguments, message, one_sente
     ("changes", "message"),
     [
         ({"tasks": ("Synthetic-Pendulm-v1",)}, "did you mean Synthetic-Pendulum-v1"),
-        ({"tasks": ("Pendulum-v1",), "backend": "spring"}, "does not take {'backend': 'spring'"),
+        (
+            {"tasks": ("Pendulum-v1",), "backend": "spring"},
+            "of Pendulum-v1 none has a choice: leave it out",
+        ),
     ],
 )
 def test_an_environment_that_cannot_be_is_refused(config, changes, message, one_sentence):

@@ -10,9 +10,11 @@ import pytest
 from flax import struct
 from gymnax.environments import spaces
 
+from lpo.objectives import load_objective
 from scb.agents.agent import Agent, AgentConfig, Algorithm
 from scb.agents.normalization import RunningStatistics
 from scb.agents.off_policy import OffPolicyState
+from scb.agents.ppo import PPO, PPOConfig, PPOHyperparameters
 from scb.agents.spec import ALGORITHMS, algorithms_for, bandit_agent, environment_agent
 from scb.agents.tables import Row, Tables
 from scb.agents.td3 import TD3, TD3Config, TD3Hyperparameters
@@ -22,6 +24,27 @@ from scb.environments.synthetic import BanditConfig
 from scb.errors import UserError
 from scb.warm_start import WarmStartConfig
 from tests.scb.probes import ContinuousCorridor, CorridorParams
+
+# -- what agents are made of
+# ------------------------------------------------------------
+
+
+def test_what_is_no_environment_and_what_is_no_drift_are_told_apart_from_bugs():
+    with pytest.raises(UserError, match="the environment is a str: give a gymnax 1"):
+        PPO("Pendulum-v1", PPOConfig())
+    objective = load_objective("lpo-pendulum")
+    env, params = ContinuousCorridor(), CorridorParams()
+    with pytest.raises(
+        UserError, match="the drift is a Objective, which is no function: of an obj"
+    ):
+        PPO(env, PPOConfig(), objective)
+    agent = PPO(env, PPOConfig(), objective.drift)
+    with pytest.raises(
+        UserError, match=r"the hyperparameters' drift is 0\.2, which the drift cannot take"
+    ):
+        agent.init(jax.random.key(0), PPOHyperparameters(), params)
+    agent.init(jax.random.key(0), PPOHyperparameters(drift=objective.parameters), params)
+
 
 # -- evaluation in another environment
 # ------------------------------------------------------------

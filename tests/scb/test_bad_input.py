@@ -21,7 +21,10 @@ pytestmark = pytest.mark.usefixtures("small_agents")
         ("train --algorithm pop", "unknown algorithm 'pop': did you mean ppo"),
         ("train --algorithm dqn", "dqn does not fit the environment's continuous actions: use ppo"),
         ("train --bandit FILE --algorithm td3", "td3 does not fit the environment's discrete act"),
-        ("train --backend spring", "'Pendulum-v1' does not take {'backend': 'spring'}"),
+        (
+            "train --backend spring",
+            "the backend is 'spring', and Pendulum-v1 has no choice of physics",
+        ),
         ("train --bandit Synthetic-Pendulum-v2", "unknown bandit 'Synthetic-Pendulum-v2'"),
         ("train --bandit nowhere.npz", "nowhere.npz does not exist"),
         ("train --agents 0", "agents is 0: it must be at least 1"),
@@ -49,7 +52,10 @@ pytestmark = pytest.mark.usefixtures("small_agents")
         ("discover --construction Q", "unknown warm-start construction 'Q': did you mean q"),
         ("discover --combine rank", "unknown combination of tasks 'rank': did you mean ranks"),
         ("discover --from-bandit nobody", "unknown bandit 'nobody'"),
-        ("discover --backend spring", "'Pendulum-v1' does not take {'backend': 'spring'}"),
+        (
+            "discover --backend spring",
+            "the backend is 'spring', and Pendulum-v1 has no choice of physics",
+        ),
         (
             "discover --environment Pendulum-v1 --algorithms ppo,dqn",
             "dqn does not fit the environment's continuous actions: use ppo, sac, ddpg, td3",

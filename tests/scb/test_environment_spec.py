@@ -97,7 +97,7 @@ def test_a_new_family_takes_a_class_and_a_line(corridors):
     assert spec.random_return() == 3.0
     env, env_params = make("Corridor-v0", num_actions=4)
     assert env.action_space(env_params).n == 4
-    with pytest.raises(UserError, match="environment 'Corridor-v0' does not take"):
+    with pytest.raises(UserError, match="and Corridor-v0 has no choice of physics: leave it out"):
         make("Corridor-v0", "spring")
     with pytest.raises(UserError, match="did you mean Corridor-v0"):
         make("Coridor-v0")

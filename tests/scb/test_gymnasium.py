@@ -175,6 +175,53 @@ def test_an_action_that_is_none_is_refused(action):
             env.step(np.broadcast_to(action, env.action_space.shape))
 
 
+@pytest.mark.parametrize(
+    ("name", "action", "message"),
+    [
+        (
+            "hopper",
+            0.5,
+            r"an action of shape \(\) and type float32 was given: it must be of shape \(3,\)\.",
+        ),
+        ("hopper", [0.5], r"an action of shape \(1,\) and type"),
+        (
+            "hopper",
+            [np.nan] * 3,
+            r"an action is \[nan, nan, nan\], which gives no reward: it must be finite\.",
+        ),
+        (
+            "CartPole-v1",
+            0.0,
+            r"of shape \(\) and type float64 was given: it must be a whole number\.",
+        ),
+        ("CartPole-v1", [1], r"of shape \(1,\) and type int64 was given"),
+    ],
+)
+def test_an_action_of_another_shape_or_type_is_refused(name, action, message):
+    env = gymnasium.make(f"scb/Synthetic-{name}", disable_env_checker=True)
+    env.reset(seed=0)
+    with pytest.raises(UserError, match=message):
+        env.step(action)
+
+
+@pytest.mark.parametrize(
+    ("name", "actions", "message"),
+    [
+        ("hopper", np.zeros((2, 1)), r"an action of shape \(1,\) .* it must be of shape \(3,\)"),
+        ("hopper", np.zeros((3, 3)), "there are 3 actions for 2 environments"),
+        ("hopper", np.float32(0), "there are 0 actions for 2 environments"),
+        ("hopper", np.full((2, 3), np.nan), "gives no reward: it must be finite"),
+        ("CartPole-v1", np.zeros(2), "type float64 was given: it must be a whole number"),
+        ("CartPole-v1", np.zeros((2, 1), int), r"an action of shape \(1,\) and type int64"),
+    ],
+)
+def test_actions_that_are_none_are_refused(name, actions, message):
+    envs = gymnasium.make_vec(f"scb/Synthetic-{name}", 2)
+    envs.reset(seed=0)
+    with pytest.raises(UserError, match=message):
+        envs.step(actions)
+
+
 def test_a_bandits_episode_is_one_step():
     env = gymnasium.make(BANDIT)
     first, info = env.reset(seed=1)

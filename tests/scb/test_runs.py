@@ -39,6 +39,24 @@ def test_a_run_may_start_in_an_empty_folder(tmp_path):
     assert Run.open(tmp_path / "empty", CONFIG).folder == tmp_path / "empty"
 
 
+def test_a_run_may_start_where_another_left_nothing_but_its_settings(tmp_path):
+    Run.open(tmp_path / "run", {**CONFIG, "command": "scb discover"}).close()
+    found = Run.open(tmp_path / "run", {**CONFIG, "command": "scb discover --seed=2"})
+    assert read_config(found.folder)["command"].endswith("--seed=2") and not found.resumed
+    found.log(0, {"fitness/mean": 1.0}, 0.1)
+    found.close()
+    with pytest.raises(UserError, match="already exists and is not empty"):
+        Run.open(tmp_path / "run", {**CONFIG, "command": "scb discover"})
+
+
+@pytest.mark.parametrize("settings", ['{"theirs": 1}', "no json"])
+def test_settings_that_are_no_runs_are_left_alone(tmp_path, settings):
+    (tmp_path / "config.json").write_text(settings)
+    with pytest.raises(UserError, match="already exists and is not empty"):
+        Run.open(tmp_path, CONFIG)
+    assert (tmp_path / "config.json").read_text() == settings
+
+
 def test_a_folder_that_holds_something_is_refused(tmp_path):
     (tmp_path / "notes.txt").write_text("mine")
     with pytest.raises(UserError, match="already exists and is not empty: choose another --out"):

@@ -61,7 +61,11 @@ def whole(tmp_path_factory):
     return fingerprint(tmp_path_factory.mktemp("whole") / "run")
 
 
-def test_a_search_that_is_told_to_end_loses_no_generation(tmp_path, whole):
+@pytest.mark.parametrize(
+    ("how", "status", "words"),
+    [("SIGTERM", 143, "told to end"), ("SIGINT", 130, "interrupted")],
+)
+def test_a_search_that_is_told_to_end_loses_no_generation(tmp_path, whole, how, status, words):
     code = f"""{SEARCH}
 import os, signal, threading, time
 from scb import termination
@@ -70,7 +74,7 @@ def end():
     log = folder / "metrics.jsonl"
     while not log.exists() or log.read_bytes().count(b"\\n") < 20:
         time.sleep(0.001)
-    os.kill(os.getpid(), signal.SIGTERM)
+    os.kill(os.getpid(), signal.{how})
 
 termination.watch("search")
 threading.Thread(target=end, daemon=True).start()
@@ -80,13 +84,13 @@ time.sleep(60)
     folder = tmp_path / "run"
     process = started(code, folder)
     _, said = process.communicate(timeout=120)
-    assert process.returncode == 143
+    assert process.returncode == status
     (step,) = (int(path.name) for path in (folder / "checkpoints").iterdir())
     logged = (folder / "metrics.jsonl").read_bytes().count(b"\n")
     # The search goes on while it is saved; what it logs then is computed again.
     assert 19 <= step <= logged and step % CONFIG.checkpoint_every
     assert said == (
-        f"search: told to end; {folder} is saved after {step} generations, and continues with --resume.\n"
+        f"search: {words}; {folder} is saved after {step} generations, and continues with --resume.\n"
     )
     assert fingerprint(folder, resume=True) == whole
 
