@@ -20,14 +20,14 @@ def main(
 
     Args:
       algorithm: ppo, sac, td3, ddpg or dqn.
-      environment: for which the zoo has a bandit.
+      environment: of Gymnasium, for which the zoo has a bandit.
       steps: of the bandit.
       seed: of the agent.
     """
-    bandit = gymnasium.make(f"scb/Synthetic-{environment}")
+    bandit, judge = gymnasium.make(f"scb/Synthetic-{environment}"), gymnasium.make(environment)
     learner = getattr(stable_baselines3, algorithm.upper())
     agent = learner("MlpPolicy", bandit, seed=seed, device="cpu").learn(steps)
-    mean, deviation = evaluate_policy(agent, gymnasium.make(environment), 20, warn=False)
+    mean, deviation = evaluate_policy(agent, judge, 20, warn=False)
     print(f"{algorithm} after {steps} steps of the bandit: {mean:.0f} ± {deviation:.0f}")
     return mean
 

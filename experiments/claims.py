@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 from scb.environments.registry import environment_spec
-from scb.statistics import Estimate
+from scb.statistics import DECIDING, Estimate
 
 HOLDS, IN_PART, FAILS, UNDECIDED, UNTESTED = OUTCOMES = (
     "holds",
@@ -21,7 +21,6 @@ HOLDS, IN_PART, FAILS, UNDECIDED, UNTESTED = OUTCOMES = (
     "not tested at this size",
 )
 CONFIDENCE = 0.95  # of all intervals of a page together
-DECIDING = 10  # agents; of fewer a bootstrap's interval is too narrow to decide anything
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from experiments.claims import DECIDING, Claim, Judged, judge, of_agents
+from experiments.claims import Claim, Judged, judge, of_agents
 from experiments.harness import Experiment, Report, packed
 from experiments.parts import InParts, Keys, Part, lacking
 from lpo import figures
@@ -29,7 +29,7 @@ from scb.errors import at_least
 from scb.files import plain
 from scb.rows import Rows
 from scb.seeds import reporting, validation
-from scb.statistics import Estimate, iqm, paired_difference
+from scb.statistics import DECIDING, Estimate, iqm, paired_difference
 
 BACKEND = "generalized"
 MARGIN = 0.05  # of what the reference earns: what is not worse by more is as good

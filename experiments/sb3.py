@@ -20,7 +20,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
-from experiments.claims import DECIDING, Claim, of_agents
+from experiments.claims import Claim, of_agents
 from experiments.harness import Experiment, Report, Save, packed, settled, unpacked
 from experiments.rendering import text
 from scb import plotting
@@ -29,7 +29,7 @@ from scb.errors import UserError, at_least, one_of
 from scb.gymnasium import NAMESPACE
 from scb.plotting import thousands
 from scb.seeds import REPORTING, reporting
-from scb.statistics import Estimate, estimate, paired_difference
+from scb.statistics import DECIDING, Estimate, estimate, paired_difference
 
 PEER_SCRIPT = Path(__file__).with_name("peers") / "sb3_peer.py"
 BANDIT, ENVIRONMENT = PLACES = ("bandit", "environment")

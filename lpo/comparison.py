@@ -19,7 +19,7 @@ from scb.errors import UserError
 from scb.files import plain
 from scb.measurement import MODE, SAMPLED, Place, as_random, measure
 from scb.rows import Rows, pivot
-from scb.statistics import Estimate, estimate, paired_difference
+from scb.statistics import DECIDING, Estimate, estimate, paired_difference
 
 _ARRAYS = ("lengths", "speeds", "diagnosis")
 
@@ -146,12 +146,20 @@ class Comparison:
             )
         return " ".join(sentences)
 
+    @property
+    def few(self) -> str:
+        """That there are too few agents for an interval to tell anything; empty where there are enough."""
+        fewest = min(len(c.seeds) for c in self.curves)
+        if fewest >= DECIDING:
+            return ""
+        return f"With fewer than {DECIDING} agents no interval decides anything; here are {fewest}."
+
     def as_dict(self) -> dict[str, Any]:
         return {
             "curves": [c.as_dict() for c in self.curves],
             "reference": self.curves[0].objective,
             "paired_differences": {k: v.as_dict() for k, v in self.differences().items()},
-            "caution": self.caution,
+            "caution": " ".join(x for x in (self.caution, self.few) if x),
         }
 
 

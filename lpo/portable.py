@@ -26,14 +26,12 @@ from scb.errors import UserError
 if TYPE_CHECKING:
     import torch
 
-    TorchFunction: TypeAlias = Callable[
-        [torch.Tensor, torch.Tensor, float | torch.Tensor], torch.Tensor
-    ]
+    TorchFunction: TypeAlias = Callable[..., torch.Tensor]
 
 
 def drift_function(
     objective: Objective | str | Path,
-) -> Callable[[ArrayLike, ArrayLike, ArrayLike], jax.Array]:
+) -> Callable[..., jax.Array]:
     """The drift of an objective, its parameters filled in, for JAX: pure, to be jitted and differentiated.
 
     Args:
@@ -44,9 +42,9 @@ def drift_function(
         log_ratio: [...] log pi(a|s) - log pi_behaviour(a|s), in nats; clipped at ±MAX_LOG_RATIO.
         advantage: [...] normalised over the minibatch.
         progress: a number or [...], the fraction of training done, in [0, 1]. Only temporal drifts
-          depend on it.
+          depend on it, and others need none.
         penalty: [...], in units of the advantage.
-      It raises a UserError where log_ratio and advantage differ in shape.
+      It raises a UserError where log_ratio and advantage differ in shape, or a temporal drift is given no progress.
 
     Raises:
       UserError: as `load_objective`.
@@ -57,7 +55,7 @@ def drift_function(
 
 def numpy_drift(
     objective: Objective | str | Path,
-) -> Callable[[ArrayLike, ArrayLike, ArrayLike], np.ndarray]:
+) -> Callable[..., np.ndarray]:
     """The drift of an objective for NumPy; arguments and errors as for `drift_function`.
 
     It computes in the floating-point type of what it is given, and in float64 for lists and
@@ -88,7 +86,9 @@ def torch_drift(objective: Objective | str | Path) -> "TorchFunction":
     drift, parameters = objective.drift, _host_parameters(objective)
 
     def penalty(
-        log_ratio: "torch.Tensor", advantage: "torch.Tensor", progress: "float | torch.Tensor"
+        log_ratio: "torch.Tensor",
+        advantage: "torch.Tensor",
+        progress: "float | torch.Tensor | None" = None,
     ) -> "torch.Tensor":
         result: torch.Tensor = _evaluate(
             torch, drift, parameters, log_ratio, advantage.to(log_ratio), progress
@@ -107,7 +107,9 @@ def torch_loss(objective: Objective | str | Path) -> "TorchFunction":
     drift = torch_drift(objective)
 
     def loss(
-        log_ratio: "torch.Tensor", advantage: "torch.Tensor", progress: "float | torch.Tensor"
+        log_ratio: "torch.Tensor",
+        advantage: "torch.Tensor",
+        progress: "float | torch.Tensor | None" = None,
     ) -> "torch.Tensor":
         penalty = drift(log_ratio, advantage, progress)
         ratio = log_ratio.clamp(-MAX_LOG_RATIO, MAX_LOG_RATIO).exp()
@@ -126,7 +128,7 @@ def _converted(
     parameters: Any,
     log_ratio: ArrayLike,
     advantage: ArrayLike,
-    progress: ArrayLike,
+    progress: ArrayLike | None = None,
 ) -> Any:
     """`_evaluate` of whatever is like an array, in the floating-point type that it has together."""
     dtype = xp.result_type(xp.asarray(log_ratio), xp.asarray(advantage), xp.float32)
@@ -148,6 +150,12 @@ def _evaluate(
             f"log_ratio has shape {tuple(log_ratio.shape)} and advantage {tuple(advantage.shape)}: "
             "a drift takes two of the same shape."
         )
+    if progress is None:
+        if drift.temporal:
+            raise UserError(
+                "this drift depends on the fraction of training done: give progress, a number in [0, 1]."
+            )
+        progress = 0.0
     # A traced JAX array is on no device yet.
     device = getattr(log_ratio, "device", None)
     like = partial(xp.asarray, dtype=log_ratio.dtype, device=device)

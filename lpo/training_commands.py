@@ -206,8 +206,8 @@ class Evaluate(Comparing):
             cells = [c.objective, final, area, str(differences.get(c.objective, ""))]
             table.add_row(*cells, *_moving(c))
         console().print(table)
-        if comparison.caution:
-            console().print(comparison.caution)
+        for said in filter(None, (comparison.caution, comparison.few)):
+            console().print(said)
 
     def run_suite(self, name: str, objectives: Sequence[Objective]) -> None:
         config, seeds = self.config, self.config.seed_list()
@@ -238,6 +238,8 @@ class Evaluate(Comparing):
         if elsewhere is not None:
             where = f"without {', '.join(homes)}, for which one of them was learned"
             printer.print(_scores_table(elsewhere, where))
+        if few := next(iter(comparisons.values())).few:
+            printer.print(few)
         if scores.left_out:
             printer.print(f"left out, nobody beat random actions: {', '.join(scores.left_out)}")
         if folder is not None:

@@ -17,6 +17,7 @@ from scb.errors import UserError
 
 # Resamples are drawn in batches of about this many numbers (80 MB), however many runs there are.
 _NUMBERS_PER_BATCH = 10_000_000
+DECIDING = 10  # agents; of fewer a bootstrap's interval is too narrow to decide anything
 
 Statistic = Callable[..., NDArray[np.floating]]
 Rows = Callable[[int], NDArray[np.integer]]

@@ -86,6 +86,8 @@ def test_where_no_agent_is_above_standing_still_it_is_said_that_nothing_can_be_t
     fallen, moving = hoppers("ppo", [400.0, 1000.0]), hoppers("dpo", [900.0, 1001.0])
     assert [c.above_standing_still for c in (fallen, moving)] == [0.0, 0.5]
     assert Comparison([fallen]).caution.startswith("No agent is above standing still (1000)")
+    assert Comparison([fallen]).few.startswith("With fewer than 10 agents no interval decides")
+    assert Comparison([replace(fallen, seeds=list(range(10)))]).few == ""
     assert Comparison([fallen, moving]).caution == ""
     stored = Comparison([fallen, moving]).as_dict()["curves"][1]
     assert stored["final_lengths"] == [9000.0, 10010.0] and stored["final_speeds"] == [0.25, 0.25]
@@ -192,7 +194,7 @@ def test_training_is_rounded_up_to_a_multiple_of_the_points(trained):
     ("changes", "message"),
     [
         ({"environment": "CartPoel-v1"}, "unknown environment 'CartPoel-v1': did you mean CartPo"),
-        ({"environment": "Pendulum-v1", "backend": "spring"}, "does not take {'backend'"),
+        ({"environment": "Pendulum-v1", "backend": "spring"}, "has no choice of physics"),
     ],
 )
 def test_what_cannot_be_trained_is_refused(arguments, changes, message, one_sentence):

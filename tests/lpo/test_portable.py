@@ -65,6 +65,15 @@ def contract_slope(objective: Objective, log_ratio, advantage, progress) -> jax.
 # -- NumPy and JAX ------------------------------------------------------------------------------
 
 
+def test_only_a_temporal_drift_asks_for_progress():
+    change, advantage = np.linspace(-1.0, 1.0, 5), np.ones(5)
+    for name in ("ppo", "lpo-pendulum"):
+        drift = numpy_drift(name)
+        np.testing.assert_array_equal(drift(change, advantage), drift(change, advantage, 0.3))
+    with pytest.raises(UserError, match=r"this drift depends on the fraction .* give progress"):
+        numpy_drift("ta-lpo")(change, advantage)
+
+
 @every_objective
 @pytest.mark.parametrize("largest_log_ratio", [0.5, 3.0, 30.0])
 def test_numpy_and_jax_give_the_contracts_penalty(objective, largest_log_ratio):

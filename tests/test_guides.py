@@ -1,0 +1,31 @@
+"""The code in the guides runs as it stands."""
+
+import re
+import sys
+from pathlib import Path
+
+from scb.environments.registry import environment_spec, make
+
+DOCS = Path(__file__).parents[1] / "docs"
+
+
+def block(page):
+    (code,) = re.findall(r"```python\n(.*?)```", (DOCS / page).read_text(), re.DOTALL)
+    return code
+
+
+def test_an_agent_is_kept_and_acts_in_gymnasiums_environment(tmp_path, capsys):
+    code = block("agents.md").replace("/tmp/agent", str(tmp_path / "agent"))
+    exec(compile(code, "agents.md", "exec"), {})
+    assert -1000 < float(capsys.readouterr().out) < 0
+
+
+def test_an_environment_of_ones_own_is_made(tmp_path, monkeypatch):
+    (tmp_path / "point_of_the_guide.py").write_text(block("own_environment.md"))
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    env, params = make("point_of_the_guide:Point")
+    assert env.action_space(params).shape == (1,) and params.max_steps_in_episode == 50
+    # A random walk from somewhere between -1 and 1.
+    spec = environment_spec("point_of_the_guide:Point")
+    assert -40 < spec.random_return() < -10 and spec.episode_limit == 50
