@@ -5,7 +5,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib import colormaps
-from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colorbar import Colorbar
@@ -13,10 +12,10 @@ from matplotlib.colors import LinearSegmentedColormap, ListedColormap, Normalize
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
-from matplotlib.ticker import MaxNLocator, NullLocator
+from matplotlib.ticker import NullLocator
 from numpy.typing import NDArray
 
-from lpo.update_regions import CLIP, REGIONS, analyze, surface
+from lpo.update_regions import CLIP, REGIONS, analyze
 from scb.errors import UserError
 from scb.plotting import (
     GREEN,
@@ -36,8 +35,6 @@ if TYPE_CHECKING:
 
 _RATIO = r"ratio $r = \pi(a|s)\,/\,\pi_{\mathrm{old}}(a|s)$"
 _ADVANTAGE = "advantage A\n(standard deviations)"
-RATIOS = (0.4, 1.8)
-ADVANTAGES = (-3.0, 3.0)
 # Of `lpo.update_regions.REGIONS`. What stops or turns an update is dark, what leaves it alone is pale.
 _REGION_COLORS = {
     "rolls back": VERMILLION,
@@ -48,75 +45,6 @@ _REGION_COLORS = {
     "amplified": GREEN,
     "hindered": PURPLE,
 }
-# Below this a penalty or a gradient is drawn as none: rounding of 32-bit floats, or a dead zone.
-NEGLIGIBLE = 1e-3
-
-
-def drift_heatmaps(objectives: "Sequence[Objective]") -> Figure:
-    """What objectives charge for moving away, and where that makes an update stop or turn round.
-
-    First row: the drift f(r, A) over ratio and advantage. Second row: the gradient d/dr (r A - f)
-    of the whole objective; it has A's sign where the update goes on, is zero where it stops, and is
-    hatched where it turns against the advantage and moves the policy back. The panels of a row
-    share one colour scale.
-
-    Args:
-      objectives: side by side, in this order; drifts that depend on the fraction of training done at a half.
-    """
-    if not objectives:
-        raise UserError("there are no objectives to draw: give at least one.")
-    ratios = np.linspace(*RATIOS, 281)
-    advantages = np.linspace(*ADVANTAGES, 241)
-    surfaces = [surface(o, np.log(ratios), advantages, 0.5) for o in objectives]
-    drifts = [drift for drift, _ in surfaces]
-    gradients = [gradient / ratios for _, gradient in surfaces]
-    with figure_style():
-        figure = Figure(figsize=(WIDTH, 6.4))
-        grid = figure.subplots(2, len(objectives), sharex=True, sharey=True, squeeze=False)
-        penalty, direction = _scales(drifts, gradients)
-        levels = [t for t in MaxNLocator(7).tick_values(0.0, penalty.norm.vmax or 1.0) if t > 0]
-        turns_back = False
-        for (top, bottom), objective, drift, gradient in zip(
-            grid.T, objectives, drifts, gradients, strict=True
-        ):
-            penalty.draw(top, ratios, advantages, drift)
-            if drift.max() > NEGLIGIBLE:
-                black = {"colors": "black", "linewidths": 1.0, "linestyles": "--"}
-                top.contour(ratios, advantages, drift, [NEGLIGIBLE], **black)
-                top.contour(ratios, advantages, drift, levels, colors="black", linewidths=0.6)
-            direction.draw(bottom, ratios, advantages, gradient)
-            back = gradient * np.sign(advantages)[:, None]
-            if back.min() < -NEGLIGIBLE:
-                turned = [-np.inf, -NEGLIGIBLE]
-                bottom.contourf(ratios, advantages, back, turned, colors="none", hatches=["////"])
-                # matplotlib's default for negative levels is dashed
-                black = {"colors": "black", "linewidths": 0.8, "linestyles": "-"}
-                bottom.contour(ratios, advantages, back, turned[1:], **black)
-                turns_back = True
-            top.set_title(objective.name, loc="center")
-            bottom.set_xlabel(_RATIO)
-            for axes in (top, bottom):
-                axes.axvline(1.0, color=GREY, linewidth=0.9)
-                axes.grid(visible=False)
-        for row in grid:
-            row[0].set_ylabel(_ADVANTAGE)
-        bar = penalty.bar(figure, grid[0], aspect=16, label="drift f (penalty)")
-        for level in levels:
-            bar.ax.axhline(level, color="black", linewidth=0.6)
-        direction.bar(figure, grid[1], aspect=16, label="gradient d/dr (r A − f)")
-        handles: list[Artist] = [
-            Line2D([], [], color="black", linewidth=1.0, linestyle="--"),
-            Line2D([], [], color="black", linewidth=0.6),
-        ]
-        names = [f"penalty begins (f = {NEGLIGIBLE:g})", "levels of f, as in the colour bar"]
-        if turns_back:
-            handles.append(Patch(facecolor="white", edgecolor="black", hatch="////", linewidth=0.8))
-            names.append("update moves the policy back")
-        figure_title(
-            figure, "Drift (top) and the direction in which it lets the policy move (bottom)"
-        )
-        legend_below(figure, (handles, names), columns=3)
-    return figure
 
 
 def drift_and_gradient(

@@ -222,7 +222,7 @@ def _figures(
         drawn[name] = figures.learning_curves(comparison.curves)
     for name, comparison in whole.items():
         drawn[f"{name}_full_size"] = figures.learning_curves(comparison.curves)
-    drawn["drift_heatmaps"] = drift_figures.drift_heatmaps(objectives)
+    drawn["drift_and_gradient"] = drift_figures.drift_and_gradient(objectives)
     paths = {}
     for name, figure in drawn.items():
         path = run.folder / "figures" / f"{name.replace('/', '-')}.png"

@@ -81,7 +81,7 @@ def write_report(folder: Path, results: Mapping[str, Any], figures: Mapping[str,
         comparisons: {environment: `Comparison.as_dict()`}.
         full_size: the same for what the library ships of longer trainings there (optional).
       figures: PNG files by the function that drew them ("meta_training" for the curve,
-        "environment_steps", "drift_heatmaps"), and learning curves by their environment, as in
+        "environment_steps", "drift_and_gradient"), and learning curves by their environment, as in
         `comparisons`, with "_full_size" behind it for those. Any may be missing.
 
     Returns:

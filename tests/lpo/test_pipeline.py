@@ -74,7 +74,7 @@ def results(folder: Path) -> dict:
 ROWS = ["rows.jsonl", "rows.json"]
 LAST_STAGE = [
     "figures/Pendulum-v1.png",
-    "figures/drift_heatmaps.png",
+    "figures/drift_and_gradient.png",
     "figures/environment_steps.png",
     "figures/meta_training.png",
     "report.html",

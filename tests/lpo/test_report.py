@@ -181,7 +181,7 @@ def test_the_page_loads_nothing_from_elsewhere(tmp_path, picture):
 
 
 def test_images_are_embedded_whole_and_once(tmp_path, picture):
-    page = write(tmp_path, drift_heatmaps=picture)
+    page = write(tmp_path, drift_and_gradient=picture)
     images = [r for r in page.references if r.startswith("data:image/png;base64,")]
     assert [base64.b64decode(i.partition(",")[2]) for i in images] == [picture.read_bytes()]
     assert 'width="200" height="200"' in page.source  # 1 inch at 200 dpi
