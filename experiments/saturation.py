@@ -7,8 +7,9 @@ they visit in its environment, this takes the mean that each of them would act b
 each other before and after the clip, and how many directions what they all do has.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,8 @@ import jax.numpy as jnp
 import numpy as np
 from matplotlib.figure import Figure
 
-from experiments.harness import Experiment, Report, Save, finite, packed, settled, unpacked
+from experiments.harness import Experiment, Report, finite, packed, settled, unpacked
+from experiments.parts import InParts, Part
 from experiments.zoo_table import Candidate, candidates
 from experiments.zoo_table_page import BANDITS
 from scb import plotting
@@ -107,17 +109,18 @@ def measured(candidate: Candidate, options: Options) -> dict[str, Any]:
     return {**said, **found, "returns": packed([returns])[0]}
 
 
-def measure(options: Options, report: dict[str, Any], save: Save) -> None:
+def parts(options: Options, report: dict[str, Any]) -> Iterator[Part]:
     """A bandit at a time; what the report holds of the same one is not measured again."""
     settled(report, size={"agents": options.agents, "episodes": options.episodes})
-    found = report.setdefault("environments", {})
     for environment in options.environments:
-        entry = found.setdefault(environment, {})
+        entry = report.setdefault("environments", {}).setdefault(environment, {})
         for kind, candidate in bandits(environment, options.published).items():
             if entry.get(kind, {}).get("sha256") != candidate.sha256:
-                entry[kind] = measured(candidate, options)
-                print(environment, kind, entry[kind], flush=True)
-                save()
+                entry.pop(kind, None)
+            yield Part(("environments", environment, kind), partial(measured, candidate, options))
+
+
+measure = InParts(parts)
 
 
 def facts(report: Report) -> dict[str, Any]:

@@ -10,7 +10,6 @@ it), in which every agent is a process. What --out holds already is not trained 
 import json
 import subprocess
 from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -21,7 +20,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
 from experiments.claims import Claim, of_agents
-from experiments.harness import Experiment, Report, Save, packed, settled, unpacked
+from experiments.harness import Experiment, Report, packed, settled, unpacked
+from experiments.parts import InParts, Part
 from experiments.rendering import text
 from scb import plotting
 from scb.environments.registry import environment_spec
@@ -67,52 +67,53 @@ class Options:
     """those of them that an environment's actions allow"""
     seeds: int = 10
     """agents of each"""
-    together: int = 2
-    """that are trained side by side"""
 
     def __post_init__(self) -> None:
-        at_least(1, self, "seeds", "together")
+        at_least(1, self, "seeds")
         for name in self.environments:
             one_of("environment", name, ALGORITHMS)
         for name in self.algorithms:
             one_of("algorithm", name, STEPS)
 
 
-def measure(options: Options, report: dict[str, Any], save: Save) -> None:
+def parts(options: Options, report: dict[str, Any]) -> Iterator[Part]:
     """A seed of everything at a time, so that all have as many wherever it ends."""
     if not options.python.exists():
         raise UserError(f"{options.python} is not there: run `make sb3`, or give another --python.")
-    agents = report.setdefault("agents", {})
     settled(report, steps=STEPS, episodes=EPISODES)
-
-    def trained(job: Mapping[str, Any]) -> dict[str, Any]:
-        command = [str(options.python), str(PEER_SCRIPT), json.dumps(job)]
-        done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=False)
-        if done.returncode:
-            raise UserError(f"an agent could not be trained: {' '.join(command)} says why.")
-        return dict(json.loads(done.stdout.strip().splitlines()[-1]))
-
-    missing = []
+    python = str(options.python)
+    yield Part(("peer_versions",), partial(_said, python, "versions"))
     for seed in reporting(options.seeds):
         for name, algorithm, place in cells(options):
-            cell = agents.setdefault(name, {}).setdefault(algorithm, {}).setdefault(place, {})
-            if str(seed) not in cell:
-                job = {
-                    "algorithm": algorithm,
-                    "train_in": trained_in(name, place),
-                    "judge_in": name,
-                    "steps": STEPS[algorithm],
-                    "episodes": EPISODES,
-                    "seed": seed,
-                }
-                missing.append((cell, job))
-    with ThreadPoolExecutor(options.together) as pool:
-        results = pool.map(trained, [job for _, job in missing])
-        for (cell, job), found in zip(missing, results, strict=True):
-            cell[str(job["seed"])] = {x: packed([found[x]])[0] for x in ("returns", "seconds")}
-            report["peer_versions"] = found["versions"]
-            print(job["train_in"], job["algorithm"], job["seed"], found["returns"], flush=True)
-            save()
+            job = {
+                "algorithm": algorithm,
+                "train_in": trained_in(name, place),
+                "judge_in": name,
+                "steps": STEPS[algorithm],
+                "episodes": EPISODES,
+                "seed": seed,
+            }
+            yield Part(
+                ("agents", name, algorithm, place, str(seed)), partial(_trained, python, job)
+            )
+
+
+measure = InParts(parts)
+
+
+def _trained(python: str, job: Mapping[str, Any]) -> dict[str, str]:
+    found = _said(python, json.dumps(job))
+    print(job["train_in"], job["algorithm"], job["seed"], found["returns"], flush=True)
+    return {x: packed([found[x]])[0] for x in ("returns", "seconds")}
+
+
+def _said(python: str, words: str) -> dict[str, Any]:
+    """What the peer prints at its end, as JSON."""
+    command = [python, str(PEER_SCRIPT), words]
+    done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=False)
+    if done.returncode:
+        raise UserError(f"an agent could not be trained: {' '.join(command)} says why.")
+    return dict(json.loads(done.stdout.strip().splitlines()[-1]))
 
 
 def cells(options: Options) -> Iterator[tuple[str, str, str]]:

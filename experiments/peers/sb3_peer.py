@@ -3,6 +3,8 @@
     python sb3_peer.py '{"algorithm": "ppo", "train_in": "scb/Synthetic-Pendulum-v1", "judge_in": "Pendulum-v1",
                          "steps": [10000, 20000], "episodes": 20, "seed": 0}'
 
+    python sb3_peer.py versions
+
 All hyperparameters are the defaults. Prints as JSON the mean return of the most likely actions after each number
 of steps, and the seconds that training took until there.
 """
@@ -53,6 +55,10 @@ class Judge(BaseCallback):
 
 
 def main():
+    if sys.argv[1] == "versions":
+        versions = {"stable_baselines3": stable_baselines3.__version__, "torch": torch.__version__}
+        print(json.dumps(versions))
+        return
     job = json.loads(sys.argv[1])
     torch.set_num_threads(1)
     algorithm = getattr(stable_baselines3, job["algorithm"].upper())
@@ -60,8 +66,7 @@ def main():
     model = algorithm("MlpPolicy", env, seed=job["seed"], device="cpu")
     judge = Judge(job)
     model.learn(max(job["steps"]), callback=judge)
-    versions = {"stable_baselines3": stable_baselines3.__version__, "torch": torch.__version__}
-    print(json.dumps({"returns": judge.returns, "seconds": judge.seconds, "versions": versions}))
+    print(json.dumps({"returns": judge.returns, "seconds": judge.seconds}))
 
 
 if __name__ == "__main__":
