@@ -21,7 +21,7 @@ import jax
 import numpy as np
 from matplotlib.figure import Figure
 
-from experiments.harness import Experiment, Save, run_name
+from experiments.harness import Experiment, Save, command_of, run_name
 from lpo import figures
 from lpo.alignment import (
     Regime,
@@ -133,16 +133,6 @@ class Options:
     skip_confirmation: bool = False
 
 
-def command_of(options: Options) -> str:
-    """The command line without where it writes: what is measured does not depend on that."""
-    flags = ["python -m experiments.alignment"]
-    if options.agents != Options.agents:
-        flags.append(f"--agents {options.agents}")
-    for flag, files in (("--adversaries", options.adversaries), ("--held-out", options.held_out)):
-        flags += [flag, *map(str, files)] if files else []
-    return " ".join(flags + ["--skip-confirmation"] * options.skip_confirmation)
-
-
 def measure(options: Options, report: dict[str, Any], save: Save) -> None:
     """A stage at a time."""
 
@@ -157,7 +147,7 @@ def measure(options: Options, report: dict[str, Any], save: Save) -> None:
             raise UserError(
                 f"{objective.name} is to be held out, and the family has it as {twins[0]}: leave it out of --held-out."
             )
-    report["command"] = command_of(options)
+    report["command"] = command_of("alignment", options)
     report.setdefault("stages", {})
 
     def stage(

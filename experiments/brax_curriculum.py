@@ -67,7 +67,7 @@ def _best_without(report: Report) -> float:
 
 
 def claims(report: Report) -> list[Claim]:
-    """Shape by shape: whether it ends above; untold where no search reached the local optimum of standing still."""
+    """Shape by shape: whether it ends above; untold where no search without a curriculum reached the local optimum."""
     curves, untold = report["curves"], -math.inf < _best_without(report) < LOCAL_OPTIMUM
     return [
         Claim(

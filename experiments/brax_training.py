@@ -31,7 +31,6 @@ from scb.seeds import REPORTING
 from scb.statistics import estimate
 
 OURS, PUBLISHED = "ours", "published"
-BRAX = ("hopper", "walker2d", "swimmer", "halfcheetah", "humanoidstandup")
 LOOKS: dict[str, dict[str, Any]] = {
     OURS: {"color": plotting.BLUE, "linestyle": "-"},
     PUBLISHED: {"color": plotting.PURPLE, "linestyle": "-."},

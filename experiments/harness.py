@@ -8,6 +8,7 @@ measured again, so that the same command continues an interrupted one.
 
 import importlib
 import json
+import shlex
 import shutil
 import sys
 import time
@@ -27,6 +28,7 @@ from experiments.claims import Claim, Judged
 from experiments.parts import InParts, Jobs, elsewhere
 from scb import plotting
 from scb.artefacts import machine_description, package_versions
+from scb.command_line import flags
 from scb.environments.registry import environment_spec, families
 from scb.environments.synthetic import SyntheticBandit
 from scb.environments.zoo import bandit_metadata, open_bandit, zoo_names
@@ -309,6 +311,12 @@ def read(path: Path, missing_is_new: bool = False, keys: Iterable[str] = ()) -> 
             f"{path} is no report of this command ({error}): measure first, or choose another --out."
         ) from error
     return report
+
+
+def command_of(name: str, options: Any) -> str:
+    """The command that measures with these options; where it writes is none of them."""
+    words = shlex.join(flags(options, type(options)()))
+    return f"python -m experiments.{name} {words}".rstrip()
 
 
 def settled(report: dict[str, Any], **settings: Any) -> None:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from experiments.claims import UNDECIDED, UNTESTED
 from scb.plotting import thousands
-from scb.statistics import Estimate, estimate, iqm
+from scb.statistics import Estimate, estimate
 
 TEMPLATES = Path(__file__).with_name("templates")
 
@@ -97,7 +97,6 @@ ENVIRONMENT = jinja2.Environment(
 ENVIRONMENT.filters |= {
     "algorithms": algorithms,
     "digits": digits,
-    "iqm": lambda x: float(iqm(x)),
     "listed": listed,
     "mean_known": mean_known,
     "millions": millions,

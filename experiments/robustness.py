@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 from experiments.claims import TENTH, Claim
 from experiments.harness import Experiment, Report, finite, packed, plan_of, settled, unpacked
 from experiments.parts import InParts, Part
-from lpo.comparison import check_names, ppo_spec
-from lpo.objectives import Objective, load_objective
+from lpo.comparison import ppo_spec
+from lpo.objectives import Objective, check_names, load_objective
 from lpo.suite import suite
 from scb.agents.spec import AgentSpec
 from scb.environments.registry import environment_spec

@@ -280,8 +280,6 @@ def _learned(name: str, seed: int, options: Options) -> tuple[Objective, dict[st
         "seconds": cost["seconds"],
         "digests": {str(seed): objective.metadata["sha256"]},
     }
-    if "generation" in cost:
-        entry["stopped_at"] = {str(seed): cost["generation"]}
     return replace(objective, name=f"{name}-{seed}"), entry
 
 

@@ -17,13 +17,13 @@ import hashlib
 import json
 import time
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from experiments.harness import Experiment, Save
+from experiments.harness import Experiment, Save, command_of
 from experiments.rendering import digits
 from experiments.zoo_table_page import (
     ACTIONS,
@@ -82,21 +82,6 @@ class Options:
     backend: str = "generalized"
     """Brax's physics"""
     skip_brax: bool = False
-
-
-def command_text(options: Options) -> str:
-    """The command, with no path of this machine in it."""
-    parts = ["python -m experiments.zoo_table"]
-    if options.published is not None:
-        parts.append("--published DIRECTORY")
-    if options.bandits:
-        parts.append(f"--bandits {' '.join(Path(name).name for name in options.bandits)}")
-    parts.append(f"--agents {options.agents} --episodes {options.episodes}")
-    if options.skip_brax:
-        parts.append("--skip-brax")
-    else:
-        parts.append(f"--brax-episodes {options.brax_episodes} --backend {options.backend}")
-    return " ".join(parts)
 
 
 def candidates(
@@ -246,7 +231,11 @@ def differences(entries: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
 def measure(options: Options, report: dict[str, Any], save: Save) -> None:
     """All bandits. Entries that are there already stay, so several commands may have made them."""
     at_least(1, options, "agents", "episodes", "brax_episodes")
-    commands = dict.fromkeys([*report.get("commands", []), command_text(options)])
+    # No path of this machine is in it.
+    published = options.published and Path("DIRECTORY")
+    names = tuple(Path(name).name for name in options.bandits)
+    command = command_of("zoo_table", replace(options, published=published, bandits=names))
+    commands = dict.fromkeys([*report.get("commands", []), command])
     report |= {"commands": list(commands), "targets": TARGETS}
     found = candidates(options.bandits or None, options.published, options.skip_brax)
     measure_bandits(found, options, report, save)

@@ -15,15 +15,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lpo.comparison import check_names, compare, ppo_spec
+from lpo.comparison import compare, ppo_spec
 from lpo.drifts import ClipDrift, DPODrift, Drift, NoDrift
 from lpo.fitness import FITNESSES, LABELS
 from lpo.inner_loop import MetaTrainingConfig, TaskTraining, task_agent
-from lpo.objectives import Objective, closed_form
+from lpo.objectives import Objective, check_names, closed_form
 from scb.agents.ppo import PPOHyperparameters
 from scb.agents.spec import AgentSpec
 from scb.artefacts import machine_description, package_versions
-from scb.environments.registry import environment_spec, make
+from scb.environments.registry import environment_spec
 from scb.errors import UserError, at_least
 from scb.evolution import map_population
 from scb.keys import root_key, split_key
@@ -129,18 +129,23 @@ def _dpo(*parameters: tuple[float, float]) -> list[Objective]:
 
 
 def regime_fitness(
-    regime: Regime, objectives: Sequence[Objective], seeds: Sequence[int]
+    regime: Regime,
+    objectives: Sequence[Objective],
+    seeds: Sequence[int],
+    backend: str | None = None,
 ) -> dict[str, dict[str, np.ndarray]]:
     """{objective: {fitness: [S]}} of agents trained in a regime with each, one a seed.
 
-    Fitnesses go by their labels, in the order of `lpo.fitness.FITNESSES`.
+    Fitnesses go by their labels, in the order of `lpo.fitness.FITNESSES`; the backend is that of the environment
+    which the bandit stands for, where some of them judge.
     """
     check_names(objectives)
     check_seeds(seeds)
     found = {}
     for family in families(objectives):
         task = regime.task(family[0])
-        program = _program(regime.static(), family[0].drift, len(family) * len(seeds))
+        size = len(family) * len(seeds)
+        program = _program(regime.static(), family[0].drift, size, backend)
         # Every objective with every seed, all at once.
         parameters = jax.tree.map(
             lambda *leaves: jnp.repeat(jnp.stack(leaves), len(seeds), axis=0),
@@ -160,13 +165,14 @@ def regime_fitness(
 
 
 @lru_cache(maxsize=64)
-def _program(regime: Regime, drift: Drift, size: int) -> Callable[..., Any]:
+def _program(regime: Regime, drift: Drift, size: int, backend: str | None) -> Callable[..., Any]:
     """([N] drift parameters, [N] seeds, hyperparameters, bandit's params, the same with noise) -> [N, F] fitnesses.
 
     Compiled once for all regimes that differ in traced numbers only: noise, learning rate, initialisation.
     """
     task = regime.task(Objective("any", drift, None))
-    home, home_params = make(task.home)
+    spec = environment_spec(task.home)
+    home, home_params = spec.make(spec.physics(backend))
     along = dict.fromkeys(f.judge for f in FITNESSES.values() if f.along)
     at_end = dict.fromkeys(f.judge for f in FITNESSES.values() if f.judge not in along)
 
@@ -317,7 +323,7 @@ def measure_alignment(
         if regime in known:
             continue
         watch = Stopwatch()
-        fitness = regime_fitness(regime, objectives, seeds)
+        fitness = regime_fitness(regime, objectives, seeds, backend)
         correlations = {
             name: asdict(alignment({o: x[name] for o, x in fitness.items()}, outcome))
             for name in LABELS

@@ -87,7 +87,7 @@ class MetaTrain(LongRun):
 
     @classmethod
     def decided(cls, config: MetaTrainingConfig) -> dict[str, str]:
-        temporal = {"temporal": ""} if getattr(config.drift, "temporal", False) else {}
+        temporal = {"temporal": ""} if config.drift.temporal else {}
         validate = {"validate": ""} if config.validation else {}
         return {"tasks": ",".join(config.tasks), "drift": config.drift.name, **temporal, **validate}
 

@@ -11,11 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from lpo.objectives import Objective
+from lpo.objectives import Objective, check_names
 from scb.agents.ppo import DIAGNOSIS
 from scb.agents.spec import AgentSpec, environment_agent
 from scb.environments.registry import environment_spec
-from scb.errors import UserError
 from scb.files import plain
 from scb.measurement import MODE, SAMPLED, Place, as_random, measure
 from scb.rows import Rows, pivot
@@ -161,16 +160,6 @@ class Comparison:
             "paired_differences": {k: v.as_dict() for k, v in self.differences().items()},
             "caution": " ".join(x for x in (self.caution, self.few) if x),
         }
-
-
-def check_names(objectives: Sequence[Objective]) -> None:
-    """Raises a UserError where two objectives bear one name."""
-    names = [objective.name for objective in objectives]
-    repeated = sorted({name for name in names if names.count(name) > 1})
-    if repeated:
-        raise UserError(
-            f"objective {repeated[0]!r} is there twice: give each once, and each a name of its own."
-        )
 
 
 def ppo_spec(

@@ -100,7 +100,8 @@ class MetaTrainingConfig:
         if self.fitness not in FITNESSES:
             raise unknown_name("fitness", self.fitness, FITNESSES)
         at_least(1, self.evolution, "num_generations")
-        if isinstance(self.tasks, str):
+        tasks: Any = self.tasks
+        if isinstance(tasks, str):
             raise UserError(f"the tasks are {self.tasks!r}, a text: give a tuple of names.")
         if not self.tasks:
             raise UserError("the list of tasks is empty: give at least one bandit or environment.")

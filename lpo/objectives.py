@@ -1,8 +1,8 @@
 """Objectives by name or file: PPO's clip, DPO, no drift, the learned ones of the zoo, and formulas."""
 
 import re
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -74,6 +74,34 @@ def load_objective(name: str | Path) -> Objective:
     if text.endswith(".npz"):
         return _from_file(Path(text))
     raise unknown_name("objective", text, [*objective_names(), "path/to/objective.npz"])
+
+
+def check_names(objectives: Sequence[Objective]) -> None:
+    """Raises a UserError where two objectives bear one name."""
+    names = [objective.name for objective in objectives]
+    repeated = sorted({name for name in names if names.count(name) > 1})
+    if repeated:
+        raise UserError(
+            f"objective {repeated[0]!r} is there twice: give each once, and each a name of its own."
+        )
+
+
+def load_apart(names: Sequence[str]) -> list[Objective]:
+    """Objectives by what `load_objective` takes, with names of their own: files of one name go by what was typed.
+
+    Every `lpo meta-train` writes an objective.npz.
+
+    Raises:
+      UserError: as for `load_objective`, or one stands there twice.
+    """
+    loaded = [load_objective(name) for name in names]
+    known = [objective.name for objective in loaded]
+    loaded = [
+        replace(objective, name=typed) if known.count(objective.name) > 1 else objective
+        for objective, typed in zip(loaded, names, strict=True)
+    ]
+    check_names(loaded)
+    return loaded
 
 
 def closed_form(name: str, drift: Drift) -> Objective:

@@ -16,7 +16,7 @@ from rich.console import Console
 from lpo import drift_figures, figures, report
 from lpo.certificate import certify
 from lpo.commands import MetaTrain
-from lpo.comparison import Comparison, check_names, compare, ppo_spec
+from lpo.comparison import Comparison, compare, ppo_spec
 from lpo.full_size import longer
 from lpo.inner_loop import MetaTrainingConfig
 from lpo.meta_training import (
@@ -24,7 +24,7 @@ from lpo.meta_training import (
     environment_problem,
     learn_objective,
 )
-from lpo.objectives import Objective, load_objective
+from lpo.objectives import Objective, check_names, load_objective
 from scb import plotting
 from scb.artefacts import machine_description, package_versions
 from scb.command_line import LongRun, Output

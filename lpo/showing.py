@@ -5,7 +5,7 @@ from pathlib import Path
 import tyro
 
 from lpo.drift_figures import drift_and_gradient
-from lpo.objectives import load_objective
+from lpo.objectives import load_apart, load_objective
 from lpo.page import save_objective_page
 from lpo.update_regions import REGIONS, analyze
 from scb import interactive, plotting
@@ -36,8 +36,8 @@ def show_command(
         raise UserError(f"--progress is {progress}: it is a fraction of training, from 0 to 1.")
     if html:
         interactive.plotly()  # before the work, not after it
+    objectives = load_apart([*(name for name in beside if name != objective), objective])
     shown = load_objective(objective)
-    objectives = [*(load_objective(name) for name in beside if name != objective), shown]
     folder = Path("runs") / "show" / shown.name if out is None else out
     make_folder(folder)
     found = [analyze(o, progress) for o in objectives]

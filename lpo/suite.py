@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from lpo.comparison import Comparison, check_names, compare, ppo_spec
-from lpo.objectives import Objective
+from lpo.comparison import Comparison, compare, ppo_spec
+from lpo.objectives import Objective, check_names
 from scb.environments.registry import environment_spec, families
 from scb.errors import UserError, unknown_name
 from scb.rows import Rows

@@ -15,9 +15,9 @@ from rich.table import Table
 
 from lpo import figures
 from lpo.alignment import Regime, correlation_text, known_drifts, measure_alignment
-from lpo.comparison import Comparison, LearningCurves, check_names, compare, ppo_spec
+from lpo.comparison import Comparison, LearningCurves, compare, ppo_spec
 from lpo.fitness import LABELS
-from lpo.objectives import Objective, load_objective
+from lpo.objectives import Objective, load_apart, load_objective
 from lpo.suite import SuiteScores, run_suite
 from lpo.suite import suite as suite_environments
 from scb import plotting
@@ -188,7 +188,7 @@ class Evaluate(Comparing):
         return replace(command, output=replace(kept, resume=resume))
 
     def run(self) -> None:
-        objectives = _named_apart(self.config.objectives)
+        objectives = load_apart(self.config.objectives)
         if self.config.suite is not None:
             self.run_suite(self.config.suite, objectives)
             return
@@ -323,7 +323,7 @@ class Align(Measuring):
 
     def run(self) -> None:
         config: AlignConfig = self.config
-        family = [*known_drifts(), *_named_apart(config.objectives)]
+        family = [*known_drifts(), *load_apart(config.objectives)]
         regimes, seeds = config.regimes(), config.seed_list()
         target = config.environment or environment_spec(regimes[0].bandit).evaluation_environment
         # A mistake must not leave a folder behind.
@@ -379,15 +379,3 @@ def _moving(curves: LearningCurves) -> tuple[str, ...]:
     above = int((curves.final > standing).sum())
     share = f"{above} of {len(curves.final)}"
     return share, f"{np.nanmean(speeds[:, -1]):.2f}", f"{np.nanmean(lengths[:, -1]):.0f}"
-
-
-def _named_apart(names: Sequence[str]) -> list[Objective]:
-    # Every `lpo meta-train` writes an objective.npz: files of one name go by what was typed.
-    loaded = [load_objective(name) for name in names]
-    known = [objective.name for objective in loaded]
-    loaded = [
-        replace(objective, name=typed) if known.count(objective.name) > 1 else objective
-        for objective, typed in zip(loaded, names, strict=True)
-    ]
-    check_names(loaded)
-    return loaded

@@ -88,11 +88,11 @@ class SyntheticEnv(gymnasium.Env[np.ndarray, Any]):
         if self._observation is None:
             raise UserError("the episode has not begun, or is over: call reset first.")
         if self._functions.one_step:
-            reward = self._reward(self._next - 1, np.asarray(action))
-            if reward != reward:
+            earned = self._reward(self._next - 1, np.asarray(action))
+            if earned != earned:
                 raise UserError(f"an action is {action}, which gives no reward: it must be finite.")
             observation, self._observation = self._observation[0].copy(), None
-            return observation, reward, True, False, {}
+            return observation, earned, True, False, {}
         after, reward, terminations = self._functions.step(
             self._observation, np.asarray(action)[None]
         )

@@ -63,7 +63,7 @@ def estimate_row(
     axes: Axes, position: float, values: NDArray[np.floating], found: Estimate, color: str
 ) -> None:
     """On one line of a horizontal plot: the estimate with its interval, and just below it each value a dot."""
-    below = offset_copy(axes.transData, axes.get_figure(), y=-5, units="points")
+    below = offset_copy(axes.transData, axes.get_figure(root=True), y=-5, units="points")
     level = np.full(values.size, position)
     axes.plot(values, level, ".", color=color, alpha=0.4, markeredgewidth=0, transform=below)
     axes.errorbar(

@@ -95,8 +95,11 @@ class _Search(NamedTuple):
     linear: bool = False  # for continuous actions; cuts episodes and asks pupils where told to
 
 
-_OF_LINEAR_SEARCHES = ("expert_episode_steps", "expert_pupils", "expert_starts", "expert_sigma")
-_OF_LINEAR_SEARCHES += (
+_OF_LINEAR_SEARCHES = (
+    "expert_episode_steps",
+    "expert_pupils",
+    "expert_starts",
+    "expert_sigma",
     "expert_learning_rate",
     "expert_decay",
     "expert_error_warmup",

@@ -3,6 +3,7 @@ from pathlib import Path
 
 import lpo
 from experiments import alignment, rendering
+from experiments.harness import command_of
 
 
 def recommended(report):
@@ -50,8 +51,8 @@ def test_the_files_of_a_stage_have_no_spaces_in_their_names():
 
 def test_a_reports_command_says_what_is_measured_and_not_where_it_is_written():
     options = alignment.Options(agents=8, held_out=(Path("a.npz"),), skip_confirmation=True)
-    command = "python -m experiments.alignment --agents 8 --held-out a.npz --skip-confirmation"
-    assert alignment.command_of(options) == command
+    command = "python -m experiments.alignment --agents=8 --held-out a.npz --skip-confirmation"
+    assert command_of("alignment", options) == command
 
 
 def test_what_is_held_out_is_not_in_the_family_under_another_name(tmp_path, capsys):
