@@ -22,6 +22,7 @@ from lpo.alignment import (
 from lpo.fitness import LABELS
 from scb import plotting
 from scb.agents.spec import environment_agent
+from scb.environments.spec import EnvironmentSpec
 from scb.errors import UserError
 from scb.evolution import map_population
 
@@ -129,6 +130,24 @@ def test_what_confirms_the_choice_did_not_choose():
 
     assert len(parameters(other_drifts())) == len(other_drifts()) == 12
     assert not parameters(other_drifts()) & parameters(known_drifts())
+
+
+def test_the_environment_of_a_bandit_has_the_physics_asked_for(monkeypatch):
+    made, make = [], EnvironmentSpec.make
+
+    def recorded(spec, backend=None, **arguments):
+        made.append((spec.name, backend))
+        return make(spec, backend, **arguments)
+
+    def nothing(function, size, axes):
+        return lambda *_: np.zeros((size, len(LABELS)))
+
+    module.forget_programs()
+    monkeypatch.setattr(EnvironmentSpec, "make", recorded)
+    monkeypatch.setattr(module, "map_population", nothing)
+    regime_fitness(replace(TINY, bandit="Synthetic-hopper"), known_drifts()[:1], [1], "spring")
+    assert ("hopper", "spring") in made
+    module.forget_programs()
 
 
 @pytest.mark.slow
