@@ -24,6 +24,7 @@ from scb.agents.ppo import PPOHyperparameters
 from scb.agents.spec import AgentSpec
 from scb.artefacts import machine_description, package_versions
 from scb.environments.registry import environment_spec
+from scb.environments.zoo import bandit_metadata
 from scb.errors import UserError, at_least
 from scb.evolution import map_population
 from scb.keys import root_key, split_key
@@ -295,6 +296,8 @@ def measure_alignment(
         "policy_output_scale": policy_output_scale,
         "agents": len(seeds),
         "first_seed": min(seeds),
+        # Of what files hold, for another may come to have its name.
+        "checksums": {o.name: o.metadata["sha256"] for o in objectives if "sha256" in o.metadata},
     }
     report: dict[str, Any] = dict(done or {})
     if not report:
@@ -309,15 +312,23 @@ def measure_alignment(
             "machine": machine_description(),
         }
         keep(report)
-    stored = {name: report[name] for name in asked}
+    stored = {name: report.get(name, asked[name]) for name in asked}
     names = {objective.name for objective in objectives}
     if stored != asked or set(report["outcome"]) != names:
+        said = ", ".join(f"{k} {v}" for k, v in stored.items() if k != "checksums")
         raise UserError(
-            f"{environment} was measured with other objectives, agents or steps ({', '.join(report['outcome'])}; "
-            f"{stored}): choose another --out."
+            f"{environment} was measured with other objectives, agents or steps ({', '.join(report['outcome'])}; {said}): "
+            "choose another --out."
         )
     outcome = {name: np.asarray(returns) for name, returns in report["outcome"].items()}
     tell(f"{environment}: " + ", ".join(f"{n} {x:.0f}" for n, x in report["outcome_iqm"].items()))
+    checksums = {x: bandit_metadata(x)["sha256"] for x in {regime.bandit for regime in regimes}}
+
+    def current(row: Mapping[str, Any]) -> bool:
+        digest = checksums.get(row["bandit"])
+        return digest is None or row.get("sha256", digest) == digest
+
+    report["regimes"] = [row for row in report["regimes"] if current(row)]
     known = {Regime(**{name: row[name] for name in asdict(Regime())}) for row in report["regimes"]}
     for regime in regimes:
         if regime in known:
@@ -332,6 +343,7 @@ def measure_alignment(
             {
                 "name": str(regime),
                 **asdict(regime),
+                "sha256": checksums[regime.bandit],
                 "alignment": correlations,
                 "mean_fitness": {
                     o: {name: float(x[name].mean()) for name in LABELS} for o, x in fitness.items()

@@ -198,7 +198,7 @@ def test_the_report_holds_every_regime_and_is_drawn(monkeypatch, tmp_path):
     monkeypatch.setattr(
         module,
         "regime_fitness",
-        lambda regime, objectives, seeds: {
+        lambda regime, objectives, seeds, backend: {
             o.name: {name: regime.reward_noise * fixed[o.name] for name in LABELS}
             for o in objectives
         },
@@ -223,6 +223,11 @@ def test_the_report_holds_every_regime_and_is_drawn(monkeypatch, tmp_path):
         keep=lambda found: kept.append(len(found["regimes"])),
     )
     assert kept == [3] and longer["regimes"][:2] == report["regimes"][:2]
+    # Of a bandit that was replaced since nothing is known.
+    longer["regimes"][0]["sha256"] = "another's"
+    again = measure_alignment(regimes, family, "Pendulum-v1", [7, 8], tell=told.append, done=longer)
+    assert [row["name"] for row in again["regimes"]][-1] == "reward noise 1.0"
+    assert len(again["regimes"]) == 3
     with pytest.raises(UserError, match="measured with other objectives, agents or steps"):
         measure_alignment(regimes, family[:2], "Pendulum-v1", [7, 8], done=report)
     path = plotting.save(figures.alignment_heatmap(report), tmp_path / "alignment.png")
