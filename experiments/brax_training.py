@@ -38,9 +38,8 @@ LOOKS: dict[str, dict[str, Any]] = {
 }
 WORDS = {OURS: "our bandit", PUBLISHED: "the published bandit", "environment": "the environment"}
 PAPER = "the environment, in the paper (at the end)"
-LEAST_TIMES = (
-    50  # half of the hundred that two orders of magnitude are, for the paper says "roughly"
-)
+# Half of the hundred that two orders of magnitude are, for the paper says "roughly".
+LEAST_TIMES = 50
 
 
 @dataclass(frozen=True)

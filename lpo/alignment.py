@@ -315,10 +315,10 @@ def measure_alignment(
     stored = {name: report.get(name, asked[name]) for name in asked}
     names = {objective.name for objective in objectives}
     if stored != asked or set(report["outcome"]) != names:
+        of = ", ".join(report["outcome"])
         said = ", ".join(f"{k} {v}" for k, v in stored.items() if k != "checksums")
         raise UserError(
-            f"{environment} was measured with other objectives, agents or steps ({', '.join(report['outcome'])}; {said}): "
-            "choose another --out."
+            f"{environment} was measured with other objectives, agents or steps ({of}; {said}): choose another --out."
         )
     outcome = {name: np.asarray(returns) for name, returns in report["outcome"].items()}
     tell(f"{environment}: " + ", ".join(f"{n} {x:.0f}" for n, x in report["outcome_iqm"].items()))
