@@ -22,7 +22,7 @@ from matplotlib.ticker import EngFormatter
 from experiments.claims import Claim, of_agents
 from experiments.harness import Experiment, Report, packed, settled, unpacked
 from experiments.parts import InParts, Part
-from experiments.rendering import text
+from experiments.rendering import number
 from scb import plotting
 from scb.environments.registry import environment_spec
 from scb.errors import UserError, at_least, one_of
@@ -141,7 +141,7 @@ def claims(report: Report) -> list[Claim]:
     found = []
     for name, algorithms in report["agents"].items():
         for algorithm, places in algorithms.items():
-            both = [places[place] for place in PLACES]
+            both = [places.get(place, {}) for place in PLACES]
             shared = sorted(set.intersection(*map(set, both)))
             steps = report["steps"][algorithm]
             for point in sorted({0, len(steps) - 1}):
@@ -184,16 +184,17 @@ def _ends(
     tables: Mapping[str, Mapping[str, Mapping[str, list[Estimate]]]],
     steps: Mapping[str, Sequence[int]],
 ) -> Iterator[str]:
-    """Of each algorithm in each environment what it ends with, in words."""
+    """Of each algorithm that has enough agents in an environment what it ends with, in words."""
     for name, algorithms in tables.items():
         for algorithm, places in algorithms.items():
-            where = {"bandit": f"the bandit of {name}"}
-            ends = [
-                f"{text(row[-1], 0)} trained in {where.get(place, f'{name} itself')}"
-                for place, row in places.items()
-            ]
-            number = thousands(steps[algorithm][-1])
-            yield f"{algorithm.upper()} after {number} steps: {', '.join(ends)}"
+            if len(places) < len(PLACES) or min(row[-1].n for row in places.values()) < DECIDING:
+                continue
+            here, there = (number(places[place][-1].value, 0) for place in PLACES)
+            after = thousands(steps[algorithm][-1])
+            yield (
+                f"{algorithm.upper()} after {after} steps: {here} trained in the bandit of {name}, {there} in {name} "
+                "itself"
+            )
 
 
 def draw(report: Mapping[str, Any]) -> Figure:
