@@ -22,21 +22,26 @@ REFERENCE = "ppo"
 
 @dataclass(frozen=True)
 class Confirmation:
-    """One claim, stated before any of its agents was trained, and decided when all have been.
+    """One claim, stated before the objective's agents of its seeds were trained, and decided when all have been.
 
     Attributes:
       environment, objective: whose it is.
       seeds: of its agents, none of which suggested the claim.
       of: what is said of them, "final" or "late".
+      reference_known: whether PPO's agents of these seeds had been trained, and seen, before.
     """
 
     environment: str
     objective: str
     seeds: Sequence[int]
     of: str = "final"
+    reference_known: bool = False
 
 
-CONFIRMATIONS = (Confirmation("hopper", "ta-lpo", reporting(30, offset=20)),)
+CONFIRMATIONS = (
+    Confirmation("hopper", "ta-lpo", reporting(30, offset=20)),
+    Confirmation("hopper", "lpo-pendulum", reporting(40, offset=10), "late", reference_known=True),
+)
 
 
 def full_size(environment: str) -> Comparison | None:
@@ -62,13 +67,12 @@ def looked_at(report: Mapping[str, Any]) -> dict[str, Any]:
     pending = [asked for asked, seeds in with_pairs(report) if len(seeds) < len(asked.seeds)]
     found = {}
     for environment, entry in report["environments"].items():
-        apart = {
-            str(s) for asked in pending if asked.environment == environment for s in asked.seeds
-        }
-        agents = {
-            name: {seed: agent for seed, agent in of_it.items() if seed not in apart}
-            for name, of_it in entry["agents"].items()
-        }
+        agents = {name: dict(of_it) for name, of_it in entry["agents"].items()}
+        for asked in pending:
+            names = [asked.objective] if asked.reference_known else list(agents)
+            for name in names if asked.environment == environment else ():
+                for seed in asked.seeds:
+                    agents[name].pop(str(seed), None)
         found[environment] = {**entry, "agents": {k: of_it for k, of_it in agents.items() if of_it}}
     return {environment: entry for environment, entry in found.items() if entry["agents"]}
 

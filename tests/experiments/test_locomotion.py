@@ -186,6 +186,18 @@ def test_a_confirmation_is_decided_by_its_own_agents_when_all_are_there(monkeypa
     assert module.confirmed(made) == []
 
 
+def test_of_a_pending_confirmation_whose_reference_was_known_the_objective_alone_is_left_out(
+    monkeypatch,
+):
+    asked = full_size.Confirmation("hopper", "dpo", range(4, 14), "late", reference_known=True)
+    monkeypatch.setattr(full_size, "CONFIRMATIONS", (asked,))
+    made = report(13)
+    counts = {c.objective: len(c.seeds) for c in module.facts(made)["comparisons"]["hopper"].curves}
+    assert counts == {"ppo": 13, "dpo": 4, "lpo-pendulum": 13}
+    said = "before the objective's agents of its 10 pairs (seeds 4 to 13) were trained; PPO's were known."
+    assert said in module.EXPERIMENT.page(made)
+
+
 def test_the_shipped_curves_are_of_the_full_size_and_stand_beside_shorter_trainings():
     whole = full_size.full_size("hopper")
     # The paper's 5.24 million.
