@@ -309,11 +309,12 @@ def diagnosis(curves: "Sequence[LearningCurves]") -> Figure:
     return figure
 
 
-def suite_scores(scores: "SuiteScores") -> Figure:
+def suite_scores(scores: "SuiteScores", suite: str) -> Figure:
     """Aggregate scores with intervals, and performance profiles, of objectives over a suite.
 
     Args:
       scores: of `lpo.suite.run_suite`.
+      suite: its name.
     """
     style = looks(scores.objectives)
     thresholds = np.linspace(-0.1, 1.3, 141)
@@ -335,7 +336,7 @@ def suite_scores(scores: "SuiteScores") -> Figure:
         aggregate.set_xlabel("normalised score")
         aggregate.set_title("Interquartile mean, 95 %", fontsize=10, weight="normal")
         environments, seeds = scores.scores.shape[1:]
-        figure_title(figure, f"{environments} environments, {seeds} seeds each")
+        figure_title(figure, f"The suite {suite}: {environments} environments, {seeds} seeds each")
         profile.legend(
             loc="upper center", bbox_to_anchor=(0.5, -0.17), ncols=min(len(scores.objectives), 4)
         )

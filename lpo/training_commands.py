@@ -255,7 +255,7 @@ class Evaluate(Comparing):
                 "versions": package_versions(),
             }
             write_json(folder / "suite.json", content)
-            plotting.save(figures.suite_scores(scores), folder / "suite.png")
+            plotting.save(figures.suite_scores(scores, name), folder / "suite.png")
 
 
 @dataclass(frozen=True)
