@@ -39,7 +39,7 @@ def test_what_lies_outside_of_the_range_is_refused(number, offset):
 
 # What reports: `lpo run`, the zoo's tables, and the experiments. No search, and nothing that a search calls.
 REPORTERS = {
-    "lpo": {"lpo/pipeline.py"},
+    "lpo": {"lpo/full_size.py", "lpo/pipeline.py"},
     "scb": {"scb/seeds.py"},
     "experiments": {
         f"experiments/{name}.py"
