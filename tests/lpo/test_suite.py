@@ -240,7 +240,10 @@ def test_a_suite_and_an_environment_do_not_go_together():
 
 def test_scores_are_drawn(tmp_path):
     scores = scores_of(np.random.default_rng(0).uniform(0.0, 1.2, (2, 5, 10)))
-    assert plotting.save(figures.suite_scores(scores, "classic"), tmp_path / "x.png").stat().st_size > 10_000
+    assert (
+        plotting.save(figures.suite_scores(scores, "classic"), tmp_path / "x.png").stat().st_size
+        > 10_000
+    )
 
 
 @pytest.mark.slow
