@@ -53,6 +53,7 @@ COLORS = {
     "ddpg": plotting.ORANGE,
 }
 LINES = {BANDIT: "-", ENVIRONMENT: ":"}
+MARKERS = {BANDIT: "o", ENVIRONMENT: "x"}
 
 
 @dataclass(frozen=True)
@@ -209,7 +210,9 @@ def draw(report: Mapping[str, Any]) -> Figure:
         for algorithm, places in algorithms.items():
             for place, found in places.items():
                 steps, color = report["steps"][algorithm], COLORS[algorithm]
-                plotting.estimate_curve(axes, steps, found, color, LINES[place], marker="o")
+                plotting.estimate_curve(
+                    axes, steps, found, color, LINES[place], marker=MARKERS[place]
+                )
         for label, level in (
             ("expert", shown["expert"][name].value),
             ("random", shown["random"][name]),
@@ -222,12 +225,16 @@ def draw(report: Mapping[str, Any]) -> Figure:
         axes.set_visible(False)
     used = {algorithm for algorithms in tables.values() for algorithm in algorithms}
     looks: dict[str, Mapping[str, Any]] = {
-        algorithm.upper(): {"color": color, "marker": "o"}
+        algorithm.upper(): {"color": color}
         for algorithm, color in COLORS.items()
         if algorithm in used
     }
     for place, line in LINES.items():
-        looks[f"trained in the {place}"] = {"color": plotting.GREY, "linestyle": line}
+        looks[f"trained in the {place}"] = {
+            "color": plotting.GREY,
+            "linestyle": line,
+            "marker": MARKERS[place],
+        }
     plotting.legend_of(figure, looks, columns=4)
     return figure
 
