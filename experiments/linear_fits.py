@@ -17,7 +17,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from experiments.claims import Claim
-from experiments.harness import Experiment, Report, finite, packed, unpacked
+from experiments.harness import Experiment, Report, packed, unpacked
 from experiments.parts import InParts, Part
 from experiments.rendering import either
 from experiments.searches import ENOUGH
@@ -29,7 +29,7 @@ from scb.errors import at_least
 from scb.expert_data import expert_dataset
 from scb.fitting import fit_bandit
 from scb.keys import root_key, split_key
-from scb.measurement import Agents, Place, measure
+from scb.measurement import Agents, Place, as_random, measure
 from scb.rows import pivot
 from scb.seeds import REPORTING
 from scb.statistics import pooled_estimate
@@ -112,8 +112,7 @@ def _searched(environment: str, name: str, seed: int, options: Options) -> dict[
             agents = Agents.drawn_from(spec, REPORTING.start, number)
             size = {"episodes": options.episodes, "side_by_side": number}
             returns = pivot(measure(spec, trained_in, place, agents, **size), "agent")
-            random = environment_spec(environment).random_return(BACKEND)
-            found["returns"][contexts][algorithm] = packed([finite(returns, random)[0]])[0]
+            found["returns"][contexts][algorithm] = packed([as_random(returns, place)[0]])[0]
     print(f"{environment}, {name}, seed {seed}: {found}", flush=True)
     return found
 

@@ -37,13 +37,13 @@ def _meta_training(
     population: int, generations: int, given: Mapping[str, str]
 ) -> MetaTrainingConfig:
     """A preset of meta-training."""
-    if given.get("environment", given.get("tasks")) != given.get("tasks", given.get("environment")):
+    names = {given[x] for x in ("environment", "tasks") if x in given}
+    if len(names) > 1:
         raise UserError(
             f"the environment {given['environment']} and the tasks {given['tasks']} are both given: name all in "
             "the tasks."
         )
-    named = given.get("tasks", given.get("environment"))
-    tasks = MetaTrainingConfig.tasks if named is None else listed(named, "tasks")
+    tasks = listed(names.pop(), "tasks") if names else MetaTrainingConfig.tasks
     temporal = {"temporal": True} if "temporal" in given else {}
     default = MetaTrainingConfig(
         tasks=tasks,
