@@ -151,6 +151,7 @@ class Train(Comparing):
     """Train PPO with an objective in an environment, and print how well it ends."""
 
     program = "lpo train"
+    growing = ("seeds",)
     presets = MappingProxyType({"quick": lambda given: TrainConfig()})
 
     config: Annotated[TrainConfig, tyro.conf.arg(name="")] = field(default_factory=TrainConfig)
@@ -167,10 +168,12 @@ class Evaluate(Comparing):
     """Compare objectives: train PPO with each on the same seeds, and print final scores with intervals.
 
     With --out every agent's returns are kept in rows.jsonl as they come, for --resume and for
-    other statistics: pandas.read_json("rows.jsonl", lines=True).
+    other statistics: pandas.read_json("rows.jsonl", lines=True). A resumed comparison may have more --seeds,
+    and further --objectives after those that it had: what is there is not trained again.
     """
 
     program = "lpo evaluate"
+    growing = ("seeds", "objectives")
     presets = MappingProxyType({"quick": lambda given: EvaluateConfig()})
 
     config: Annotated[EvaluateConfig, tyro.conf.arg(name="")] = field(

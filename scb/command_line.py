@@ -111,6 +111,7 @@ class LongRun(ABC):
       presets: {name: (deciding flags that were given, by name) -> configuration}.
       deciding: flags that other settings' defaults depend on. A flag without a value is "".
       together: whether several processes may compute a run together.
+      growing: settings of which a resumed run may have more than it was started with.
     """
 
     config: Any
@@ -121,6 +122,7 @@ class LongRun(ABC):
     presets: ClassVar[Mapping[str, Callable[[Mapping[str, str]], Any]]]
     deciding: ClassVar[tuple[str, ...]] = ()
     together: ClassVar[bool] = False
+    growing: ClassVar[tuple[str, ...]] = ()
 
     @classmethod
     def decided(cls, config: Any) -> dict[str, str]:
@@ -195,7 +197,7 @@ class LongRun(ABC):
         # Of several processes the first has the folder, and what it is refused the others are told.
         if processes.first():
             try:
-                run = Run.open(folder, stored, resumed, wandb)
+                run = Run.open(folder, stored, resumed, wandb, self.growing)
             except UserError as error:
                 refused = str(error)
         if refused := processes.told(refused):
@@ -209,8 +211,8 @@ class Kept:
 
     Attributes:
       out: folder for rows.jsonl and for what is made of them; must be new or empty.
-      resume: a folder that an interrupted command wrote; its settings apply, and a flag that
-        contradicts them is an error.
+      resume: a folder that such a command wrote, and was perhaps interrupted; its settings apply, and a
+        flag that contradicts them is an error.
     """
 
     out: Path | None = None

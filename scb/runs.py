@@ -16,7 +16,7 @@ import secrets
 import shutil
 import socket
 import time
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import IO, Any
@@ -58,6 +58,7 @@ class Run:
         config: Mapping[str, Any],
         resume: bool = False,
         wandb_project: str | None = None,
+        growing: Collection[str] = (),
     ) -> "Run":
         """Creates a run folder, or opens one to resume.
 
@@ -67,6 +68,8 @@ class Run:
             "command", by which people and resumptions start it, is stored and not compared.
           resume: continue the run that is there. Its config must equal `config`.
           wandb_project: also log to this Weights & Biases project (extra `wandb`).
+          growing: settings in the entry "config" that may be more than they were: a larger number, a list
+            that goes on. The folder then stores the new config.
 
         Raises:
           UserError: the folder can't be written, holds something already, isn't a run, is another
@@ -77,9 +80,16 @@ class Run:
             _wandb()  # that a missing package leaves no folder behind
         config = json.loads(json.dumps(config))
         if resume:
-            stored = read_config(folder)
-            stored, asked = ({**c, "command": None} for c in (stored, config))
-            difference = first_difference(stored, asked)
+            before = read_config(folder)
+            more = {
+                name: value
+                for name, value in config.get("config", {}).items()
+                if name in growing and _goes_on(before["config"].get(name), value)
+            }
+            stored = {**before, "config": {**before["config"], **more}} if more else before
+            difference = first_difference(
+                {**stored, "command": None}, {**config, "command": None}
+            )
             if difference:
                 raise UserError(
                     f"cannot resume {folder}: its config differs at {difference}; resume with the config it was "
@@ -87,6 +97,8 @@ class Run:
                 )
             make_folder(folder)
             _lock(folder)
+            if stored != before:
+                write_json(folder / "config.json", config)
             return cls(folder, resumed=True, wandb_project=wandb_project)
         if folder.exists() and not _has_room(folder):
             raise UserError(
@@ -367,6 +379,13 @@ def first_difference(stored: Any, given: Any, path: str = "") -> str:
                 return difference
         return ""
     return "" if stored == given else f"{path.lstrip('.')} ({stored!r} there, {given!r} now)"
+
+
+def _goes_on(stored: Any, given: Any) -> bool:
+    """Whether a setting is as it was, or more."""
+    if isinstance(stored, list):
+        return bool(given[: len(stored)] == stored)
+    return isinstance(stored, int) and bool(given >= stored)
 
 
 def _wandb() -> Any:

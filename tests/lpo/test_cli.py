@@ -193,12 +193,35 @@ def test_a_killed_evaluation_resumes_to_the_same_bytes(interrupted_evaluation, w
     assert [row["seed"] for row in map(json.loads, written[0].splitlines())][::4] == [7, 8, 7, 8]
 
 
+def test_a_resumed_evaluation_may_have_more_seeds_and_objectives(
+    interrupted_evaluation, working_folder, monkeypatch
+):
+    folder = working_folder / "o"
+    (folder / "rows.jsonl").write_bytes(interrupted_evaluation[0])
+    told: list[str] = []
+    monkeypatch.setattr(training_commands, "_tell", told.append)
+    more = ["--seeds=3", "--objectives", "none", "dpo", "ppo"]
+    assert cli.main(["evaluate", *more, "--resume=o"]) == 0
+    assert (folder / "rows.jsonl").read_bytes().startswith(interrupted_evaluation[0])
+    curves = json.loads((folder / "comparison.json").read_text())["curves"]
+    assert [(c["objective"], c["seeds"]) for c in curves] == [
+        (name, [7, 8, 9]) for name in ("none", "dpo", "ppo")
+    ]
+    told.clear()
+    assert cli.main(["evaluate", "--resume=o"]) == 0  # the folder knows what it has become
+    assert told == []
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         (
-            ["evaluate", "--seeds=3"],
-            "cannot resume o: its config differs at config.seeds (2 there, 3 now)",
+            ["evaluate", "--seeds=1"],
+            "cannot resume o: its config differs at config.seeds (2 there, 1 now)",
+        ),
+        (
+            ["evaluate", "--objectives", "dpo", "none"],
+            "config.objectives (['none', 'dpo'] there, ['dpo', 'none'] now)",
         ),
         (
             ["train"],
