@@ -87,9 +87,7 @@ class Run:
                 if name in growing and _goes_on(before["config"].get(name), value)
             }
             stored = {**before, "config": {**before["config"], **more}} if more else before
-            difference = first_difference(
-                {**stored, "command": None}, {**config, "command": None}
-            )
+            difference = first_difference({**stored, "command": None}, {**config, "command": None})
             if difference:
                 raise UserError(
                     f"cannot resume {folder}: its config differs at {difference}; resume with the config it was "
