@@ -34,6 +34,7 @@ from scb.environments.synthetic import SyntheticBandit
 from scb.environments.zoo import bandit_metadata, open_bandit, zoo_names
 from scb.errors import UserError
 from scb.files import make_folder, write_json
+from scb.runs import grown
 
 CLASSIC_CONTROL = tuple(sorted(families()["classic"].suite))
 DATA = Path("docs/data")
@@ -215,8 +216,8 @@ class Experiment:
                 )
             plan = json.loads(json.dumps(dict(self.presets[preset])))
             stored = report.get("plan", plan)
-            grown = {x: plan[x] for x in self.grows if _grown(stored.get(x), plan[x])}
-            if {**stored, **grown} != plan:
+            more = {x: plan[x] for x in self.grows if grown(stored.get(x), plan[x])}
+            if {**stored, **more} != plan:
                 raise UserError(
                     f"{out} was measured when the preset {preset} was another one: choose another --out."
                 )
@@ -270,13 +271,6 @@ class Experiment:
             plotting.save(figure, docs / "figures" / f"{name}.png", self.dpi)
         if self.extras is not None:
             self.extras(report, docs)
-
-
-def _grown(before: Any, now: Any) -> bool:
-    """Whether a list or a table holds all that it held before."""
-    if isinstance(before, dict) and isinstance(now, dict):
-        return all(name in now and now[name] == value for name, value in before.items())
-    return isinstance(before, list) and isinstance(now, list) and all(x in now for x in before)
 
 
 def plan_of(name: str) -> dict[str, Any]:

@@ -168,8 +168,8 @@ class Evaluate(Comparing):
     """Compare objectives: train PPO with each on the same seeds, and print final scores with intervals.
 
     With --out every agent's returns are kept in rows.jsonl as they come, for --resume and for
-    other statistics: pandas.read_json("rows.jsonl", lines=True). A resumed comparison may have more --seeds,
-    and further --objectives after those that it had: what is there is not trained again.
+    other statistics: pandas.read_json("rows.jsonl", lines=True). A resumed comparison may have more --seeds
+    and further --objectives: what is there is not trained again.
     """
 
     program = "lpo evaluate"

@@ -68,8 +68,8 @@ class Run:
             "command", by which people and resumptions start it, is stored and not compared.
           resume: continue the run that is there. Its config must equal `config`.
           wandb_project: also log to this Weights & Biases project (extra `wandb`).
-          growing: settings in the entry "config" that may be more than they were: a larger number, a list
-            that goes on. The folder then stores the new config.
+          growing: settings in the entry "config" that may be more than they were (`grown`). The folder
+            then stores the new config.
 
         Raises:
           UserError: the folder can't be written, holds something already, isn't a run, is another
@@ -84,7 +84,7 @@ class Run:
             more = {
                 name: value
                 for name, value in config.get("config", {}).items()
-                if name in growing and _goes_on(before["config"].get(name), value)
+                if name in growing and grown(before["config"].get(name), value)
             }
             stored = {**before, "config": {**before["config"], **more}} if more else before
             difference = first_difference({**stored, "command": None}, {**config, "command": None})
@@ -379,11 +379,13 @@ def first_difference(stored: Any, given: Any, path: str = "") -> str:
     return "" if stored == given else f"{path.lstrip('.')} ({stored!r} there, {given!r} now)"
 
 
-def _goes_on(stored: Any, given: Any) -> bool:
-    """Whether a setting is as it was, or more."""
-    if isinstance(stored, list):
-        return bool(given[: len(stored)] == stored)
-    return isinstance(stored, int) and bool(given >= stored)
+def grown(before: Any, now: Any) -> bool:
+    """Whether a setting is as it was, or more: a larger number, a list or a table that holds what it held."""
+    if isinstance(before, dict) and isinstance(now, dict):
+        return all(name in now and now[name] == value for name, value in before.items())
+    if isinstance(before, list) and isinstance(now, list):
+        return all(x in now for x in before)
+    return isinstance(before, int) and isinstance(now, int) and now >= before
 
 
 def _wandb() -> Any:

@@ -220,8 +220,8 @@ def test_a_resumed_evaluation_may_have_more_seeds_and_objectives(
             "cannot resume o: its config differs at config.seeds (2 there, 1 now)",
         ),
         (
-            ["evaluate", "--objectives", "dpo", "none"],
-            "config.objectives (['none', 'dpo'] there, ['dpo', 'none'] now)",
+            ["evaluate", "--objectives", "dpo", "ppo"],
+            "config.objectives (['none', 'dpo'] there, ['dpo', 'ppo'] now)",
         ),
         (
             ["train"],
