@@ -2,7 +2,7 @@
 
 import shlex
 import sys
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -25,7 +25,7 @@ from lpo.meta_training import (
 from lpo.objectives import Objective, load_objective, save_objective
 from scb import plotting, processes
 from scb.artefacts import machine_description
-from scb.command_line import LongRun, Output, flags, listed
+from scb.command_line import GENERATIONS, LongRun, Output, flags, listed
 from scb.console import console
 from scb.errors import UserError
 from scb.files import make_folder
@@ -67,6 +67,8 @@ def _meta_training(
 class MetaTrain(LongRun):
     """Learn an objective: evolve a drift on a bandit, or on an environment.
 
+    A resumed search may have more --generations.
+
     Attributes:
       preset: quick (30 generations of 32) or paper (512 of 64); single flags override it.
       family: what is learned: network, or another family of drifts that learns.
@@ -90,6 +92,9 @@ class MetaTrain(LongRun):
         temporal = {"temporal": ""} if config.drift.temporal else {}
         validate = {"validate": ""} if config.validation else {}
         return {"tasks": ",".join(config.tasks), "drift": config.drift.name, **temporal, **validate}
+
+    def growing(self) -> Collection[str]:
+        return GENERATIONS
 
     def run(self) -> None:
         objective = self.objective()

@@ -11,6 +11,7 @@ makes it rank objectives almost as the environment does.
 
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -125,7 +126,7 @@ def learn_objective(
     """
     path, config = run.folder / file, problem.config
     mean = None
-    if not processes.told(path.with_suffix(".json").exists()):  # it is written last
+    if not processes.told(_learned(path, config)):
         outcome = evolve(problem, config.evolution, run)
         run.close()
         outcome.check(best=bool(config.validation))
@@ -136,6 +137,14 @@ def learn_objective(
     if not processes.first():  # which has the folder
         return Objective(path.stem, config.drift, mean)
     return load_objective(path)
+
+
+def _learned(path: Path, config: MetaTrainingConfig) -> bool:
+    """Whether the objective of a search, and not of one of fewer generations, is there."""
+    if not path.with_suffix(".json").exists():  # it is written last
+        return False
+    stored = load_objective(path).metadata["config"]["meta_training"]
+    return bool(stored == config_dict(config))
 
 
 def environment_problem(config: MetaTrainingConfig) -> MetaTraining:

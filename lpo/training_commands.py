@@ -3,7 +3,7 @@
 import itertools
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from types import MappingProxyType
@@ -121,6 +121,9 @@ class EvaluateConfig(JudgedConfig):
 class Comparing(Measuring):
     """A command that compares objectives on one environment."""
 
+    def growing(self) -> Collection[str]:
+        return "seeds", "objectives"
+
     def compare(self, objectives: Sequence[Objective]) -> Comparison:
         """Trains with the objectives, and leaves rows, comparison.json and curves.png where a folder is named."""
         config: JudgedConfig = self.config
@@ -151,7 +154,6 @@ class Train(Comparing):
     """Train PPO with an objective in an environment, and print how well it ends."""
 
     program = "lpo train"
-    growing = ("seeds",)
     presets = MappingProxyType({"quick": lambda given: TrainConfig()})
 
     config: Annotated[TrainConfig, tyro.conf.arg(name="")] = field(default_factory=TrainConfig)
@@ -173,7 +175,6 @@ class Evaluate(Comparing):
     """
 
     program = "lpo evaluate"
-    growing = ("seeds", "objectives")
     presets = MappingProxyType({"quick": lambda given: EvaluateConfig()})
 
     config: Annotated[EvaluateConfig, tyro.conf.arg(name="")] = field(

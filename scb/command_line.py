@@ -7,7 +7,7 @@ text (`ppo,sac`), the field's annotation says so, with `tyro.conf.arg` and `text
 import argparse
 import shlex
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Self, TypeVar, get_type_hints
@@ -22,6 +22,7 @@ from scb.rows import Rows
 from scb.runs import Run, config_dict, read_config
 
 T = TypeVar("T")
+GENERATIONS = ("evolution.num_generations",)
 # Flags are the fields' names without those of the dataclasses that they are in; comments are for readers of code.
 _STYLE = (tyro.conf.OmitArgPrefixes, tyro.conf.HelptextFromCommentsOff)
 
@@ -111,7 +112,6 @@ class LongRun(ABC):
       presets: {name: (deciding flags that were given, by name) -> configuration}.
       deciding: flags that other settings' defaults depend on. A flag without a value is "".
       together: whether several processes may compute a run together.
-      growing: settings of which a resumed run may have more than it was started with.
     """
 
     config: Any
@@ -122,12 +122,15 @@ class LongRun(ABC):
     presets: ClassVar[Mapping[str, Callable[[Mapping[str, str]], Any]]]
     deciding: ClassVar[tuple[str, ...]] = ()
     together: ClassVar[bool] = False
-    growing: ClassVar[tuple[str, ...]] = ()
 
     @classmethod
     def decided(cls, config: Any) -> dict[str, str]:
         """The deciding flags that a configuration has."""
         return {}
+
+    def growing(self) -> Collection[str]:
+        """Settings, such as "evolution.num_generations", of which a resumed run may have more than it had."""
+        return ()
 
     @abstractmethod
     def run(self) -> None:
@@ -197,7 +200,8 @@ class LongRun(ABC):
         # Of several processes the first has the folder, and what it is refused the others are told.
         if processes.first():
             try:
-                run = Run.open(folder, stored, resumed, wandb, self.growing)
+                growing = [f"config.{name}" for name in self.growing()]
+                run = Run.open(folder, stored, resumed, wandb, growing)
             except UserError as error:
                 refused = str(error)
         if refused := processes.told(refused):

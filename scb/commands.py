@@ -1,6 +1,6 @@
 """What the subcommands of `scb` do. Their docstrings are the command line's help."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
@@ -11,7 +11,7 @@ import tyro
 
 from scb import experts, processes
 from scb.agents.spec import bandit_agent
-from scb.command_line import LongRun, Measuring, Output, flags
+from scb.command_line import GENERATIONS, LongRun, Measuring, Output, flags
 from scb.console import console
 from scb.discovery import BanditDiscovery, DiscoveryConfig
 from scb.environments.registry import environment_spec
@@ -106,6 +106,8 @@ class Judgement:
 class Discover(LongRun):
     """Discover a bandit: evolve one so that agents trained in it do well in an environment.
 
+    A resumed search may have more --generations, but not with --curriculum paper, which is stretched to them.
+
     Attributes:
       preset: quick (150 generations of 32, PPO) or paper (the paper's tables for the environment);
         single flags override it.
@@ -125,6 +127,10 @@ class Discover(LongRun):
     @classmethod
     def decided(cls, config: DiscoveryConfig) -> dict[str, str]:
         return {"environment": config.environment}
+
+    def growing(self) -> Collection[str]:
+        # The paper's curriculum is stretched to the length of the search.
+        return () if self.config.curriculum == "paper" else GENERATIONS
 
     def further(self) -> Iterator[str]:
         yield from flags(self.judgement, Judgement())

@@ -27,7 +27,7 @@ from scb.keys import key_at, root_key, split_key
 from scb.runs import Run, Stopwatch, continued
 from scb.seeds import VALIDATING, searching
 from scb.statistics import iqm
-from scb.strategies import STRATEGIES, has_mean, strategy_for
+from scb.strategies import STRATEGIES, strategy_for
 
 COMBINATIONS = ("mean", "ranks")
 
@@ -169,9 +169,10 @@ class Outcome:
     def cost(self, problem: Problem, config: EvolutionConfig, best: bool) -> dict[str, Any]:
         """What an artefact says of the search's cost; `best` where the mean judged best was taken."""
         steps, evaluations = problem.steps(), config.num_generations * config.population_size
-        # The last mean is judged too; a strategy that keeps a population has none to begin with.
-        judgements = -(-config.num_generations // config.evaluate_mean_every) + has_mean(config)
-        agents = judgements * config.mean_evaluations if evaluations else 0
+        judgements = sum(
+            name in line for line in self.metrics for name in ("mean/fitness", "final_mean/fitness")
+        )
+        agents = judgements * config.mean_evaluations
         judging = problem.judgement_steps()
         return {
             "environment_steps_training": evaluations * steps.training,
@@ -266,7 +267,8 @@ def evolve(
 
     Every generation is a function of (config, generation, strategy state), so a run that was killed
     and resumed ends with the same bytes as one that was not, on the same machine, devices and
-    versions.
+    versions; and one that is resumed with more generations goes on to the same mean as one that had
+    them from the start. Its log, and what is best, know one judgement more: that of its first end.
 
     Args:
       problem: what is evolved.

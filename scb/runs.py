@@ -68,7 +68,7 @@ class Run:
             "command", by which people and resumptions start it, is stored and not compared.
           resume: continue the run that is there. Its config must equal `config`.
           wandb_project: also log to this Weights & Biases project (extra `wandb`).
-          growing: settings in the entry "config" that may be more than they were (`grown`). The folder
+          growing: entries, such as "config.seeds", that may be more than they were (`grown`). The folder
             then stores the new config.
 
         Raises:
@@ -80,14 +80,8 @@ class Run:
             _wandb()  # that a missing package leaves no folder behind
         config = json.loads(json.dumps(config))
         if resume:
-            before = read_config(folder)
-            more = {
-                name: value
-                for name, value in config.get("config", {}).items()
-                if name in growing and grown(before["config"].get(name), value)
-            }
-            stored = {**before, "config": {**before["config"], **more}} if more else before
-            difference = first_difference({**stored, "command": None}, {**config, "command": None})
+            stored, asked = ({**c, "command": None} for c in (read_config(folder), config))
+            difference = first_difference(stored, asked, growing)
             if difference:
                 raise UserError(
                     f"cannot resume {folder}: its config differs at {difference}; resume with the config it was "
@@ -95,7 +89,7 @@ class Run:
                 )
             make_folder(folder)
             _lock(folder)
-            if stored != before:
+            if stored != asked:
                 write_json(folder / "config.json", config)
             return cls(folder, resumed=True, wandb_project=wandb_project)
         if folder.exists() and not _has_room(folder):
@@ -368,15 +362,21 @@ def _digest(leaves: Mapping[str, Any]) -> str:
     return digest.hexdigest()
 
 
-def first_difference(stored: Any, given: Any, path: str = "") -> str:
-    """Where two trees of JSON differ first, such as "a.b (1 there, 2 now)"; empty where they don't."""
+def first_difference(stored: Any, given: Any, growing: Collection[str] = (), path: str = "") -> str:
+    """Where two trees of JSON differ first, such as "a.b (1 there, 2 now)"; empty where they don't.
+
+    Entries of `growing`, by such a path, may be more than they were (`grown`).
+    """
     if isinstance(stored, dict) and isinstance(given, dict):
         for key in sorted(stored.keys() | given.keys()):
-            difference = first_difference(stored.get(key), given.get(key), f"{path}.{key}")
+            inner = f"{path}.{key}".lstrip(".")
+            difference = first_difference(stored.get(key), given.get(key), growing, inner)
             if difference:
                 return difference
         return ""
-    return "" if stored == given else f"{path.lstrip('.')} ({stored!r} there, {given!r} now)"
+    if stored == given or (path in growing and grown(stored, given)):
+        return ""
+    return f"{path} ({stored!r} there, {given!r} now)"
 
 
 def grown(before: Any, now: Any) -> bool:

@@ -42,17 +42,13 @@ STRATEGIES: dict[str, Any] = {
 }
 
 
-def has_mean(config: "EvolutionConfig") -> bool:
-    """Whether the strategy has a mean; others keep a population, and have nothing to judge before the first tell."""
-    return config.strategy in evosax.algorithms.distribution_based_algorithms
-
-
 class Strategy:
     """An evosax strategy behind one interface. Runs on one device; fitness comes and goes through the host."""
 
     def __init__(self, config: "EvolutionConfig", solution: Any) -> None:
         algorithm = STRATEGIES[config.strategy]
-        self.has_mean = has_mean(config)
+        # Others keep a population, and have no mean to judge before the first tell.
+        self.has_mean = config.strategy in evosax.algorithms.distribution_based_algorithms
         arguments: dict[str, Any] = {}
         if "std_schedule" in algorithm.__init__.__annotations__:
             arguments["std_schedule"] = lambda generation: jnp.maximum(

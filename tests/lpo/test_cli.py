@@ -321,11 +321,18 @@ def test_meta_train_writes_an_objective_that_loads(
     figure = working_folder / "learned" / "figures" / "meta_training.png"
     assert figure.read_bytes().startswith(b"\x89PNG")
 
+    # A finished search goes on with more generations, and replaces its objective.
+    assert cli.main(["meta-train", "--resume=learned", "--generations=3"]) == 0
+    longer = load_objective(working_folder / "learned" / "objective.npz").metadata
+    assert longer["cost"]["environment_steps_training"] == 144
+    assert longer["config"]["meta_training"]["evolution"]["num_generations"] == 3
+
     # The command that the artefact holds asks for the same again.
     again = MetaTrain.parse(shlex.split(objective.metadata["command"])[2:]).config
     assert config_dict(again) == config
     stored = json.loads((working_folder / "learned" / "config.json").read_text())
-    assert stored == {"command": objective.metadata["command"], "config": config}
+    longer_config = longer["config"]["meta_training"]
+    assert stored == {"command": longer["command"], "config": longer_config}
 
 
 def asked_for(words=""):

@@ -112,6 +112,27 @@ def test_a_finished_discovery_is_resumed_to_the_same_bandit(discovered, tmp_path
     assert (folder / "metrics.jsonl").read_bytes() == metrics
 
 
+def test_a_finished_discovery_goes_on_with_more_generations(discovered, tmp_path):
+    folder = Path(shutil.copytree(discovered[0], tmp_path / "copy"))
+    bandit = folder / "Synthetic-CartPole-v1.json"
+    before = json.loads(bandit.read_text())
+    words = ["--resume", folder, "--generations", "3", "--judge-agents", "0"]
+    result = call("discover", *words)
+    assert (result.code, result.err.count("generation 3/3")) == (0, 1)
+    after = json.loads(bandit.read_text())
+    assert after["sha256"] != before["sha256"]
+    assert after["command"] == before["command"].replace("--generations=2", "--generations=3")
+    result = call("discover", "--resume", folder, "--generations", "2")
+    assert "its config differs at config.evolution.num_generations (3 there, 2 now)" in result.err
+
+
+def test_a_search_under_the_papers_curriculum_keeps_its_length(tmp_path):
+    words = ["--environment=MountainCar-v0", "--curriculum=paper", "--generations=4"]
+    Discover.parse([*words, "--out", str(tmp_path / "run")]).open().close()
+    result = call("discover", "--resume", tmp_path / "run", "--generations=5")
+    assert "its config differs at config.evolution.num_generations (4 there, 5 now)" in result.err
+
+
 def test_a_resumed_discovery_judges_as_it_was_told_to_at_first(tmp_path):
     folder = tmp_path / "run"
     words = ["--environment=CartPole-v1", "--judge-agents=3", "--judge-episodes=2"]

@@ -26,7 +26,7 @@ from scb.evolution import (
     map_population,
     rank_failed_last,
 )
-from scb.runs import Run, config_dict
+from scb.runs import Run, config_dict, read_config
 from scb.strategies import STRATEGIES
 from tests.scb.probes import Parabola
 
@@ -543,6 +543,22 @@ def test_another_seed_ends_with_other_bytes(tmp_path, uninterrupted):
     assert fingerprint(tmp_path / "run", outcome)[0] != uninterrupted["SNES"][0]
 
 
+def test_a_finished_run_goes_on_with_more_generations(tmp_path, uninterrupted):
+    evolve_in(tmp_path / "run", replace(CONFIG, num_generations=5))
+    config = config_dict(CONFIG)
+    run = Run.open(tmp_path / "run", config, resume=True, growing=["num_generations"])
+    outcome = evolve(Parabola(noise=0.5), CONFIG, run, quiet=True)
+    run.close()
+    mean = [np.asarray(x).tobytes() for x in jax.tree.leaves(outcome.mean)]
+    assert mean == uninterrupted["SNES"][0][: len(mean)]
+    assert read_config(tmp_path / "run") == config
+    assert [line["generation"] for line in outcome.metrics] == [*range(8)]
+    # Judged before generations 0, 3 and 6, after the first end and after the last.
+    one = Parabola().judgement_steps().training * CONFIG.mean_evaluations
+    cost = outcome.cost(Parabola(), CONFIG, best=False)
+    assert cost["environment_steps_judgements_training"] == 5 * one
+
+
 def cut_in_half(folder):
     for path in [p for p in folder.rglob("*") if p.is_file()]:
         path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
@@ -580,7 +596,7 @@ def test_a_process_that_was_killed_mid_way_is_resumed_to_the_same_bytes(tmp_path
     code = f"""
 import os, pathlib, signal, sys, threading, time
 from scb.evolution import EvolutionConfig, evolve
-from scb.runs import Run, config_dict
+from scb.runs import Run, config_dict, read_config
 from tests.scb.probes import Parabola
 
 def kill():

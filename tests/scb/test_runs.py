@@ -102,6 +102,32 @@ def test_another_config_cannot_resume_a_run(run, change, message):
         Run.open(run.folder, {**CONFIG, **change}, resume=True)
 
 
+GROWING = ["seed", "evolution.sigma", "hidden_sizes"]
+
+
+@pytest.mark.parametrize("change", [{"seed": 1}, {"hidden_sizes": [8, 8, 4]}])
+def test_a_run_that_may_grow_stores_what_it_has_become(run, change):
+    Run.open(run.folder, {**CONFIG, **change}, resume=True, growing=GROWING).close()
+    assert read_config(run.folder) == {**CONFIG, "hidden_sizes": [8, 8], **change}
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"seed": -1}, r"differs at seed \(0 there, -1 now\)"),
+        ({"hidden_sizes": [4]}, r"\[4\] now"),
+        (
+            {"evolution": {"strategy": "SNES", "sigma": 0.1}},
+            "0.1 now",
+        ),  # of a fraction there is no more
+    ],
+)
+def test_a_run_that_may_grow_may_not_shrink(run, change, message):
+    with pytest.raises(UserError, match=message):
+        Run.open(run.folder, {**CONFIG, **change}, resume=True, growing=GROWING)
+    assert read_config(run.folder) == {**CONFIG, "hidden_sizes": [8, 8]}
+
+
 @pytest.mark.parametrize("content", [None, "", "{", '{"seed": ', "[1]", "3", "null"])
 def test_what_is_no_run_cannot_be_resumed(tmp_path, content):
     if content is not None:
