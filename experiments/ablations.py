@@ -15,10 +15,10 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from experiments import searches
-from experiments.claims import OF_THE_WAY, Claim, of_the_way
+from experiments.claims import ENOUGH, OF_THE_WAY, Claim, of_the_way
 from experiments.harness import Experiment, Report
 from experiments.parts import InParts, Part
-from experiments.searches import ENOUGH, NONE
+from experiments.searches import NONE
 from scb import plotting
 from scb.discovery import DiscoveryConfig
 from scb.environments.synthetic import BanditConfig

@@ -21,7 +21,7 @@ import jax
 import numpy as np
 from matplotlib.figure import Figure
 
-from experiments.harness import Experiment, Save, command_of, run_name
+from experiments.harness import Experiment, Save, command_of
 from lpo import figures
 from lpo.alignment import (
     Regime,
@@ -32,7 +32,7 @@ from lpo.alignment import (
     other_drifts,
 )
 from lpo.fitness import LABELS
-from lpo.objectives import Objective, load_objective
+from lpo.objectives import Objective, load_objective, run_name
 from scb.environments.registry import environment_spec
 from scb.errors import UserError
 

@@ -18,7 +18,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from experiments import zoo_table, zoo_table_page
-from experiments.claims import Claim
+from experiments.claims import Claim, of_agents
 from experiments.harness import Experiment, Preset, Report, bandit_of
 from experiments.parts import InParts, Part
 from lpo.full_size import full_size
@@ -219,7 +219,8 @@ def claims(report: Report) -> list[Claim]:
         told = None not in row["each_low"] or _ratio(row, None) >= LEAST_TIMES
         name = f"{row['bandit']}, {row['algorithm'].upper()}"
         text = f"{name}: the environment takes {LEAST_TIMES} times the steps or more"
-        evidence = partial(estimate, times, statistic=np.median) if told else None
+        median = partial(estimate, times, statistic=np.median)
+        evidence = of_agents(median, len(times)) if told else None
         found.append(Claim(text, evidence, LEAST_TIMES, places=0))
         standing = environment_spec(row["environment"]).standing_still(row["backend"])
         if standing is not None:

@@ -9,9 +9,13 @@ or one search, nothing is decided.
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+from numpy.typing import ArrayLike
 
 from scb.environments.registry import environment_spec
-from scb.statistics import DECIDING, Estimate
+from scb.statistics import DECIDING, Estimate, few_groups_difference, pooled_estimate
 
 HOLDS, IN_PART, FAILS, UNDECIDED, UNTESTED = OUTCOMES = (
     "holds",
@@ -20,6 +24,8 @@ HOLDS, IN_PART, FAILS, UNDECIDED, UNTESTED = OUTCOMES = (
     "undecided",
     "not tested at this size",
 )
+# Searches; of fewer nothing is decided, whose scatter two or three cannot tell.
+ENOUGH = 5
 CONFIDENCE = 0.95  # of all intervals of a page together
 
 
@@ -72,6 +78,23 @@ class Judged:
 def of_agents(evidence: Callable[..., Estimate], number: int) -> Callable[..., Estimate] | Estimate:
     """What so many agents say: without an interval where they are too few."""
     return evidence if number >= DECIDING else replace(evidence(), low=None, high=None)
+
+
+def of_searches(
+    ours: ArrayLike, theirs: ArrayLike, paired: bool = False
+) -> Callable[..., Estimate] | Estimate:
+    """How far agents of several searches earn more than others': without an interval where searches are too few.
+
+    Args:
+      ours, theirs: [searches, agents]. A single one is nobody's search where the other side has several,
+        as of PPO's clip; with several on both sides each has to have enough.
+      paired: whether searches of the same position share a seed.
+    """
+    several = [n for n in map(len, map(np.asarray, (ours, theirs))) if n > 1]
+    if several and min(several) >= ENOUGH:
+        return partial(few_groups_difference, ours, theirs, paired_groups=paired)
+    found = pooled_estimate(ours, theirs, paired_groups=paired)
+    return replace(found, low=None, high=None)
 
 
 def judge(claims: Sequence[Claim]) -> list[Judged]:

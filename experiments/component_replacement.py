@@ -26,7 +26,13 @@ from scb.judgement import judge
 from scb.keys import key_at, root_key, split_key
 from scb.measurement import Place
 from scb.seeds import ILLUSTRATING, REPORTING
-from scb.statistics import Estimate, iqm, normalized_score, pooled_estimate
+from scb.statistics import (
+    Estimate,
+    few_groups_difference,
+    iqm,
+    normalized_score,
+    pooled_estimate,
+)
 
 ENVIRONMENT = "Pendulum-v1"
 BANDIT, CLONING, ACTION, Q = REWARDS = (
@@ -152,7 +158,7 @@ def claims(report: Report) -> list[Claim]:
 
     def more(one: tuple[str, str], than: tuple[str, str]) -> partial[Estimate]:
         scores, others = (scores_of(report, *x) for x in (one, than))
-        return partial(pooled_estimate, scores, others, paired_groups=True)
+        return partial(few_groups_difference, scores, others, paired_groups=True)
 
     itself = (BANDIT, SYNTHETIC)
     return [

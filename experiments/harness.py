@@ -375,8 +375,3 @@ def finite(returns: Any, instead: float) -> tuple[list[float], int]:
     values = np.asarray(returns, np.float64)
     bad = ~np.isfinite(values)
     return np.round(np.where(bad, instead, values), 2).tolist(), int(bad.sum())
-
-
-def run_name(file: Path) -> str:
-    """What to call an objective's file: every run's is objective.npz, and its folder tells runs apart."""
-    return file.parent.name if file.stem == "objective" else file.stem

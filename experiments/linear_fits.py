@@ -16,11 +16,10 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from experiments.claims import Claim
+from experiments.claims import ENOUGH, Claim, of_searches
 from experiments.harness import Experiment, Report, packed, unpacked
 from experiments.parts import InParts, Part
 from experiments.rendering import either
-from experiments.searches import ENOUGH
 from scb import plotting
 from scb.agents.spec import bandit_agent
 from scb.environments.registry import environment_spec
@@ -141,10 +140,10 @@ def claims(report: Report) -> list[Claim]:
         ):
             seeds = sorted(entry[expert].keys() & entry[other].keys())
             evidence = None
-            if len(seeds) >= ENOUGH:
+            if seeds:
                 ours = earned(entry, expert, contexts, "ppo", seeds)
                 theirs = earned(entry, other, others, "ppo", seeds)
-                evidence = partial(pooled_estimate, ours, theirs, paired_groups=True)
+                evidence = of_searches(ours, theirs, paired=True)
             found.append(Claim(f"{environment}: {text}", evidence, places=0))
     return found
 

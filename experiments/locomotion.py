@@ -24,7 +24,7 @@ from experiments.parts import InParts, Keys, Part, lacking
 from lpo import figures
 from lpo.comparison import Comparison, LearningCurves, compare, ppo_spec
 from lpo.full_size import REFERENCE, Confirmation, as_comparison, looked_at, with_pairs
-from lpo.objectives import CLIPS, load_objective
+from lpo.objectives import CLIPS, learned_in, load_objective, zoo_names
 from scb.errors import at_least
 from scb.files import plain
 from scb.rows import Rows
@@ -33,9 +33,11 @@ from scb.statistics import DECIDING, Estimate, iqm, paired_difference
 
 BACKEND = "generalized"
 MARGIN = 0.05  # of what the reference earns: what is not worse by more is as good
-AS_GOOD = {
+# What is asked of an objective, by the measure that decides it.
+ASKED = {
     "final": "ends no lower than PPO",
     "late": "earns no less over the last quarter than PPO",
+    "area": "earns more over the training than PPO",
 }
 
 
@@ -171,14 +173,14 @@ def claims(report: Report) -> list[Claim]:
     for environment, entry in looked_at(report).items():
         reference, *others = as_comparison(environment, entry).curves
         for curves in others:
-            found += [_as_good(curves, reference, of) for of in AS_GOOD]
-            text = f"{environment}: {curves.objective} earns more over the training than PPO"
-            found.append(Claim(text, paired(curves, reference, "area"), places=0))
+            found += [_claim(curves, reference, of) for of in ASKED]
     return found
 
 
-def _as_good(curves: LearningCurves, reference: LearningCurves, of: str) -> Claim:
-    text = f"{curves.environment}: {curves.objective} {AS_GOOD[of]}"
+def _claim(curves: LearningCurves, reference: LearningCurves, of: str) -> Claim:
+    text = f"{curves.environment}: {curves.objective} {ASKED[of]}"
+    if of == "area":
+        return Claim(text, paired(curves, reference, of), places=0)
     margin = round(MARGIN * abs(float(getattr(reference, of).mean())), 1)
     reason = "a twentieth of what PPO's clip earns"
     return Claim(text, paired(curves, reference, of), 0.0, margin, reason, places=0)
@@ -194,7 +196,7 @@ def confirmed(report: Report) -> list[tuple[Confirmation, int, Judged | None]]:
             names = (REFERENCE, asked.objective)
             fresh = {name: {s: entry["agents"][name][s] for s in seeds} for name in names}
             reference, curves = as_comparison(asked.environment, {**entry, "agents": fresh}).curves
-            (judged,) = judge([_as_good(curves, reference, asked.of)])
+            (judged,) = judge([_claim(curves, reference, asked.of)])
         found.append((asked, len(seeds), judged))
     return found
 
@@ -205,14 +207,15 @@ def facts(report: Report) -> dict[str, Any]:
     return {
         "comparisons": comparisons,
         "deciding": DECIDING,
-        "confirmations": [(asked, AS_GOOD[asked.of], *rest) for asked, *rest in confirmed(report)],
+        "learned_here": _learned_here(comparisons),
+        "confirmations": [(asked, ASKED[asked.of], *rest) for asked, *rest in confirmed(report)],
         "sweeps": {
             name: (sweep, len(entry["sweep"][REFERENCE]), tuned(sweep))
             for name, entry in report["environments"].items()
             if (sweep := swept(entry))
         },
         "diagnosed": {
-            name: {curve.objective: widths(curve)[1] for curve in curves}
+            name: {curve.objective: width(curve) for curve in curves}
             for name, comparison in comparisons.items()
             if (curves := _diagnosed(comparison))
         },
@@ -230,14 +233,23 @@ def draw(report: Mapping[str, Any]) -> dict[str, Figure]:
     return drawn
 
 
-def widths(curves: LearningCurves) -> tuple[float, float]:
-    """(first, last) standard deviation of a Gaussian policy: the geometric mean over joints and diagnosed agents."""
+def _learned_here(comparisons: Mapping[str, Comparison]) -> list[str]:
+    """Objectives of the zoo among these that were learned for one of these environments."""
+    names = {curve.objective for comparison in comparisons.values() for curve in comparison.curves}
+    return [
+        name
+        for name in zoo_names()
+        if name in names and {*comparisons} & {*learned_in([load_objective(name)])}
+    ]
+
+
+def width(curves: LearningCurves) -> float:
+    """The last standard deviation of a Gaussian policy: the geometric mean over joints and diagnosed agents."""
     entropy = np.nanmean((curves.diagnosis or {})["entropy"], axis=0)
     # A Gaussian starts with a deviation of 1 in each joint, which says how many there are.
     of_one = 0.5 * math.log(2 * math.pi * math.e)
     joints = round(entropy[0] / of_one)
-    first, last = (math.exp(x / joints - of_one) for x in entropy[[0, -1]])
-    return first, last
+    return math.exp(entropy[-1] / joints - of_one)
 
 
 def _diagnosed(comparison: Comparison) -> list[LearningCurves]:

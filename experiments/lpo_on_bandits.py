@@ -21,7 +21,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, LogLocator, NullFormatter, StrMethodFormatter
 
-from experiments.claims import OF_THE_WAY, Claim, of_the_way
+from experiments.claims import OF_THE_WAY, Claim, of_searches, of_the_way
 from experiments.harness import Experiment, Preset, Report, Save, settled
 from experiments.locomotion import paired
 from experiments.searches import judgements, objective_of_run, read_log
@@ -105,11 +105,11 @@ def on_hopper() -> dict[str, LearningCurves]:
     return {name: measured[of] for name, of in HOPPER.items() if of in measured}
 
 
-def _above(returns: Mapping[str, Any], name: str, other: str) -> partial[Estimate] | Estimate:
-    """How far an objective earns more than another; without an interval where either was searched for once."""
-    evidence = partial(pooled_estimate, returns[name], returns[other])
+def _above(returns: Mapping[str, Any], name: str, other: str) -> Callable[..., Estimate] | Estimate:
+    """How far an objective earns more than another; without an interval where searches are too few."""
+    found = of_searches(returns[name], returns[other])
     once = any(len(returns[x]) == 1 for x in (name, other) if x in (BANDIT, ENVIRONMENT))
-    return replace(evidence(), low=None, high=None) if once else evidence
+    return replace(found(), low=None, high=None) if once and callable(found) else found
 
 
 def cheaper(report: Report) -> float:
@@ -139,7 +139,7 @@ def facts(report: Report) -> dict[str, Any]:
         tables[place] = {
             "earned": {o: [pooled_estimate(x[o]) for x in kinds] for o in kinds[0]},
             "against": {
-                o: [pooled_estimate(x[BANDIT], x[o]) for x in kinds]
+                o: [x() if callable(x := _above(k, BANDIT, o)) else x for k in kinds]
                 for o in kinds[0]
                 if o != BANDIT
             },

@@ -24,7 +24,7 @@ from experiments.claims import TENTH, Claim
 from experiments.harness import Experiment, Report, finite, packed, plan_of, settled, unpacked
 from experiments.parts import InParts, Part
 from lpo.comparison import ppo_spec
-from lpo.objectives import Objective, check_names, load_objective
+from lpo.objectives import Objective, check_names, learned_in, load_objective
 from lpo.suite import suite
 from scb.agents.spec import AgentSpec
 from scb.environments.registry import environment_spec
@@ -105,13 +105,16 @@ def _trained(
     random = environment_spec(environment).random_return()
     earned, failed = finite([row["return"] for row in rows], random)
     print(f"{environment}, {name}, {key}: {np.mean(earned):.4g}", flush=True)
-    tasks = () if objective is None else objective.learned_on
     return {
         "random": random,
         "returns": {name: {key: packed([earned])[0]}},
         "failed": {name: {key: failed}},
-        "draws": {key: {x: packed([[row[x] for row in rows]])[0] for x in drawn.drawn}},
-        "learned_on": {name: [environment_spec(x).evaluation_environment for x in tasks]},
+        "draws": {
+            key: {
+                x: packed([np.asarray(getattr(drawn.hyperparameters, x))])[0] for x in drawn.drawn
+            }
+        },
+        "learned_on": {name: learned_in(objectives)},
     }
 
 

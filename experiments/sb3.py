@@ -10,7 +10,7 @@ it), in which every agent is a process. What --out holds already is not trained 
 import json
 import subprocess
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -167,13 +167,17 @@ def facts(report: Report) -> dict[str, Any]:
                 counts.add(len(agents))
                 returns = returns_of(agents, sorted(agents))
                 row = [estimate(column) for column in returns.T]
+                if len(agents) < DECIDING:
+                    row = [replace(x, low=None, high=None) for x in row]
                 tables.setdefault(name, {}).setdefault(algorithm, {})[place] = row
+    trained = {algorithm for of_it in tables.values() for algorithm in of_it}
+    longest = max((n[-1] for n in report["steps"].values()), default=0)
     return {
         "tables": tables,
         "every": sorted({n for x in report["steps"].values() for n in x}),
         "counts": sorted(counts),
         "ends": "; ".join(_ends(tables, report["steps"])),
-        "several": len({algorithm for of_it in tables.values() for algorithm in of_it}) > 1,
+        "short": [x for x, n in report["steps"].items() if x in trained and n[-1] < longest],
         "deciding": DECIDING,
         "expert": {name: environment_spec(name).reference() for name in tables},
         "random": {name: environment_spec(name).random_return() for name in tables},

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from experiments.claims import ENOUGH
 from experiments.rendering import text
 from lpo.commands import MetaTrain
 from lpo.objectives import Objective
@@ -22,8 +23,6 @@ from scb.runs import Run, config_dict
 from scb.statistics import Estimate, Statistic, estimate, stratified_estimate
 
 NONE = "none"  # the curriculum that is none
-# Of two searches the bootstrap's interval is their range: two such lie apart by chance in every third comparison.
-ENOUGH = 5
 
 
 def config_of(

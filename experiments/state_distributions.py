@@ -20,7 +20,6 @@ from experiments.harness import Experiment, Report, bandit_of, packed, unpacked
 from experiments.interpretability import action_bar, draw_actions
 from experiments.parts import InParts, Part
 from scb import plotting
-from scb.agents.agent import flat_bounds
 from scb.analysis.components import ReplacedBandit, q_reward
 from scb.analysis.optimal_actions import first_action, optimal_actions
 from scb.analysis.planes import plane_for
@@ -28,6 +27,7 @@ from scb.analysis.states import bandit_states, follow
 from scb.environments.synthetic import SyntheticBandit
 from scb.keys import root_key, split_key
 from scb.seeds import ILLUSTRATING
+from scb.spaces import flat_bounds
 from scb.statistics import Estimate, estimate
 
 POINTS = 50  # of the grid of best actions, in either direction

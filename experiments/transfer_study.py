@@ -20,7 +20,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from experiments.claims import FAILS, HOLDS, UNDECIDED, Claim, judge
+from experiments.claims import ENOUGH, FAILS, HOLDS, Claim, judge, of_searches
 from experiments.harness import Experiment, Report, plan_of, settled
 from experiments.parts import InParts, Keys, Part, lacking
 from experiments.searches import meta_training, objective_of_run
@@ -42,7 +42,7 @@ NO_SEARCH = "no search"  # stands for the meta-seed of a reference
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Where objectives are judged. The seeds are neither those of searches nor those that report."""
+    """Where objectives are judged, on reporting seeds of their own, apart from those of other tables."""
 
     name: str
     environments: tuple[str, ...]
@@ -85,7 +85,7 @@ def difference(
 ) -> Callable[..., Estimate] | Estimate | None:
     """How far an objective ends above the default's: as evidence of a claim, with searches and agents resampled.
 
-    A variation is compared over the searches of one seed in both, and of one search there is no interval; a
+    A variation is compared over the searches of one seed in both; of too few there is no interval. A
     reference was searched for by nobody, so its one set of agents stands against all searches of the default.
     """
     default = report["objectives"].get("default", {}).get("returns", {}).get(evaluation, {})
@@ -96,10 +96,7 @@ def difference(
         return None
     first = list(own.values()) if reference else [own[seed] for seed in seeds]
     second = [default[seed] for seed in seeds]
-    found = partial(pooled_estimate, first, second, paired_groups=not reference)
-    if len(second) > 1:
-        return found
-    return replace(found(), low=None, high=None)
+    return of_searches(first, second, paired=not reference)
 
 
 def summary(report: Report) -> list[dict[str, Any]]:
@@ -131,37 +128,31 @@ def summary(report: Report) -> list[dict[str, Any]]:
 
 
 def facts(report: Report) -> dict[str, Any]:
-    """The rows, and which variations are better or worse than the default by the whole interval of several searches."""
+    """The rows, and by place which objectives enough searches show to be better or worse than the default's."""
     rows = summary(report)
+    places = {e["name"]: 2 if Evaluation(**e).normalized else 0 for e in report["evaluations"]}
 
-    def those(outcome: str) -> list[str]:
-        return [
-            f"{row['name']} ({', '.join(places)})"
-            for row in rows
-            if (places := [e for e, (_, x) in row["against"].items() if x == outcome])
-            and row["searches"] != 1
-        ]
-
-    # Of one environment each, with either initialisation of the policy.
-    single = [e["name"] for e in report["evaluations"] if not Evaluation(**e).normalized]
-
-    def behind(row: dict[str, Any], places: Sequence[str]) -> bool:
-        return row["searches"] > 1 and all(
-            place in row["against"] and row["against"][place][1] == FAILS for place in places
-        )
+    def those(outcome: str, of: Callable[[str], bool] = lambda name: True) -> dict[str, list[str]]:
+        found = {
+            place: [
+                row["name"]
+                for row in rows
+                if row["against"].get(place, (None, None))[1] == outcome and of(row["name"])
+            ]
+            for place in places
+        }
+        return {place: names for place, names in found.items() if names}
 
     number = sum(x.low is not None for row in rows for x, _ in row["against"].values())
     return {
         "rows": rows,
         "better": those(HOLDS),
         "worse": those(FAILS),
-        "undecided": those(UNDECIDED),
-        "behind": [row["name"] for row in rows if behind(row, single)],
-        "once": [row["name"] for row in rows if row["searches"] == 1],
+        "behind": those(FAILS, lambda name: name not in REFERENCES),
+        "few": [row["name"] for row in rows if 0 < row["searches"] < ENOUGH],
+        "enough": ENOUGH,
         "number": number,
-        "places": {
-            e["name"]: 2 if Evaluation(**e).normalized else 0 for e in report["evaluations"]
-        },
+        "places": places,
         "level": 100 * (1 - 0.05 / max(1, number)),
     }
 

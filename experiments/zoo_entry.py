@@ -12,9 +12,9 @@ from typing import Any
 
 import tyro
 
-from experiments.harness import Experiment, Save, run_name
+from experiments.harness import Experiment, Save
 from experiments.understanding import read_comparison
-from lpo.objectives import load_objective, save_objective
+from lpo.objectives import load_objective, run_name, save_objective
 from scb.errors import UserError
 
 

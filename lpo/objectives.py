@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from lpo.certificate import Certificate, certify
 from lpo.drifts import ClipDrift, DPODrift, Drift, NoDrift, drift_from_config
 from scb import artefacts
+from scb.environments.registry import environment_spec
 from scb.errors import UserError, unknown_name
 from scb.keys import root_key
 
@@ -102,6 +103,17 @@ def load_apart(names: Sequence[str]) -> list[Objective]:
     ]
     check_names(loaded)
     return loaded
+
+
+def learned_in(objectives: Sequence[Objective]) -> list[str]:
+    """The environments that objectives were learned for: themselves, or what their bandits stand for."""
+    tasks = [task for objective in objectives for task in objective.learned_on]
+    return sorted({environment_spec(task).evaluation_environment for task in tasks})
+
+
+def run_name(file: Path) -> str:
+    """What to call an objective's file: every run's is objective.npz, and its folder tells runs apart."""
+    return file.parent.name if file.stem == "objective" else file.stem
 
 
 def closed_form(name: str, drift: Drift) -> Objective:

@@ -5,7 +5,7 @@ from pathlib import Path
 import tyro
 
 from lpo.drift_figures import drift_and_gradient
-from lpo.objectives import load_apart
+from lpo.objectives import load_apart, run_name
 from lpo.page import save_objective_page
 from lpo.update_regions import REGIONS, analyze
 from scb import interactive, plotting
@@ -29,7 +29,8 @@ def show_command(
       objective: ppo, ppo-0.3, dpo, none, a zoo name, or path.npz.
       beside: other objectives to show with it.
       progress: fraction of training done, from 0 to 1, for objectives that change with it.
-      out: folder for show.png, show.json and show.html; runs/show/NAME where left out.
+      out: folder for show.png, show.json and show.html; runs/show/NAME where left out, of a run's objective.npz
+        by the name of its folder.
       html: also write a page where advantage and ratio can be moved and the penalty turned (extra `html`).
     """
     if not 0.0 <= progress <= 1.0:
@@ -37,7 +38,8 @@ def show_command(
     if html:
         interactive.plotly()  # before the work, not after it
     objectives = load_apart([*(name for name in beside if name != objective), objective])
-    name = Path(objective.removesuffix(".npz")).name
+    file = objective.endswith(".npz")
+    name = run_name(Path(objective).resolve()) if file else Path(objective).name
     folder = Path("runs") / "show" / name if out is None else out
     make_folder(folder)
     found = [analyze(o, progress) for o in objectives]

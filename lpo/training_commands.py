@@ -17,7 +17,7 @@ from lpo import figures
 from lpo.alignment import Regime, correlation_text, known_drifts, measure_alignment
 from lpo.comparison import Comparison, LearningCurves, compare, ppo_spec
 from lpo.fitness import LABELS
-from lpo.objectives import Objective, load_apart, load_objective
+from lpo.objectives import Objective, learned_in, load_apart, load_objective
 from lpo.suite import SuiteScores, run_suite
 from lpo.suite import suite as suite_environments
 from scb import plotting
@@ -356,12 +356,6 @@ class Align(Measuring):
         printer.print(table)
         if folder is not None:
             plotting.save(figures.alignment_heatmap(report), folder / "alignment.png")
-
-
-def learned_in(objectives: Sequence[Objective]) -> list[str]:
-    """The environments that objectives were learned for: themselves, or what their bandits stand for."""
-    tasks = [task for objective in objectives for task in objective.learned_on]
-    return sorted({environment_spec(task).evaluation_environment for task in tasks})
 
 
 def _scores_table(scores: SuiteScores, where: str) -> Table:

@@ -18,14 +18,7 @@ import tyro
 from jax.typing import ArrayLike
 
 from scb import processes
-from scb.agents.spec import (
-    ALGORITHMS,
-    AgentSpec,
-    algorithms_for,
-    bandit_agent,
-    check_algorithms,
-    kind_of_actions,
-)
+from scb.agents.spec import ALGORITHMS, AgentSpec, algorithms_for, bandit_agent, check_algorithms
 from scb.agents.tables import Lists
 from scb.command_line import listed, text
 from scb.curriculum import (
@@ -53,6 +46,7 @@ from scb.lists import read_lists, write_lists
 from scb.measurement import Judge, Place, train_and_judge
 from scb.refinement import RefinementConfig, refined
 from scb.runs import Run, config_dict
+from scb.spaces import kind_of_actions
 from scb.strategies import strategy_for
 from scb.warm_start import WarmStartConfig, expert_agent, warm_start
 

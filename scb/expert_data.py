@@ -1,6 +1,5 @@
 """What an expert does, and what actions are worth, in states that it takes part in visiting."""
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
@@ -18,6 +17,7 @@ from scb.fitting import CONSTRUCTIONS, ExpertDataset
 from scb.keys import named_key, split_key
 from scb.linear_expert import erring, noisy
 from scb.measurement import Place
+from scb.spaces import flat_size
 
 
 @dataclass(frozen=True)
@@ -114,7 +114,7 @@ def expert_dataset(
 def _trajectories(place: Place, config: DatasetConfig) -> Callable[[Partial, jax.Array], Visited]:
     """(policy, [N] keys) -> [N, T, ...] states that it takes part in visiting."""
     space = place.env.action_space(place.params)
-    size = math.prod(place.env.observation_space(place.params).shape)
+    size = flat_size(place.env.observation_space(place.params))
 
     def roll(policy: Partial, key: jax.Array) -> Visited:
         key_reset, key_skill, key_steps = split_key(key, 3)

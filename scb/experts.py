@@ -25,6 +25,7 @@ from scb.evolution import EnvironmentSteps, EvolutionConfig, evolve
 from scb.keys import named_key, root_key, split_key
 from scb.measurement import Judge, train_and_judge
 from scb.neuroevolution import network_action, policy_network
+from scb.spaces import flat_size
 
 EPISODES = 20  # by which an expert is judged
 
@@ -168,7 +169,7 @@ class _PolicySearch:
         return act
 
     def initial_solution(self, key: jax.Array) -> Any:
-        size = int(np.prod(self.env.observation_space(self.env_params).shape))
+        size = flat_size(self.env.observation_space(self.env_params))
         return self.network.init(key, jnp.zeros(size))
 
     def _returns(self, weights: Any, key: jax.Array, limit: Any) -> jax.Array:

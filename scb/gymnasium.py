@@ -1,4 +1,4 @@
-"""Bandits and synthetic MDPs as Gymnasium's environments, in NumPy: no step calls JAX.
+"""Bandits and synthetic MDPs as Gymnasium's environments, in NumPy: JAX draws the start states of a "T", and no more.
 
 import gymnasium, scb
 env = gymnasium.make("scb/Synthetic-Pendulum-v1")  # or "scb:scb/Synthetic-Pendulum-v1", which imports scb
@@ -49,6 +49,15 @@ def _opened(file: str) -> tuple[InNumpy, spaces.Box, spaces.Space[Any]]:
     return InNumpy(synthetic), observations, actions
 
 
+def _check_finite(actions: np.ndarray) -> None:
+    """A UserError for the first of [B, ...] actions that is not finite; a synthetic MDP may overflow by itself."""
+    for action in actions:
+        if not np.isfinite(action).all():
+            raise UserError(
+                f"an action is {action.tolist()}, which gives no reward: it must be finite."
+            )
+
+
 class SyntheticEnv(gymnasium.Env[np.ndarray, Any]):
     """One bandit or synthetic MDP.
 
@@ -90,12 +99,14 @@ class SyntheticEnv(gymnasium.Env[np.ndarray, Any]):
         if self._functions.one_step:
             earned = self._reward(self._next - 1, np.asarray(action))
             if earned != earned:
-                raise UserError(f"an action is {action}, which gives no reward: it must be finite.")
+                _check_finite(np.asarray(action)[None])
             observation, self._observation = self._observation[0].copy(), None
             return observation, earned, True, False, {}
         after, reward, terminations = self._functions.step(
             self._observation, np.asarray(action)[None]
         )
+        if reward[0] != reward[0]:
+            _check_finite(np.asarray(action)[None])
         self._time += 1
         terminated = bool(terminations[0])
         truncated = not terminated and self._time >= self._functions.max_steps
@@ -159,9 +170,7 @@ class SyntheticVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             raise UserError(f"there are {number} actions for {self.num_envs} environments.")
         after, rewards, terminated = self._functions.step(self._observations, actions)
         if np.isnan(rewards).any():
-            raise UserError(
-                f"an action is {actions[np.isnan(rewards)][0]}, which gives no reward: it must be finite."
-            )
+            _check_finite(actions)
         self._times += 1
         truncated = ~terminated & (self._times >= self._functions.max_steps)
         rewards = rewards.astype(np.float64)

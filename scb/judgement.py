@@ -9,12 +9,13 @@ from gymnax.environments import environment
 from scb.agents.spec import AgentSpec, algorithms_for, bandit_agent
 from scb.console import console
 from scb.environments.registry import environment_spec
-from scb.environments.synthetic import BanditConfig, SyntheticBandit, Weights, bandit_for
+from scb.environments.synthetic import SyntheticBandit, Weights
 from scb.environments.synthetic_mdp import SyntheticMDP
 from scb.errors import UserError
 from scb.measurement import MODE, SAMPLED, Agents, Place, as_random, measure
 from scb.rows import Rows, pivot
 from scb.seeds import VALIDATING
+from scb.spaces import shapes
 from scb.statistics import estimate
 
 EPISODES, BRAX_EPISODES = 50, 5  # of each agent that judges a bandit; Brax's physics are slow
@@ -27,11 +28,9 @@ def check_fits(
     environment_name: str,
 ) -> None:
     """Raises a UserError where a bandit has other observation or action shapes than an environment."""
-    other = bandit_for(env, env_params, BanditConfig(), environment_name)
     ours, theirs = (
-        f"{b.observation_size} observations and {b.num_actions} "
-        + ("discrete actions" if b.discrete else "action dimensions")
-        for b in (bandit, other)
+        shapes(e.observation_space(params), e.action_space(params))
+        for e, params in ((bandit, None), (env, env_params))
     )
     if ours != theirs:
         raise UserError(

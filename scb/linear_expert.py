@@ -6,7 +6,6 @@ search's fitness: else it finds to stand still. The same search finds the one ac
 throughout, which is all that humanoidstandup asks for.
 """
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,7 +21,7 @@ from jax.tree_util import Partial
 from jax.typing import ArrayLike
 from rich.console import Console
 
-from scb.agents.agent import AgentConfig, clip_to_space, scale_to_space
+from scb.agents.agent import AgentConfig
 from scb.agents.networks import MLP
 from scb.agents.normalization import RunningStatistics, merge_statistics, normalize
 from scb.console import Progress, progress_console
@@ -32,6 +31,7 @@ from scb.evolution import map_population
 from scb.experts import EPISODES, Expert, judged
 from scb.keys import key_at, named_key, split_key
 from scb.runs import Stopwatch, continued
+from scb.spaces import action_size, clip_to_space, flat_size, scale_to_space
 
 START_GENERATIONS = 20  # after which one of several searches goes on
 
@@ -174,8 +174,8 @@ class _LinearSearch:
         self._env, self._params, self._key = env, env_params, key
         self._config, self._bonus, self._worth = config, bonus, worth
         self._space = env.action_space(env_params)
-        self._size = int(np.prod(env.observation_space(env_params).shape))
-        actions = int(np.prod(self._space.shape))
+        self._size = flat_size(env.observation_space(env_params))
+        actions = action_size(self._space)
         self._zero = {"bias": jnp.zeros(actions)}
         if not config.constant:
             self._zero["matrix"] = jnp.zeros((self._size, actions))
@@ -349,7 +349,7 @@ def erring(
     """
     if isinstance(scale, float | int) and scale == 0:
         return policy
-    network = MLP(AgentConfig.hidden_sizes, math.prod(space.shape), AgentConfig.activation)
+    network = MLP(AgentConfig.hidden_sizes, action_size(space), AgentConfig.activation)
     variables = network.init(named_key(key, "errors"), jnp.zeros(size))
     half = scale * (space.high - space.low) / 2
 

@@ -153,10 +153,7 @@ class Agents:
         """One agent a seed, with the specification's own hyperparameters."""
         check_seeds(seeds)
         keys = jax.vmap(root_key)(np.asarray(seeds, np.uint32))
-        hyperparameters = jax.tree.map(
-            lambda x: jnp.full((len(seeds), *np.shape(x)), x), spec.hyperparameters
-        )
-        return cls([(seed, 0) for seed in seeds], keys, hyperparameters)
+        return cls([(seed, 0) for seed in seeds], keys, spec.repeated(len(seeds)))
 
     @classmethod
     def drawn_from(cls, spec: AgentSpec, seed: int, number: int) -> "Agents":
@@ -256,6 +253,9 @@ def measure(
         "agent": {n: getattr(spec, n) for n in ("config", "hyperparameters", "lists")},
         "trained_in": params[0],
         "judged_in": params[1],
+        "physics": train_in.backend,
+        # Drawn agents share the values of lists out: of another number each has others.
+        "drawn": len(agents.names) if agents.drawn else None,
         "points": points,
         "episodes": episodes,
         "actions": list(actions),

@@ -8,16 +8,15 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from evosax.algorithms import SNES
 from flax import linen as nn
 from gymnax.environments import environment, spaces
 
 from scb.agents import networks
-from scb.agents.agent import clip_to_space, scale_to_space
 from scb.errors import at_least
 from scb.evaluation import Policy, evaluate
 from scb.keys import split_key
+from scb.spaces import action_size, clip_to_space, flat_size, scale_to_space
 
 
 @dataclass(frozen=True)
@@ -46,9 +45,8 @@ def policy_network(
     space: spaces.Box | spaces.Discrete, hidden_sizes: tuple[int, ...], activation: str
 ) -> nn.Module:
     """A network of one number for each discrete action, or of a continuous action squashed to [-1, 1]."""
-    if isinstance(space, spaces.Discrete):
-        return networks.QNetwork(int(space.n), hidden_sizes, activation)
-    return networks.DeterministicPolicy(int(np.prod(space.shape)), hidden_sizes, activation)
+    of = networks.QNetwork if isinstance(space, spaces.Discrete) else networks.DeterministicPolicy
+    return of(action_size(space), hidden_sizes, activation)
 
 
 def network_action(outputs: jax.Array, space: spaces.Box | spaces.Discrete) -> jax.Array:
@@ -77,7 +75,7 @@ def evolve_policy(
     space = env.action_space(env_params)
     # Any: flax types `apply` as a union with mutated collections, which these never have.
     network: Any = policy_network(space, config.hidden_sizes, config.activation)
-    size = int(np.prod(env.observation_space(env_params).shape))
+    size = flat_size(env.observation_space(env_params))
 
     def policy_of(weights: Any) -> Policy:
         return lambda observation, _: network_action(

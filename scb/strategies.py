@@ -21,8 +21,9 @@ with unstarted():
 if TYPE_CHECKING:
     from scb.evolution import EvolutionConfig
 
-# These take constructor arguments of their own that no common configuration can supply.
-_UNSUPPORTED = {"RandomSearch", "SV_CMA_ES", "SV_Open_ES"}
+# These take constructor arguments of their own that no common configuration can supply; gradientless
+# descent draws within radii of its own, whatever sigma is.
+_UNSUPPORTED = {"RandomSearch", "SV_CMA_ES", "SV_Open_ES", "GradientlessDescent"}
 # These estimate a gradient and hand it to an optimiser; the others' update rules set their own
 # step.
 _GRADIENT_ESTIMATING = {

@@ -21,7 +21,6 @@ from scb.agents.spec import (
     check_algorithms,
     environment_agent,
     has_values_for,
-    kind_of_actions,
 )
 from scb.agents.tables import WARM_START
 from scb.aggregation import Learned, Learners, best_round
@@ -37,6 +36,7 @@ from scb.keys import named_key, split_key
 from scb.linear_expert import LinearSearchConfig, Worth, search_linear_expert
 from scb.measurement import Place
 from scb.runs import Stopwatch
+from scb.spaces import kind_of_actions
 
 PUPILS_EPISODES = 3  # by which each of an expert's pupils is judged
 

@@ -5,7 +5,6 @@ An agent is static configuration; its hyperparameters are traced numbers. `init`
 the caller.
 """
 
-import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, fields
@@ -13,8 +12,9 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
-from gymnax.environments import environment, spaces
+from gymnax.environments import environment
 from jax.typing import ArrayLike
 
 from scb.agents import networks
@@ -22,6 +22,7 @@ from scb.agents.normalization import normalize
 from scb.errors import UserError, at_least, one_of
 from scb.evaluation import Episodes, evaluate
 from scb.keys import split_key
+from scb.spaces import clip_to_space, flat_size, shapes
 
 
 @dataclass(frozen=True)
@@ -43,7 +44,17 @@ class AgentConfig(ABC):
     normalize_observations: bool = False
 
     def __post_init__(self) -> None:
-        at_least(1, self, *(f.name for f in fields(self) if type(getattr(self, f.name)) is int))
+        counts = {f.name: getattr(self, f.name) for f in fields(self) if f.type is int}
+        sizes = self.hidden_sizes
+        if not isinstance(sizes, tuple):
+            raise UserError(f"hidden_sizes is {sizes!r}: give a tuple of one size a layer.")
+        for name, value in {
+            **counts,
+            **{f"hidden_sizes[{i}]": x for i, x in enumerate(sizes)},
+        }.items():
+            if not isinstance(value, int | np.integer) or isinstance(value, bool):
+                raise UserError(f"{name} is {value!r}: it must be a whole number.")
+            at_least(1, **{name: int(value)})
         one_of("activation", self.activation, networks.ACTIVATIONS)
 
     @property
@@ -74,10 +85,10 @@ class Agent(ABC):
     config: AgentConfig
 
     def __post_init__(self) -> None:
-        if not hasattr(self.env, "step_env"):
+        if not isinstance(self.env, environment.Environment):
             raise UserError(
                 f"the environment is a {type(self.env).__name__}: give a gymnax 1.x environment, such as the first of "
-                "scb.make(NAME)."
+                "scb.make(NAME), and make a subclass of one for what a wrapper would do."
             )
 
     @property
@@ -194,16 +205,36 @@ class Agent(ABC):
           env: where the episodes are; None for the agent's environment. In another, the agent's actions are
             scaled to the bounds of its own environment with its default parameters.
           env_params: None for the environment's default parameters.
+
+        Raises:
+          UserError: the other environment has other observations or actions.
         """
         env = self.env if env is None else env
         env_params = env.default_params if env_params is None else env_params
-        own_params = env_params if env is self.env else None
+        own_params = env_params
+        if env is not self.env:
+            own_params = self._default_params()
+            (name, ours), (other, theirs) = (
+                (e.name, shapes(e.observation_space(params), e.action_space(params)))
+                for e, params in ((self.env, own_params), (env, env_params))
+            )
+            if ours != theirs:
+                raise UserError(
+                    f"{name} has {ours}, {other} has {theirs}: evaluate an agent where these are the same."
+                )
 
         def policy(observation: jax.Array, key: jax.Array) -> jax.Array:
             action = self.choose(state, jnp.ravel(observation), key, own_params, mode)
             return clip_to_space(action, env.action_space(env_params))
 
         return evaluate(env, env_params, policy, key, num_episodes, horizon)
+
+    def _default_params(self) -> Any:
+        """Of the agent's environment; None of a synthetic one without weights, whose spaces depend on none."""
+        try:
+            return self.env.default_params
+        except UserError:
+            return None
 
     def _inputs(self, state: Any, observation: jax.Array) -> jax.Array:
         """[..., O] what the networks are given of an observation."""
@@ -213,14 +244,7 @@ class Agent(ABC):
 
     def observation_size(self, env_params: Any) -> int:
         """Of the flattened observation."""
-        return math.prod(self.env.observation_space(env_params).shape)
-
-
-def clip_to_space(action: jax.Array, space: spaces.Box | spaces.Discrete) -> jax.Array:
-    """A continuous action within the space's bounds and of its shape; a discrete one as it is."""
-    if isinstance(space, spaces.Discrete):
-        return action
-    return jnp.clip(jnp.reshape(action, space.shape), space.low, space.high)
+        return flat_size(self.env.observation_space(env_params))
 
 
 def clipped_adam(hyperparameters: Any, eps: float = 1e-8) -> optax.GradientTransformation:
@@ -229,21 +253,6 @@ def clipped_adam(hyperparameters: Any, eps: float = 1e-8) -> optax.GradientTrans
         optax.clip_by_global_norm(hyperparameters.max_grad_norm),
         optax.adam(hyperparameters.learning_rate, eps=eps),
     )
-
-
-def flat_bounds(space: spaces.Box) -> tuple[jax.Array, jax.Array]:
-    """[A], [A] the lower and upper bounds of the flattened space."""
-    low, high = (
-        jnp.ravel(jnp.broadcast_to(jnp.asarray(bound, jnp.float32), space.shape))
-        for bound in (space.low, space.high)
-    )
-    return low, high
-
-
-def scale_to_space(squashed: jax.Array, space: spaces.Box) -> jax.Array:
-    """[..., A] in [-1, 1] -> [..., A] between the bounds of the flattened action."""
-    low, high = flat_bounds(space)
-    return low + (squashed + 1.0) * 0.5 * (high - low)
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,7 @@ from scb.agents.off_policy import (
     target_values,
 )
 from scb.keys import split_key
+from scb.spaces import action_size
 
 
 @dataclass(frozen=True)
@@ -66,7 +67,9 @@ class DQN(OffPolicyAgent):
     def _network(self, env_params: Any) -> Any:
         space = self.env.action_space(env_params)
         require_discrete("dqn", space, True)
-        return networks.QNetwork(space.n, self.config.hidden_sizes, self.config.activation)
+        return networks.QNetwork(
+            action_size(space), self.config.hidden_sizes, self.config.activation
+        )
 
     def init_params(self, key: jax.Array, env_params: Any) -> dict[str, Any]:
         observation = jnp.zeros(self.observation_size(env_params))

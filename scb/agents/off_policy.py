@@ -17,10 +17,11 @@ from gymnax.environments import spaces
 from jax.typing import ArrayLike
 
 from scb.agents import replay
-from scb.agents.agent import Agent, AgentConfig, clip_to_space, clipped_adam
+from scb.agents.agent import Agent, AgentConfig, clipped_adam
 from scb.agents.normalization import RunningStatistics, update_statistics
 from scb.errors import UserError
 from scb.keys import key_at, split_key
+from scb.spaces import clip_to_space
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from gymnax.environments import spaces
 from jax.typing import ArrayLike
 
 from scb.agents import networks
-from scb.agents.agent import Algorithm, scale_to_space
+from scb.agents.agent import Algorithm
 from scb.agents.off_policy import (
     Learner,
     Moment,
@@ -25,6 +25,7 @@ from scb.agents.off_policy import (
     target_values,
 )
 from scb.keys import split_key
+from scb.spaces import action_size, scale_to_space
 
 
 @dataclass(frozen=True)
@@ -63,9 +64,7 @@ class SAC(OffPolicyAgent):
 
     def _space(self, env_params: Any) -> tuple[bool, int]:
         space = self.env.action_space(env_params)
-        if isinstance(space, spaces.Discrete):
-            return True, int(space.n)
-        return False, int(np.prod(space.shape))
+        return isinstance(space, spaces.Discrete), action_size(space)
 
     def _networks(self, env_params: Any) -> tuple[Any, Any]:
         # Any: flax types `apply` as a union with mutated collections, which these never have.

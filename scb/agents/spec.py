@@ -19,11 +19,20 @@ from scb.curriculum import with_limit
 from scb.environments.registry import environment_spec
 from scb.errors import UserError, at_least, one_of
 from scb.keys import split_key
+from scb.spaces import kind_of_actions
 
 # Of 32 bits, which is what an agent calculates with.
 _LARGEST = float(jnp.finfo(jnp.float32).max)
 # What is a factor or a share, of which more than 1 makes no sense.
-_SHARES = ("discount", "gae_lambda", "polyak", "epsilon_start", "epsilon_end", "epsilon_decay")
+_SHARES = (
+    "discount",
+    "gae_lambda",
+    "polyak",
+    "epsilon_start",
+    "epsilon_end",
+    "epsilon_decay",
+    "target_entropy_ratio",
+)
 # {name: its tables, with the algorithm itself}. In the order that lists and pages name them in.
 ALGORITHMS: dict[str, Tables] = {tables.algorithm.name: tables for tables in TABLES}
 
@@ -92,14 +101,17 @@ class AgentSpec:
             name: deal(k, values)
             for k, (name, values) in zip(keys, sorted(self.lists.items()), strict=True)
         }
-        repeated = jax.tree.map(lambda x: jnp.full(number, x), self.hyperparameters)
-        return repeated.replace(**drawn)
+        return self.repeated(number).replace(**drawn)
+
+    def repeated(self, number: int) -> Any:
+        """The hyperparameters of `number` agents that all have these, every leaf [N, ...]."""
+        return jax.tree.map(lambda x: jnp.full((number, *jnp.shape(x)), x), self.hyperparameters)
 
     def with_values(self, **values: Any) -> "AgentSpec":
         """With other values of static or traced fields; those that are None stay as they are.
 
         Raises:
-          UserError: an unknown field, or a negative or infinite number.
+          UserError: an unknown field, or a number that an agent cannot take.
         """
         values = {name: value for name, value in values.items() if value is not None}
         static, traced = ([f.name for f in fields(x)] for x in (self.config, self.hyperparameters))
@@ -108,8 +120,8 @@ class AgentSpec:
                 raise UserError(
                     f"{self.algorithm} has no {name}: known are {', '.join((*static, *traced))}."
                 )
-            if isinstance(value, int | float):
-                at_least(0, **{name: value})
+            if name in traced and isinstance(value, int | float):
+                check_value(name, value)
         return replace(
             self,
             config=replace(self.config, **{k: v for k, v in values.items() if k in static}),
@@ -196,11 +208,6 @@ def tables_of(algorithm: str) -> Tables:
     return ALGORITHMS[algorithm]
 
 
-def kind_of_actions(space: spaces.Box | spaces.Discrete) -> str:
-    """Either "discrete" or "continuous"."""
-    return "discrete" if isinstance(space, spaces.Discrete) else "continuous"
-
-
 def algorithms_for(space: spaces.Box | spaces.Discrete | None = None) -> tuple[str, ...]:
     """The inner loop's algorithms where none are named, for an action space or for any."""
     return tuple(
@@ -237,15 +244,19 @@ def check_lists(lists: Lists, hyperparameters: Any) -> None:
                 f"{name} has {values!r} for a list of values: give one or more numbers."
             )
         for value in values:
-            number = isinstance(value, int | float) and not isinstance(value, bool)
-            if not number or not abs(value) <= _LARGEST:
-                raise UserError(
-                    f"{name} has the value {value!r}, which is no number that an agent can take: give finite "
-                    "numbers only."
-                )
-            if value < 0 or (name in _SHARES and value > 1):
-                allowed = "between 0 and 1" if name in _SHARES else "0 or larger"
-                raise UserError(f"{name} has the value {value!r}: it must be {allowed}.")
+            check_value(name, value)
+
+
+def check_value(name: str, value: Any) -> None:
+    """Raises a UserError for a value that the hyperparameter cannot have."""
+    number = isinstance(value, int | float) and not isinstance(value, bool)
+    if not number or not abs(value) <= _LARGEST:
+        raise UserError(
+            f"{name} has the value {value!r}, which is no number that an agent can take: give finite numbers only."
+        )
+    if value < 0 or (name in _SHARES and value > 1):
+        allowed = "between 0 and 1" if name in _SHARES else "0 or larger"
+        raise UserError(f"{name} has the value {value!r}: it must be {allowed}.")
 
 
 @cache

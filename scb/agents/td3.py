@@ -5,12 +5,11 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from flax import struct
 from jax.typing import ArrayLike
 
 from scb.agents import networks
-from scb.agents.agent import Algorithm, scale_to_space
+from scb.agents.agent import Algorithm
 from scb.agents.off_policy import (
     Learner,
     Moment,
@@ -22,6 +21,7 @@ from scb.agents.off_policy import (
     target_values,
 )
 from scb.keys import split_key
+from scb.spaces import action_size, scale_to_space
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,7 @@ class TD3(OffPolicyAgent):
         # and without bootstrapping it has no effect on anything.
         number = 1 if self.one_step else self.config.num_critics
         critics = networks.stacked(networks.Critic, number)(*shape)
-        return networks.DeterministicPolicy(int(np.prod(space.shape)), *shape), critics
+        return networks.DeterministicPolicy(action_size(space), *shape), critics
 
     def init_params(self, key: jax.Array, env_params: Any) -> dict[str, Any]:
         policy, critics = self._networks(env_params)

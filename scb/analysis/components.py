@@ -17,7 +17,6 @@ from gymnax.environments import environment, spaces
 from jax.typing import ArrayLike
 
 from scb.agents import networks
-from scb.agents.agent import clip_to_space, scale_to_space
 from scb.agents.ppo import PPOConfig
 from scb.agents.sac import SAC
 from scb.agents.spec import environment_agent
@@ -26,6 +25,7 @@ from scb.evaluation import Policy, evaluate
 from scb.experts import best_agent
 from scb.keys import root_key, split_key
 from scb.measurement import Judge
+from scb.spaces import action_size, clip_to_space, scale_to_space
 
 Reward = Callable[[jax.Array, jax.Array], jax.Array]  # ([O] observation, action) -> []
 
@@ -147,12 +147,9 @@ def clone(
     Returns:
       The trained policy's most likely actions.
     """
-    discrete, shape = isinstance(space, spaces.Discrete), (config.hidden_sizes, config.activation)
-    network: Any = (
-        networks.CategoricalPolicy(int(space.n), *shape)
-        if isinstance(space, spaces.Discrete)
-        else networks.SquashedGaussianPolicy(int(np.prod(space.shape)), *shape)
-    )
+    discrete = isinstance(space, spaces.Discrete)
+    of: Any = networks.CategoricalPolicy if discrete else networks.SquashedGaussianPolicy
+    network = of(action_size(space), config.hidden_sizes, config.activation)
     optimizer = optax.adam(learning_rate)
 
     def distribution(weights: Any, observation: jax.Array) -> distrax.Distribution:

@@ -10,7 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 import tyro
 
-from scb.agents.agent import flat_bounds
 from scb.analysis.importance import reward_variance
 from scb.analysis.optimal_actions import first_action, optimal_actions, optimal_policy
 from scb.analysis.planes import observation_names, plane_for
@@ -23,6 +22,7 @@ from scb.files import make_folder, write_json
 from scb.judgement import evaluation_place
 from scb.keys import root_key, split_key
 from scb.measurement import Place
+from scb.spaces import flat_bounds
 from scb.statistics import estimate
 
 STATES = 2000  # of either distribution, as in the paper

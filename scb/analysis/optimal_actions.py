@@ -14,11 +14,11 @@ import numpy as np
 import optax
 from gymnax.environments import spaces
 
-from scb.agents.agent import clip_to_space, flat_bounds
 from scb.environments.synthetic import BanditParams, SyntheticBandit
 from scb.errors import UserError, one_of
 from scb.evaluation import Policy
 from scb.keys import root_key
+from scb.spaces import action_size, clip_to_space, flat_bounds
 
 METHODS = ("gradient", "grid")
 GRID_POINTS = 101  # in each dimension of the action
@@ -72,14 +72,14 @@ def first_action(
 ) -> tuple[int | None, tuple[float, float] | None]:
     """What a map of actions is drawn with: (number of discrete actions, None), or (None, bounds of the first one)."""
     if isinstance(space, spaces.Discrete):
-        return int(space.n), None
+        return action_size(space), None
     low, high = flat_bounds(space)
     return None, (float(low[0]), float(high[0]))
 
 
 def _grid(space: spaces.Box) -> jax.Array:
     """[N, ...] every combination of evenly spaced values."""
-    low, high = (np.asarray(x) for x in flat_bounds(space))
+    low, high = flat_bounds(space, np)
     number = GRID_POINTS**low.size
     if number > LARGEST_GRID:
         raise UserError(

@@ -12,6 +12,7 @@ from scb.environments.synthetic import SyntheticBandit
 from scb.environments.synthetic_mdp import SyntheticMDP
 from scb.errors import UserError
 from scb.keys import root_key, split_key
+from scb.spaces import flat_bounds
 
 Array: TypeAlias = np.ndarray
 Generator: TypeAlias = np.random.Generator
@@ -105,8 +106,9 @@ class InNumpy:
         """[number, O] first observations of episodes."""
         if self._starts is None:
             return self._networks["initial_state"](self._draw(rng, number, self._latent_size))
-        # Of the environment that it stands for, which is JAX's.
-        return np.array(self._starts(split_key(root_key(int(rng.integers(2**32))), number)))
+        # Of the environment that it stands for, which is JAX's: compiled for powers of two, not for every number.
+        keys = split_key(root_key(int(rng.integers(2**32))), 1 << (number - 1).bit_length())
+        return np.array(self._starts(keys))[:number]
 
     def rewards_of(self, contexts: Array) -> Callable[[int, Any], float]:
         """[B, O] contexts of a bandit -> the reward of an action in a row of them, but for the action computed now."""
@@ -171,9 +173,7 @@ def _encoding(space: spaces.Box | spaces.Discrete) -> Callable[[Array], Array]:
             return choices[action]
 
         return one_hot
-    low, high = (
-        np.broadcast_to(np.asarray(x, np.float32), space.shape) for x in (space.low, space.high)
-    )
+    low, high = (x.reshape(space.shape) for x in flat_bounds(space, np))
 
     # minimum and maximum are quicker than clip, of which there is one a step.
     def clipped(action: Array) -> Array:

@@ -6,6 +6,7 @@ settings for is trained with general ones.
 """
 
 from collections.abc import Iterable
+from pathlib import Path
 from typing import Any
 
 from scb.environments.spec import EnvironmentSpec, Family, Made
@@ -29,7 +30,7 @@ def environment_names() -> list[str]:
     return list(dict.fromkeys(name for family in _FAMILIES.values() for name in family.names()))
 
 
-def environment_spec(name: str) -> EnvironmentSpec:
+def environment_spec(name: str | Path) -> EnvironmentSpec:
     """What is known of an environment.
 
     Args:
@@ -39,6 +40,7 @@ def environment_spec(name: str) -> EnvironmentSpec:
     Raises:
       UserError: unknown name (with near matches), or a file that is none of these.
     """
+    name = str(name)
     for family in _FAMILIES.values():
         if family.owns(name):
             return family.spec(name)
@@ -65,7 +67,7 @@ def check_backend(backend: str | None, names: Iterable[str]) -> None:
         )
 
 
-def make(name: str, backend: str | None = None, **arguments: Any) -> Made:
+def make(name: str | Path, backend: str | None = None, **arguments: Any) -> Made:
     """An environment and its default parameters.
 
     Args:

@@ -20,6 +20,7 @@ from gymnax.environments import environment
 
 from scb.evaluation import Policy, evaluate
 from scb.keys import root_key
+from scb.spaces import check_bounded
 
 # By backend; None where there is no choice of physics.
 Returns: TypeAlias = Mapping[str | None, float]
@@ -31,8 +32,9 @@ _TABLE = Path(__file__).with_name("returns.json")
 def random_return(
     env: environment.Environment[Any, Any], env_params: Any, episodes: int = EPISODES
 ) -> float:
-    """Mean return of uniformly random actions."""
+    """Mean return of uniformly random actions; a UserError where these have no bounds."""
     space = env.action_space(env_params)
+    check_bounded(space)
     return _mean_return(env, env_params, lambda _, key: space.sample(key), episodes)
 
 

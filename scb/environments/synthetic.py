@@ -6,7 +6,6 @@ context and action; the episode ends there. All weights live in the environment'
 population of bandits is `vmap` over `params` in one program.
 """
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, TypeAlias, TypeVar, cast
@@ -24,6 +23,7 @@ from scb.agents.networks import ACTIVATIONS, MLP
 from scb.environments.linear import PolicyDistance, units
 from scb.errors import UserError, at_least, one_of
 from scb.keys import root_key, split_key
+from scb.spaces import action_size, flat_bounds, flat_size
 
 Weights: TypeAlias = dict[str, dict[str, Any]]
 
@@ -140,7 +140,7 @@ class SyntheticEnvironment(environment.Environment[_State, _Params]):
         self._action_space = action_space
         self._name = name
         self.discrete = isinstance(action_space, spaces.Discrete)
-        self._action_size = encoded_size(action_space)
+        self._action_size = action_size(action_space)
         self.latent_size = config.latent_size or observation_size
         self._weights = weights
 
@@ -244,11 +244,7 @@ class SyntheticBandit(SyntheticEnvironment[BanditState, BanditParams]):
     @property
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """[A] lowest and [A] highest actions, of continuous ones."""
-        space = cast(spaces.Box, self._action_space)
-        low, high = (
-            np.broadcast_to(np.asarray(x), space.shape).ravel() for x in (space.low, space.high)
-        )
-        return low, high
+        return flat_bounds(cast(spaces.Box, self._action_space), np)
 
     def units(self, weights: Weights) -> Weights | None:
         """What a change of 1 is for each weight; None where it is 1 for all."""
@@ -304,21 +300,16 @@ class SyntheticBandit(SyntheticEnvironment[BanditState, BanditParams]):
         return jnp.std(self.sample_rewards(params, key, num_samples))
 
 
-def encoded_size(space: spaces.Box | spaces.Discrete) -> int:
-    """A, the size of `encode_action`."""
-    return int(space.n) if isinstance(space, spaces.Discrete) else max(1, math.prod(space.shape))
-
-
 def encode_action(action: ArrayLike, space: spaces.Box | spaces.Discrete) -> jax.Array:
     """An action as networks take it: [A], a discrete one one-hot, a continuous one clipped to its bounds."""
     if isinstance(space, spaces.Discrete):
-        return jax.nn.one_hot(action, encoded_size(space))
-    return jnp.reshape(jnp.clip(jnp.asarray(action), space.low, space.high), (encoded_size(space),))
+        return jax.nn.one_hot(action, action_size(space))
+    return jnp.reshape(jnp.clip(jnp.asarray(action), space.low, space.high), (action_size(space),))
 
 
 def bandit_for(
     env: environment.Environment[Any, Any], env_params: Any, config: BanditConfig, name: str
 ) -> SyntheticBandit:
     """An untrained bandit with the (flattened) observation and action shapes of an evaluation environment."""
-    observation_size = math.prod(env.observation_space(env_params).shape)
+    observation_size = flat_size(env.observation_space(env_params))
     return SyntheticBandit(observation_size, env.action_space(env_params), config, name=name)

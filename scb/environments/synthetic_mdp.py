@@ -12,7 +12,6 @@ number over long episodes (with tanh it is bounded by the last layer's weights):
 are passed on as they are, and evolution ranks such a candidate last.
 """
 
-import math
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -30,6 +29,7 @@ from scb.environments.synthetic import (
     bandit_for,
 )
 from scb.errors import UserError, at_least, one_of
+from scb.spaces import flat_size
 
 MDP_PARAMETERIZATIONS = ("T", "TI")
 PARAMETERIZATIONS = (*MDP_PARAMETERIZATIONS, "I")
@@ -122,7 +122,7 @@ class SyntheticMDP(SyntheticEnvironment[MDPState, MDPParams]):
                 "T, which starts in its start states, and none to TI."
             )
         if self.env is not None:
-            size = math.prod(self.env.observation_space(self.env_params).shape)
+            size = flat_size(self.env.observation_space(self.env_params))
             if size != self.observation_size:
                 raise UserError(
                     f"{self.name!r} has observations of {self.observation_size} entries and "
@@ -214,7 +214,7 @@ def synthetic_for(
     if max_steps is None:
         max_steps = int(env_params.max_steps_in_episode)
     mdp_config = MDPConfig(*layers, parameterization=parameterization, max_steps=max_steps)
-    observation_size = math.prod(env.observation_space(env_params).shape)
+    observation_size = flat_size(env.observation_space(env_params))
     start = {"env": env, "env_params": env_params} if parameterization == "T" else {}
     return SyntheticMDP(
         observation_size, env.action_space(env_params), mdp_config, name=name, **start

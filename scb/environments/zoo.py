@@ -23,6 +23,7 @@ from scb.environments.spec import BANDIT, SYNTHETIC_MDP, Family, Made
 from scb.environments.synthetic import BanditConfig, SyntheticBandit, Weights
 from scb.environments.synthetic_mdp import MDPConfig, SyntheticMDP
 from scb.errors import UserError, unknown_name
+from scb.spaces import flat_bounds
 
 PREFIX = "Synthetic-"
 _ZOO = Path(__file__).parents[1] / "zoo"
@@ -186,10 +187,7 @@ def space_description(space: spaces.Box | spaces.Discrete) -> dict[str, Any]:
     """An action space as JSON."""
     if isinstance(space, spaces.Discrete):
         return {"type": "discrete", "n": int(space.n)}
-    low, high = (
-        np.broadcast_to(np.asarray(x, np.float32), space.shape).tolist()
-        for x in (space.low, space.high)
-    )
+    low, high = (x.reshape(space.shape).tolist() for x in flat_bounds(space, np))
     return {"type": "box", "shape": list(space.shape), "low": low, "high": high}
 
 

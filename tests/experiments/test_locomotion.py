@@ -158,8 +158,7 @@ def test_only_agents_of_the_same_seeds_are_compared():
 
 def test_the_width_of_a_policy_is_read_off_its_entropy():
     # At the end (50 + seed) / 50 nats more than three joints of deviation 1 have.
-    first, last = module.widths(curves("ppo", range(10), 50.0))
-    assert first == pytest.approx(1.0, abs=1e-3)
+    last = module.width(curves("ppo", range(10), 50.0))
     assert last == pytest.approx(np.exp(np.mean(50 + np.arange(10)) / 50 / 3), rel=1e-3)
 
 

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,8 +12,10 @@ import lpo
 from experiments import robustness as module
 from experiments.claims import FAILS, HOLDS
 from experiments.harness import packed
+from lpo.comparison import ppo_spec
 from lpo.objectives import load_objective
 from scb.environments.registry import environment_spec
+from scb.measurement import Agents
 from scb.seeds import REPORTING, VALIDATING
 
 KEY = "20 of num_epochs 4"
@@ -107,13 +110,25 @@ def test_all_objectives_meet_the_same_draws(tmp_path, monkeypatch):
                 *(getattr(x[-1].hyperparameters, name) for x in (first, second))
             )
     found = json.loads(out.read_text())["environments"]["CartPole-v1"]
-    assert found["learned_on"]["lpo-multi"] == ["Pendulum-v1", "CartPole-v1"]
+    assert found["learned_on"]["lpo-multi"] == ["CartPole-v1", "Pendulum-v1"]
     key = "2 of num_epochs 4, num_minibatches 4"
     # What ends in NaN counts as random actions.
     random = environment_spec("CartPole-v1").random_return()
     assert found["returns"]["ppo"][key] == packed([[random, 9.0]])[0]
     assert found["failed"]["ppo"][key] == 1
     assert load_objective("lpo-multi").name in found["returns"]
+
+
+@pytest.mark.parametrize("objective", [None, "dpo"])
+def test_a_part_trains_agents_with_the_draws_that_it_says(tmp_path, objective):
+    small = ppo_spec("CartPole-v1").with_values(total_steps=64, num_envs=2, num_steps=8)
+    spec = replace(small, lists={"drift": (0.1, 0.3), "learning_rate": (0.01, 0.001)})
+    drawn = Agents.drawn_from(spec, 20_000, 2)
+    of = None if objective is None else load_objective(objective)
+    found = module._trained("CartPole-v1", "some", "2 of", of, spec, drawn, tmp_path)
+    assert {x.split() and len(x.split()) for x in found["draws"]["2 of"].values()} == {2}
+    assert set(found["draws"]["2 of"]) == {"drift", "learning_rate"}
+    assert len(found["returns"]["some"]["2 of"].split()) == 2
 
 
 def test_validation_is_on_other_seeds_and_in_a_report_of_its_own(report, tmp_path, capsys):

@@ -7,9 +7,8 @@ import pytest
 
 from lpo import figures, suite, training_commands
 from lpo.comparison import Comparison, LearningCurves, learning_curves
-from lpo.objectives import load_objective
+from lpo.objectives import learned_in, load_objective
 from lpo.suite import RESAMPLES, SuiteScores, run_suite, suite_scores, suites
-from lpo.training_commands import learned_in
 from scb import plotting
 from scb.agents.ppo import PPOHyperparameters
 from scb.agents.spec import AgentSpec, environment_agent

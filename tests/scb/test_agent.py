@@ -58,9 +58,12 @@ class BoundedParams(CorridorParams):
 class BoundedCorridor(ContinuousCorridor):
     """Its parameters hold the bound of its actions, as Pendulum's do; they lie in [-bound, bound]."""
 
-    def action_space(self, params=None):
-        bound = BoundedParams().bound if params is None else params.bound
-        return spaces.Box(-bound, bound, (1,), jnp.float32)
+    @property
+    def default_params(self):
+        return BoundedParams()
+
+    def action_space(self, params):
+        return spaces.Box(-params.bound, params.bound, (1,), jnp.float32)
 
 
 def test_the_environment_of_the_evaluation_says_nothing_of_what_the_agents_actions_mean():

@@ -313,9 +313,12 @@ def test_other_values_take_the_place_of_a_settings_own():
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"policy_output_scale": -1.0}, "policy_output_scale is -1.0: it must be 0 or larger"),
-        ({"learning_rate": math.inf}, "learning_rate is inf: it must be 0 or larger, and finite"),
-        ({"discount": math.nan}, "discount is nan: it must be 0 or larger, and finite"),
+        (
+            {"policy_output_scale": -1.0},
+            "policy_output_scale has the value -1.0: it must be 0 or larger",
+        ),
+        ({"learning_rate": math.inf}, "learning_rate has the value inf, which is no number"),
+        ({"discount": math.nan}, "discount has the value nan, which is no number"),
         ({"polyak": 0.9}, "ppo has no polyak: known are num_envs, .*learning_rate"),
     ],
 )

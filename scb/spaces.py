@@ -1,0 +1,69 @@
+"""What is asked of gymnax's action and observation spaces: their kind, how many numbers, their bounds."""
+
+import math
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from gymnax.environments import spaces
+
+from scb.errors import UserError
+
+
+def kind_of_actions(space: spaces.Box | spaces.Discrete) -> str:
+    """Either "discrete" or "continuous"."""
+    return "discrete" if isinstance(space, spaces.Discrete) else "continuous"
+
+
+def action_size(space: spaces.Box | spaces.Discrete) -> int:
+    """How many discrete actions there are, or how many numbers a flattened action has."""
+    return int(space.n) if isinstance(space, spaces.Discrete) else math.prod(space.shape)
+
+
+def flat_size(space: spaces.Box | spaces.Discrete) -> int:
+    """How many numbers a flattened observation has; a discrete one is a single number."""
+    return math.prod(space.shape)
+
+
+def shapes(
+    observations: spaces.Box | spaces.Discrete, actions: spaces.Box | spaces.Discrete
+) -> str:
+    """What decides whether agents fit an environment, such as "4 observations and 2 discrete actions"."""
+    what = "discrete actions" if isinstance(actions, spaces.Discrete) else "action dimensions"
+    return f"{flat_size(observations)} observations and {action_size(actions)} {what}"
+
+
+def flat_bounds(space: spaces.Box, xp: Any = jnp) -> tuple[Any, Any]:
+    """[A], [A] the lower and upper bounds of the flattened space, as arrays of NumPy or of JAX."""
+    low, high = (
+        xp.ravel(xp.broadcast_to(xp.asarray(bound, xp.float32), space.shape))
+        for bound in (space.low, space.high)
+    )
+    return low, high
+
+
+def check_bounded(space: spaces.Box | spaces.Discrete) -> None:
+    """Raises a UserError where a continuous space has no bounds, between which actions could be drawn or scaled."""
+    if isinstance(space, spaces.Discrete):
+        return
+    for bound in (space.low, space.high):
+        if not isinstance(bound, jax.core.Tracer) and not np.isfinite(bound).all():
+            raise UserError(
+                f"an action's bound is {bound}: only PPO takes actions without bounds; give the environment finite "
+                "ones."
+            )
+
+
+def clip_to_space(action: jax.Array, space: spaces.Box | spaces.Discrete) -> jax.Array:
+    """A continuous action within the space's bounds and of its shape; a discrete one as it is."""
+    if isinstance(space, spaces.Discrete):
+        return action
+    return jnp.clip(jnp.reshape(action, space.shape), space.low, space.high)
+
+
+def scale_to_space(squashed: jax.Array, space: spaces.Box) -> jax.Array:
+    """[..., A] in [-1, 1] -> [..., A] between the bounds of the flattened action."""
+    check_bounded(space)
+    low, high = flat_bounds(space)
+    return low + (squashed + 1.0) * 0.5 * (high - low)
