@@ -16,11 +16,10 @@ import jinja2
 
 from lpo.certificate import LARGEST_KINK, Certificate
 from scb.plotting import ratio_text, thousands
+from scb.statistics import DECIDING
 
-Verdict = Literal["better", "worse", "undecided", "one seed", "not compared"]
+Verdict = Literal["better", "worse", "undecided", "few seeds", "not compared"]
 
-# Below this many seeds the bootstrap's intervals are too narrow (see `scb.statistics`).
-_FEW_SEEDS = 10
 _NAMES = {"ppo": "PPO's clip"}
 
 
@@ -97,7 +96,9 @@ def _sentence(name: str, environment: str, comparison: Mapping[str, Any]) -> Hea
     difference = comparison["paired_differences"][name]
     reference = _NAMES.get(comparison["reference"], comparison["reference"])
     verdict = _verdict(difference)
-    seeds = f"{difference['n']} paired seeds"
+    number = difference["n"]
+    seeds = "a single seed" if number == 1 else f"{number} paired seeds"
+    few = "One seed" if number == 1 else f"{number} seeds"
     opening, protocol = {
         "better": (f"{name} ends better than {reference}", f"{seeds}, 95 % interval"),
         "worse": (f"{name} ends worse than {reference}", f"{seeds}, 95 % interval"),
@@ -105,9 +106,9 @@ def _sentence(name: str, environment: str, comparison: Mapping[str, Any]) -> Hea
             f"No difference between {name} and {reference} could be shown",
             f"{seeds}; the 95 % interval includes zero",
         ),
-        "one seed": (
-            f"One seed cannot tell {name} from {reference}",
-            "a single seed, so no interval",
+        "few seeds": (
+            f"{few} cannot tell {name} from {reference}",
+            seeds + ("" if difference["low"] is None else ", 95 % interval, which is too narrow"),
         ),
     }[verdict]
     return Headline(
@@ -119,8 +120,8 @@ def _sentence(name: str, environment: str, comparison: Mapping[str, Any]) -> Hea
 
 
 def _verdict(difference: Mapping[str, Any]) -> Verdict:
-    if difference["low"] is None or difference["high"] is None:
-        return "one seed"
+    if difference["low"] is None or difference["n"] < DECIDING:
+        return "few seeds"
     if difference["low"] > 0:
         return "better"
     return "worse" if difference["high"] < 0 else "undecided"
@@ -257,7 +258,6 @@ def _comparison(name: str, comparison: Mapping[str, Any], learned: str) -> dict[
         "rows": _rows(comparison, learned),
         "seeds": _seeds(curves[0]["seeds"]),
         "steps": thousands(max(curve["steps"][-1] for curve in curves)),
-        "few_seeds": min(len(curve["seeds"]) for curve in curves) < _FEW_SEEDS,
         "backend": curves[0]["backend"],
         "standing": f"{curves[0].get('standing_still') or 0:g}",
         "moving": [_moving(c) for c in curves if c.get("above_standing_still") is not None],
@@ -273,7 +273,7 @@ def _whole(comparison: Mapping[str, Any]) -> dict[str, Any]:
         "steps": thousands(curves[0]["steps"][-1]),
         "backend": curves[0]["backend"],
         "agents": ", ".join(f"{name} {number}" for name, number in agents),
-        "few_seeds": min(len(curve["seeds"]) for curve in curves) < _FEW_SEEDS,
+        "few_seeds": min(len(curve["seeds"]) for curve in curves) < DECIDING,
     }
 
 

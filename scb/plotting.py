@@ -66,6 +66,8 @@ def estimate_row(
     below = offset_copy(axes.transData, axes.get_figure(root=True), y=-5, units="points")
     level = np.full(values.size, position)
     axes.plot(values, level, ".", color=color, alpha=0.4, markeredgewidth=0, transform=below)
+    # What is drawn with an offset does not count for the axes' limits, and outliers would be outside.
+    axes.update_datalim(np.column_stack([values, level]), updatey=False)
     axes.errorbar(
         found.value,
         position,

@@ -97,8 +97,13 @@ def test_claims_follow_the_figures(report):
     body = experiment.EXPERIMENT.block("body", report)
     assert "| 200 [200, 200] | 2 of 2 | 600000 | 400000 | 60 | 60 |" in body
     assert "| 200 [200, 200] | 0 of 2 | more than 800000 | 400000 | more than 80 |" in body
-    # 40 and 80 times with one agent each: two agents do not decide it. And 200 is less than standing still.
-    assert outcomes(report) == (["undecided", "holds"], ["does not hold"] * 2)
+    # Two agents each decide nothing, whatever they say. And 200 is less than standing still.
+    assert outcomes(report) == (["undecided", "undecided"], ["does not hold"] * 2)
+    curve = report["environments"]["hopper (generalized)"]["ppo"]
+    many = {**curve, "returns": curve["returns"] * 5}
+    report["environments"]["hopper (generalized)"]["ppo"] = many
+    assert outcomes(report)[0] == ["undecided", "holds"]
+    report["environments"]["hopper (generalized)"]["ppo"] = curve
     # Of two agents one gets there: the median is not that one's.
     report["environments"]["hopper (spring)"]["ppo"]["returns"][0] = [0.0, 0.0, 0.0]
     said = experiment.EXPERIMENT.block("verdict", report)
@@ -112,6 +117,8 @@ def test_the_uncertainty_of_a_level_is_that_of_its_steps(report):
     report["bandits"]["hopper (spring), ours"]["ppo"] = in_bandit
     body = experiment.EXPERIMENT.block("body", report)
     assert "| 200 [100, 300] | 2 of 2 | 600000 | 400000 | 60 | 40 |" in body
+    for trained in report["environments"].values():
+        trained["ppo"]["returns"] *= 5  # ten agents, of whom some decide
     assert outcomes(report)[0] == ["does not hold", "holds"]
 
 

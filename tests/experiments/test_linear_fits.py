@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from experiments import linear_fits as module
-from experiments.claims import FAILS, HOLDS, UNTESTED
+from experiments.claims import FAILS, HOLDS, UNDECIDED
 from experiments.harness import packed
 
 FIVE = range(20, 25)
@@ -46,7 +46,7 @@ def test_what_earns_agents_more_is_shown_by_five_searches():
     assert outcomes(report(*FIVE)) == [HOLDS] * 4
     # Errors earn less than noise in the same contexts, but more than noise had in contexts without jitter.
     assert outcomes(report(*FIVE, errors=500.0)) == [HOLDS, FAILS, HOLDS, HOLDS]
-    assert outcomes(report(*FIVE[:4])) == [UNTESTED] * 4
+    assert outcomes(report(*FIVE[:4])) == [UNDECIDED] * 4
 
 
 def test_searches_are_paired_by_seed_in_whatever_order_they_ended():

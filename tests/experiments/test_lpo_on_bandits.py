@@ -55,14 +55,14 @@ def report():
             "steps_to_judge": 1000,
         }
         for source, environment, number in (
-            ("bandit", "Synthetic-Pendulum-v1", 3),
+            ("bandit", "Synthetic-Pendulum-v1", 5),
             ("environment", "Pendulum-v1", 1),
         )
     }
     finals = {
         "ppo": [[-900.0, -800.0]],
         "dpo": [[-300.0, -200.0]],
-        "LPO (bandit)": [[-250.0, -150.0], [-260.0, -160.0], [-240.0, -140.0]],
+        "LPO (bandit)": [[-200.0 + x - 50.0, -200.0 + x + 50.0] for x in (0, -10, 10, -5, 5)],
         "LPO (environment)": [[-350.0, -250.0]],
     }
     table = {"protocol": "Two agents.", "seeds": [1, 2], "finals": finals, "areas": finals}
@@ -83,11 +83,11 @@ def report():
 
 def test_the_page_says_costs_returns_and_differences(report):
     page = module.EXPERIMENT.page(report)
-    assert "| Synthetic-Pendulum-v1 | 3 | 4 | 2 x 1 | 100 + 20 | 3.0 | 480 | 1,000 |" in page
+    assert "| Synthetic-Pendulum-v1 | 5 | 4 | 2 x 1 | 100 + 20 | 3.0 | 480 | 1,000 |" in page
     # (-850 of PPO, -200 of the pooled bandit's objectives.)
     assert "| ppo | −850 [" in page
     assert "| LPO (bandit) | −200 [" in page
-    assert "| ppo | +650 [" in page and "| LPO (environment) | +100 [" in page
+    assert "| ppo | +650 [" in page and "| LPO (environment) | +100 | " in page
     assert "The tuned clip is ppo-0.5: on other agents ppo −900, ppo-0.5 −400." in page
     (figure,) = module.EXPERIMENT.figures(report).values()
     assert len(figure.axes) == 3 + 2
@@ -106,7 +106,7 @@ def test_one_search_decides_nothing_and_searches_of_other_sizes_are_not_compared
     like = f"{place}: LPO (bandit) ends no lower than LPO (environment), after searches of one size"
     assert found[like] == "undecided"
     for table in report["evaluations"].values():
-        table["finals"]["LPO (environment)"] *= 2
+        table["finals"]["LPO (environment)"] *= 5
     assert outcomes()[like] == "holds"
     report["searches"]["bandit"]["settings"] |= {"population_size": 4}
     assert outcomes()[like] == "not tested at this size"

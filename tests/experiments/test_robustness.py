@@ -121,7 +121,8 @@ def test_all_objectives_meet_the_same_draws(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("objective", [None, "dpo"])
 def test_a_part_trains_agents_with_the_draws_that_it_says(tmp_path, objective):
-    small = ppo_spec("CartPole-v1").with_values(total_steps=64, num_envs=2, num_steps=8)
+    size = {"total_steps": 64, "num_envs": 2, "num_steps": 8, "num_minibatches": 2}
+    small = ppo_spec("CartPole-v1").with_values(**size)
     spec = replace(small, lists={"drift": (0.1, 0.3), "learning_rate": (0.01, 0.001)})
     drawn = Agents.drawn_from(spec, 20_000, 2)
     of = None if objective is None else load_objective(objective)
