@@ -203,36 +203,46 @@ def _ends(
 
 
 def draw(report: Mapping[str, Any]) -> Figure:
-    """A panel an environment: return after each number of steps, trained here and there."""
+    """A row an environment: return after each number of steps, and of what has one number each agent a dot."""
     shown = facts(report)
     tables = shown["tables"]
-    columns = min(2, len(tables))
-    rows = -(-len(tables) // columns)
-    figure = Figure(figsize=(plotting.WIDTH, 2.9 * rows))
-    panels = figure.subplots(rows, columns, squeeze=False).ravel()
-    for axes, (name, algorithms) in zip(panels, tables.items(), strict=False):
+    figure = Figure(figsize=(plotting.WIDTH, 3.1 * len(tables)))
+    panels = figure.subplots(len(tables), 2, squeeze=False, width_ratios=(3, 2))
+    for (curves, dots), (name, algorithms) in zip(panels, tables.items(), strict=True):
+        once = [x for x in algorithms if len(report["steps"][x]) == 1]
         for algorithm, places in algorithms.items():
+            color = COLORS[algorithm]
             for place, found in places.items():
-                steps, color = report["steps"][algorithm], COLORS[algorithm]
-                plotting.estimate_curve(
-                    axes, steps, found, color, LINES[place], marker=MARKERS[place]
-                )
+                if algorithm not in once:
+                    steps = report["steps"][algorithm]
+                    plotting.estimate_curve(
+                        curves, steps, found, color, LINES[place], marker=MARKERS[place]
+                    )
+                    continue
+                position = once.index(algorithm) + 0.4 * PLACES.index(place)
+                agents = report["agents"][name][algorithm][place]
+                earned = returns_of(agents, sorted(agents))[:, 0]
+                plotting.estimate_row(dots, position, earned, found[0], color)
         for label, level in (
             ("expert", shown["expert"][name].value),
             ("random", shown["random"][name]),
         ):
-            axes.axhline(level, color=plotting.GREY, linewidth=0.8, linestyle="--")
-            axes.annotate(label, (1.0, level), xycoords=("axes fraction", "data"), fontsize=7)
-        axes.set(title=name, xlabel="training steps", ylabel="return", xscale="log")
-        axes.xaxis.set_major_formatter(EngFormatter(sep=""))
-    for axes in panels[len(tables) :]:
-        axes.set_visible(False)
-    used = {algorithm for algorithms in tables.values() for algorithm in algorithms}
-    looks: dict[str, Mapping[str, Any]] = {
-        algorithm.upper(): {"color": color}
-        for algorithm, color in COLORS.items()
-        if algorithm in used
-    }
+            curves.axhline(level, color=plotting.GREY, linewidth=0.8, linestyle="--")
+            curves.annotate(label, (1.0, level), xycoords=("axes fraction", "data"), fontsize=7)
+        curves.set(title=name, xlabel="training steps", ylabel="return", xscale="log")
+        curves.xaxis.set_major_formatter(EngFormatter(sep=""))
+        dots.set_visible(bool(once))
+        if once:
+            after = thousands(report["steps"][once[0]][0])
+            dots.set(title=f"after {after} steps", xlabel="return, each agent a dot")
+            rows = [(i, x, j, p) for i, x in enumerate(once) for j, p in enumerate(PLACES)]
+            dots.set_yticks(
+                [i + 0.4 * j for i, _, j, _ in rows],
+                [f"{x.upper()}, {'bandit' if p == BANDIT else 'itself'}" for _, x, _, p in rows],
+            )
+            dots.set_ylim(len(once) - 0.3, -0.3)
+    used = [x for x in COLORS if any(x in algorithms for algorithms in tables.values())]
+    looks: dict[str, Mapping[str, Any]] = {x.upper(): {"color": COLORS[x]} for x in used}
     for place, line in LINES.items():
         looks[f"trained in the {place}"] = {
             "color": plotting.GREY,

@@ -66,7 +66,8 @@ class MetaTrainingConfig:
         environment).
       initial_scale: of the drift's random start, so that the search begins near what it corrects.
       drift: the settings of what is learned.
-      evolution: of the candidates.
+      evolution: of the candidates. Of several tasks `combine` should be "ranks", as it is on the command
+        line: their returns have different scales.
     """
 
     tasks: Annotated[
@@ -126,7 +127,8 @@ class MetaTrainingConfig:
             )
         if self.horizons and self.judgement.along:
             raise UserError(
-                f"fitness {self.fitness!r} needs trainings of one length: leave out the horizons, or use 'return'."
+                f"fitness {self.fitness!r} needs trainings of one length: take no horizons (--horizons None where "
+                "--temporal brings them), or the fitness 'return'."
             )
         for horizon in self.horizons:
             if not 0 < horizon < math.inf:

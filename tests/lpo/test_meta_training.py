@@ -487,7 +487,7 @@ def test_physics_go_to_the_environment_and_not_to_its_bandit(
         ({"horizons": (0.5, 0.0)}, "a horizon is 0.0: it must be larger than 0"),
         (
             {"horizons": (0.5,), "fitness": "area"},
-            "fitness 'area' needs trainings of one length: leave out the horizons",
+            "fitness 'area' needs trainings of one length: take no horizons",
         ),
         ({"agents_per_candidate": 0}, "agents_per_candidate is 0: it must be at least 1."),
         ({"evaluation_episodes": -1}, "evaluation_episodes is -1: it must be at least 1."),
