@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from flax import struct
 from gymnax.environments import spaces
+from gymnax.wrappers import StickyActionWrapper
 
 from lpo.objectives import load_objective
 from scb.agents.agent import Agent, AgentConfig, Algorithm
@@ -20,10 +21,11 @@ from scb.agents.tables import Row, Tables
 from scb.agents.td3 import TD3, TD3Config, TD3Hyperparameters
 from scb.cli import main
 from scb.discovery import BanditDiscovery, DiscoveryConfig
+from scb.environments.returns import random_return
 from scb.environments.synthetic import BanditConfig
 from scb.errors import UserError
 from scb.warm_start import WarmStartConfig
-from tests.scb.probes import ContinuousCorridor, CorridorParams
+from tests.scb.probes import ContinuousCorridor, Corridor, CorridorParams
 
 # -- what agents are made of
 # ------------------------------------------------------------
@@ -44,6 +46,41 @@ def test_what_is_no_environment_and_what_is_no_drift_are_told_apart_from_bugs():
     ):
         agent.init(jax.random.key(0), PPOHyperparameters(), params)
     agent.init(jax.random.key(0), PPOHyperparameters(drift=objective.parameters), params)
+
+
+def test_a_wrapper_is_refused_whose_step_an_evaluation_would_go_round():
+    env = StickyActionWrapper(Corridor(), 1.0)
+    with pytest.raises(UserError, match=r"StickyActionWrapper: .* make a subclass of one"):
+        PPO(env, PPOConfig())
+
+
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [
+        ({"total_steps": 1e4}, r"total_steps is 10000.0: it must be a whole number"),
+        ({"num_envs": np.int64(0)}, "num_envs is 0: it must be at least 1"),
+        ({"hidden_sizes": 64}, "hidden_sizes is 64: give a tuple of one size a layer"),
+        ({"hidden_sizes": (8, 0)}, r"hidden_sizes\[1\] is 0: it must be at least 1"),
+        ({"hidden_sizes": (8.0,)}, r"hidden_sizes\[0\] is 8.0: it must be a whole number"),
+    ],
+)
+def test_settings_that_no_agent_can_have_are_told(setting, message):
+    with pytest.raises(UserError, match=message):
+        TD3Config(**setting)
+
+
+class Unbounded(ContinuousCorridor):
+    def action_space(self, params=None):
+        return spaces.Box(-jnp.inf, jnp.inf, (1,), jnp.float32)
+
+
+def test_actions_without_bounds_are_for_ppo_alone():
+    env, key = Unbounded(), jax.random.key(0)
+    PPO(env, PPOConfig()).init(key, PPOHyperparameters(), env.default_params)
+    with pytest.raises(UserError, match="only PPO takes actions without bounds"):
+        TD3(env, TD3Config()).train(key, TD3Hyperparameters(), env.default_params)
+    with pytest.raises(UserError, match="only PPO takes actions without bounds"):
+        random_return(env, env.default_params, 2)
 
 
 # -- evaluation in another environment
@@ -80,6 +117,19 @@ def test_the_environment_of_the_evaluation_says_nothing_of_what_the_agents_actio
     assert np.ptp(squashed) > 0.1
     episodes = agent.evaluate(state, key, 1, other, other.default_params, mode=True)
     np.testing.assert_allclose(episodes.returns, np.sum(1 - (actions - 0.5) ** 2), rtol=1e-5)
+
+
+def test_an_environment_of_other_observations_or_actions_is_refused():
+    env, discrete = ContinuousCorridor(), Corridor()
+    agent = PPO(env, PPOConfig())
+    state = agent.init(jax.random.key(0), PPOHyperparameters(), env.default_params)
+    has = "has 3 observations and 1 action dimensions"
+    for other, theirs in (
+        (discrete, "3 observations and 2 discrete"),
+        (ContinuousCorridor(5), "5"),
+    ):
+        with pytest.raises(UserError, match=f"{has}, .* has {theirs}"):
+            agent.evaluate(state, jax.random.key(0), 1, other)
 
 
 # -- a new algorithm: its module and a row of the tables

@@ -266,6 +266,30 @@ def test_episodes_of_an_mdp_end_and_are_cut(file):
     assert set(lengths["truncated"]) == {3} and min(lengths["terminated"]) < 3
 
 
+def test_start_states_of_an_environment_are_compiled_for_few_numbers(file):
+    functions = SyntheticVectorEnv(file, 2)._functions
+    if functions._starts is None:
+        pytest.skip("start states of its own are NumPy's")
+    rng = np.random.default_rng
+    many = functions.start(rng(0), 13)
+    np.testing.assert_array_equal(functions.start(rng(0), 16)[:13], many)
+    for number in range(1, 17):
+        assert len(functions.start(rng(1), number)) == number
+    assert functions._starts._cache_size() <= 5  # 1, 2, 4, 8, 16
+
+
+def test_an_mdp_that_overflows_is_told_from_an_action_that_is_not_finite(file):
+    ours, one = SyntheticVectorEnv(file, 2), SyntheticEnv(file)
+    for env, action in ((ours, [[0.3], [0.3]]), (one, [0.3])):
+        env.reset(seed=0)
+        network = env._functions._networks["reward"]
+        network._bias = np.full_like(network._bias, np.nan)
+        env.step(np.array(action, np.float32))  # passed on, as in JAX
+        env.reset(seed=0)
+        with pytest.raises(UserError, match=r"an action is \[nan\], which gives no reward"):
+            env.step(np.array(action, np.float32) * np.nan)
+
+
 @pytest.mark.parametrize("mode", list(AutoresetMode))
 def test_a_vector_steps_and_resets_as_gymnasiums_own(file, mode):
     """Side by side with one copy an environment: all that doesn't depend on what is drawn is the same."""

@@ -313,6 +313,33 @@ def test_a_traced_number_of_iterations_trains_as_long(bandit):
     assert earned["a"].returns.shape == (2,)
 
 
+def test_agents_that_were_trained_under_other_physics_are_others(bandit, tmp_path):
+    """Rows say where agents are judged; where they trained is in their configuration."""
+
+    def trained(place):
+        rows = Rows(tmp_path / "rows.jsonl")
+        return measure(SPEC, place, bandit, agents=[0], episodes=5, rows=rows)
+
+    first = trained(replace(bandit, backend="spring"))
+    with pytest.raises(UserError, match=r"differs at physics \('spring' there, 'positional' now\)"):
+        trained(replace(bandit, backend="positional"))
+    assert trained(replace(bandit, backend="spring")) == first
+
+
+def test_draws_of_another_number_are_others(bandit, tmp_path):
+    # Agents share the values of a list out, so that the second of two is not the second of three.
+    spec = replace(SPEC, lists={"learning_rate": (0.03, 0.01, 0.003)})
+
+    def drawn(number):
+        agents = Agents.drawn_from(spec, 0, number)
+        rows = Rows(tmp_path / "rows.jsonl")
+        return measure(spec, bandit, agents=agents, episodes=5, rows=rows)
+
+    drawn(2)
+    with pytest.raises(UserError, match=r"differs at drawn \(2 there, 3 now\)"):
+        drawn(3)
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [

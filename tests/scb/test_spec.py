@@ -319,6 +319,7 @@ def test_other_values_take_the_place_of_a_settings_own():
         ),
         ({"learning_rate": math.inf}, "learning_rate has the value inf, which is no number"),
         ({"discount": math.nan}, "discount has the value nan, which is no number"),
+        ({"discount": 3.0}, "discount has the value 3.0: it must be between 0 and 1"),
         ({"polyak": 0.9}, "ppo has no polyak: known are num_envs, .*learning_rate"),
     ],
 )

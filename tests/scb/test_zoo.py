@@ -131,6 +131,7 @@ def test_a_foreign_file_is_refused(tmp_path):
 def test_a_bandit_opens_by_file_or_by_name(tmp_path):
     path, _ = saved(tmp_path, BANDITS["box"])
     assert open_bandit(str(path)).name == "Synthetic-Test"
+    assert scb.make(path)[0].name == "Synthetic-Test"
     with pytest.raises(UserError, match="unknown bandit 'Pendulum': did you mean Synthetic-P"):
         open_bandit("Pendulum")
 
