@@ -26,7 +26,7 @@ from scb.artefacts import machine_description, package_versions
 from scb.environments.registry import environment_spec
 from scb.environments.zoo import bandit_metadata
 from scb.errors import UserError, at_least
-from scb.evolution import map_population
+from scb.evolution import map_population, rank_failed_last
 from scb.keys import root_key, split_key
 from scb.measurement import Judge, check_seeds, train_and_judge
 from scb.objectives import families
@@ -138,7 +138,11 @@ def regime_fitness(
     """{objective: {fitness: [S]}} of agents trained in a regime with each, one a seed.
 
     Fitnesses go by their labels, in the order of `lpo.fitness.FITNESSES`; the backend is that of the environment
-    which the bandit stands for, where some of them judge.
+    which the bandit stands for, where some of them judge. What is no number, as of an agent that diverged, counts as
+    less than all that is.
+
+    Raises:
+      UserError: every agent diverged.
     """
     check_names(objectives)
     check_seeds(seeds)
@@ -161,8 +165,16 @@ def regime_fitness(
         )
         of_family = np.asarray(earned, np.float64).reshape(len(family), len(seeds), -1)
         for objective, of_it in zip(family, of_family, strict=True):
-            found[objective.name] = dict(zip(LABELS, of_it.T, strict=True))
-    return found
+            found[objective.name] = of_it
+    values = np.stack(list(found.values()))
+    if not np.isfinite(values).any(axis=(0, 1)).all():
+        raise UserError(f"every agent diverged in {regime}: lower its learning rate.")
+    flat = values.reshape(-1, len(LABELS))
+    ranked = np.stack([rank_failed_last(x) for x in flat.T], axis=1).reshape(values.shape)
+    return {
+        name: dict(zip(LABELS, of_it.T, strict=True))
+        for name, of_it in zip(found, ranked, strict=True)
+    }
 
 
 @lru_cache(maxsize=64)

@@ -214,7 +214,7 @@ def environment_steps(bandit: Mapping[str, int], environment: Mapping[str, int])
         axes.tick_params(axis="y", length=0)
         axes.grid(axis="y", visible=False)
         axes.xaxis.set_minor_formatter(NullFormatter())
-        axes.set_xlabel("environment steps of the whole meta-training (logarithmic)")
+        axes.set_xlabel("environment steps of all candidates of the meta-training (logarithmic)")
         figure_title(figure, "Cost of meta-training in environment steps")
         legend_below(figure, axes.get_legend_handles_labels(), columns=2)
     return figure

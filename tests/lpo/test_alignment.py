@@ -165,6 +165,18 @@ def test_agents_of_a_regime_are_judged_in_every_way():
     np.testing.assert_allclose(again["transfer"], fitness["transfer"][[2, 1]], rtol=1e-4)
 
 
+def test_an_agent_that_diverged_is_the_worst_and_all_of_them_are_an_error(monkeypatch):
+    ppo, seeds = known_drifts()[2], [1, 2, 3]
+    earned = np.arange(3.0)[:, None] + np.zeros(len(LABELS))
+    earned[2] = np.nan
+    monkeypatch.setattr(module, "_program", lambda *_: lambda *_: earned)
+    fitness = regime_fitness(TINY, [ppo], seeds)[ppo.name]["transfer"]
+    assert fitness[2] < fitness[0] < fitness[1] and np.isfinite(fitness[2])
+    earned[:] = np.nan
+    with pytest.raises(UserError, match=r"every agent diverged in .*: lower its learning rate"):
+        regime_fitness(TINY, [ppo], seeds)
+
+
 @pytest.mark.slow
 def test_regimes_that_differ_in_traced_numbers_share_a_program_and_nothing_else(monkeypatch):
     ppo, made = known_drifts()[2], []
