@@ -139,7 +139,7 @@ def draw(report: Mapping[str, Any]) -> Figure:
             step = min(number * entry["every"], entry["steps"])
             axes.set_title(f"step {step}", fontsize=8, fontweight="normal")
         row[0].set_title(f"{name}\nstep 0", fontsize=8)
-    plotting.figure_title(figure, "Agents trained in a bandit, in its environment")
+    plotting.figure_title(figure, "The best agent trained in each bandit, in its environment")
     return figure
 
 

@@ -125,7 +125,7 @@ def tiny(monkeypatch):
         timing = [json.dumps({"generation": i, "seconds": 2.0}) for i in range(len(METRICS))]
         (folder / "timing.jsonl").write_text("\n".join(timing))
         return replace(
-            load_objective("dpo"), metadata={"cost": {"environment_steps_validation": 7}}
+            load_objective("dpo"), metadata={"cost": {"environment_steps_judgements_training": 7}}
         )
 
     def compare(environment, objectives, seeds, spec, rows, points=15):
@@ -166,6 +166,7 @@ def test_what_a_report_has_is_not_measured_again(tiny, tmp_path):
     compared = ("ppo", "ppo-0.5", "dpo", *both)
     judged = [("Pendulum-v1", scale, *x) for scale in (1.0, 0.01) for x in (module.CLIPS, compared)]
     assert asked == ["bandit-0", "environment-0", *judged]
+    assert {entry["steps_to_judge"] for entry in report["searches"].values()} == {7}
     table = report["evaluations"]["Pendulum, small last layer"]
     assert table["finals"]["ppo-0.5"] == [[-3.0, -4.0]]
     assert table["finals"]["LPO (bandit)"] == [[-14.0, -15.0]]
