@@ -30,7 +30,7 @@ class Certificate:
       value_at_one: largest |f| at ratio 1 over all advantages.
       gradient_at_one: largest |df/dr| there.
       slope_at_0_001: largest |df/dr| at |r - 1| = 0.001. Not a condition, but a drift whose slope jumps
-        just outside its dead zone is one in name only: see `stalls`.
+        just outside its dead zone is one in name only.
       slope_at_0_01: the same at 0.01.
       kink: how much the penalty rises per unit of |log-ratio| around ratio 1 (at |r - 1| = 0.01), the
         mean over standard normal advantages. No condition either: but where the advantages of a
@@ -40,6 +40,7 @@ class Certificate:
       grid: what the grid was.
       by_construction: whether every drift of its family holds, so that `holds` says no more than that
         the weights are finite.
+      kink_at_0_001: the kink at |r - 1| = 0.001; None in artefacts of before it was measured.
     """
 
     holds: bool
@@ -52,15 +53,17 @@ class Certificate:
     finite: bool
     grid: str
     by_construction: bool = False
+    kink_at_0_001: float | None = None
 
     @property
     def stalls(self) -> bool:
         """Whether it may hold a policy still: the penalty rises right at ratio 1, and by more than `LARGEST_KINK`.
 
-        One that begins smoothly, as KL does, or further out, as a clip, has less than half of the slope
-        at |r - 1| = 0.01 already at 0.001.
+        The line through the kinks at |r - 1| = 0.01 and 0.001 says so: of a penalty that begins smoothly, as KL
+        does, or further out, as a clip, nothing is left at 0.
         """
-        return self.kink > LARGEST_KINK and self.slope_at_0_001 > 0.5 * self.slope_at_0_01
+        near = self.kink if self.kink_at_0_001 is None else self.kink_at_0_001
+        return (10 * near - self.kink) / 9 > LARGEST_KINK
 
     def as_dict(self) -> dict[str, Any]:
         return asdict(self)
@@ -119,10 +122,16 @@ def certify(
             np.max([jnp.abs(slopes(points, advantages, p)).max() for p in progress_values])
         )
 
-    def kink(progress: float) -> float:
-        right, left = slopes(jnp.log(jnp.asarray([1.01, 0.99])), advantages, progress)
-        weights = jnp.exp(-(advantages**2) / 2)
-        return float(jnp.sum(weights * (right - left)) / (2 * jnp.sum(weights)))
+    def kink(distance: float) -> float:
+        points, weights = (
+            jnp.asarray([1.0 + distance, 1.0 - distance]),
+            jnp.exp(-(advantages**2) / 2),
+        )
+        rises = [
+            jnp.sum(weights * (right - left)) / (2 * jnp.sum(weights))
+            for right, left in (slopes(jnp.log(points), advantages, p) for p in progress_values)
+        ]
+        return float(np.max(rises))
 
     grid = [np.asarray(values(log_ratios, advantages, progress)) for progress in progress_values]
     at_one = [np.asarray(values(jnp.zeros(1), advantages, p)) for p in progress_values]
@@ -137,7 +146,8 @@ def certify(
         gradient_at_one=gradient_at_one,
         slope_at_0_001=largest_slope([0.999, 1.001]),
         slope_at_0_01=largest_slope([0.99, 1.01]),
-        kink=float(np.max([kink(progress) for progress in progress_values])),
+        kink=kink(0.01),
+        kink_at_0_001=kink(0.001),
         finite=finite,
         grid=f"{len(log_ratios)} log-ratios in [-{MAX_LOG_RATIO:g}, {MAX_LOG_RATIO:g}] x "
         f"{len(advantages)} advantages in [-10, 10] x {len(progress_values)} training fraction"

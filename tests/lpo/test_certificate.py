@@ -163,6 +163,24 @@ def test_the_kink_is_the_rise_of_the_penalty_around_ratio_one():
         assert found.kink == pytest.approx(0.0, abs=1e-3)
 
 
+@pytest.mark.parametrize(
+    ("formula", "stalls"),
+    [
+        (lambda x, a, p: 0.1 * jnp.abs(x), True),
+        # Whatever rises smoothly beside it, and where advantages are large more than it.
+        (lambda x, a, p: 0.1 * jnp.abs(x) + 5 * a * a * jnp.expm1(x) ** 2, True),
+        (lambda x, a, p: 0.02 * jnp.abs(x), False),
+        (lambda x, a, p: 30 * jnp.expm1(x) ** 2, False),  # steep, and smooth
+        (lambda x, a, p: jax.nn.relu(jnp.abs(x) - 0.005), False),
+    ],
+)
+def test_what_rises_right_at_ratio_one_may_hold_a_policy_still(formula, stalls):
+    found = certificate(formula)
+    assert found.stalls == stalls
+    # As stored before the nearer kink was: by the other alone.
+    assert replace(found, kink_at_0_001=None).stalls == (found.kink > 0.03)
+
+
 def test_a_gate_takes_the_kink_from_any_weights():
     drift = LearnedDrift(hidden_size=16, gate=0.0)
     weights = jax.tree.map(lambda w: 3.0 * w, drift.init(jax.random.key(1)))
