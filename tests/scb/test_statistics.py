@@ -8,6 +8,7 @@ from scb.errors import UserError
 from scb.statistics import (
     Estimate,
     estimate,
+    few_groups_difference,
     iqm,
     normalized_score,
     paired_difference,
@@ -288,3 +289,45 @@ def test_a_pooled_estimate_refuses_what_it_cannot_pair():
 def test_a_single_run_of_a_group_has_no_interval():
     assert stratified_estimate([[1.0], [3.0, 3.0]]) == Estimate(2.0, None, None, 3)
     assert pooled_estimate([[1.0], [2.0]]) == Estimate(1.5, None, None, 2)
+
+
+# -- few groups
+# ------------------------------------------------------------
+
+
+def with_failures(generator, groups, scatter):
+    """[groups, 20] runs of deviation 1, of which a fifth fails, in groups that scatter by this."""
+    runs = generator.normal(0.0, 1.0, (groups, 20))
+    runs = np.where(generator.random(runs.shape) < 0.2, runs - 6.0, runs)
+    return runs + generator.normal(0.0, scatter, (groups, 1))
+
+
+@pytest.mark.parametrize(("others", "scatter"), [(5, 2.0), (1, 0.0)])
+def test_few_groups_leave_the_truth_out_as_seldom_as_they_say(others, scatter):
+    generator, outside, number = np.random.default_rng(0), 0, 200
+    for _ in range(number):
+        first, second = with_failures(generator, 5, 2.0), with_failures(generator, others, scatter)
+        found = few_groups_difference(first, second, others > 1, 0.95)
+        assert found.value == pytest.approx(float(iqm(first) - iqm(second)))
+        outside += not found.low <= 0.0 <= found.high
+    # 5 % are meant: of 200 there are more than 18, or fewer than 3, in one of a hundred such tests.
+    assert 3 <= outside <= 18
+
+
+def test_few_groups_that_differ_in_nothing_have_no_width():
+    found = few_groups_difference([[1.0, 1.0]] * 5, [[0.0, 0.0]])
+    assert (found.value, found.low, found.high) == (1.0, 1.0, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("groups", "minus", "paired", "message"),
+    [
+        ([[1.0, 2.0]], [[1.0, 3.0]], False, "there is one group, or one run"),
+        ([[1.0]] * 5, [[1.0]], False, "there is one group, or one run"),
+        ([[1.0, 2.0]] * 5, [[1.0, 2.0, 3.0]], False, "can't be compared: pair run by run."),
+        ([[1.0, 2.0]] * 5, [[1.0, 2.0]] * 4, True, "pair run by run and group by group."),
+    ],
+)
+def test_few_groups_that_cannot_be_compared_are_refused(groups, minus, paired, message):
+    with pytest.raises(UserError, match=message):
+        few_groups_difference(groups, minus, paired)
