@@ -205,6 +205,10 @@ def few_groups_difference(
       UserError: another shape; groups of other numbers to pair; a single group, or run; NaN or infinity.
     """
     first, second = _comparable(groups, minus, paired_groups)
+    if len(first) == len(second) == 1 or first.shape[1] < 2:
+        raise UserError(
+            "there is one group, or one run: give several, of which each could be others."
+        )
 
     def difference(a: NDArray[np.floating], b: NDArray[np.floating]) -> float:
         return float(iqm(a) - iqm(b))
@@ -219,10 +223,6 @@ def few_groups_difference(
     drawn = [(0, 1)] if paired_groups else [(0,), (1,)]
     samples = [without(0, *of) for of in drawn if len((first, second)[of[0]]) > 1]
     samples.append(without(1, 0, 1))
-    if len(samples) == 1 or first.shape[1] < 2:
-        raise UserError(
-            "there is one group, or one run: give several, of which each could be others."
-        )
     sizes = np.array([len(x) for x in samples]) - 1
     variances = np.array([len(x) - 1 for x in samples]) * [float(np.var(x)) for x in samples]
     variance, value = variances.sum(), difference(first, second)
