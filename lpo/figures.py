@@ -366,11 +366,15 @@ def alignment_heatmap(report: Mapping[str, Any]) -> Figure:
         axes.tick_params(length=0)
         for i, of_row in enumerate(cells):
             for j, cell in enumerate(of_row):
-                text = "-" if cell["spearman"] is None else f"{cell['spearman']:.2f}"
+                interval = f"[{cell['low']:.2f}, {cell['high']:.2f}]"
+                # Where all earn the same there is nothing to rank.
+                text = "all alike"
+                if cell["spearman"] is not None:
+                    text = f"{cell['spearman']:.2f}\n{interval}".replace("-", "\u2212")
                 axes.text(
                     j,
                     i,
-                    f"{text}\n[{cell['low']:.2f}, {cell['high']:.2f}]".replace("-", "\u2212"),
+                    text,
                     ha="center",
                     va="center",
                     fontsize=8,
