@@ -206,7 +206,9 @@ def draw(report: Mapping[str, Any]) -> Figure:
     """A row an environment: return after each number of steps, and of what has one number each agent a dot."""
     shown = facts(report)
     tables = shown["tables"]
-    figure = Figure(figsize=(plotting.WIDTH, 3.1 * len(tables)))
+    figure = Figure(figsize=(plotting.WIDTH, 3.1 * max(1, len(tables))))
+    if not tables:
+        return figure
     panels = figure.subplots(len(tables), 2, squeeze=False, width_ratios=(3, 2))
     for (curves, dots), (name, algorithms) in zip(panels, tables.items(), strict=True):
         once = [x for x in algorithms if len(report["steps"][x]) == 1]

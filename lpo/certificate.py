@@ -40,7 +40,8 @@ class Certificate:
       grid: what the grid was.
       by_construction: whether every drift of its family holds, so that `holds` says no more than that
         the weights are finite.
-      kink_at_0_001: the kink at |r - 1| = 0.001; None in artefacts of before it was measured.
+      kink_at_one: where the line through the kinks at |r - 1| = 0.01 and 0.001 meets ratio 1; None in artefacts
+        of before it was measured.
     """
 
     holds: bool
@@ -53,17 +54,15 @@ class Certificate:
     finite: bool
     grid: str
     by_construction: bool = False
-    kink_at_0_001: float | None = None
+    kink_at_one: float | None = None
 
     @property
     def stalls(self) -> bool:
         """Whether it may hold a policy still: the penalty rises right at ratio 1, and by more than `LARGEST_KINK`.
 
-        The line through the kinks at |r - 1| = 0.01 and 0.001 says so: of a penalty that begins smoothly, as KL
-        does, or further out, as a clip, nothing is left at 0.
+        Of a penalty that begins smoothly, as KL does, or further out, as a clip, nothing is left there.
         """
-        near = self.kink if self.kink_at_0_001 is None else self.kink_at_0_001
-        return (10 * near - self.kink) / 9 > LARGEST_KINK
+        return (self.kink if self.kink_at_one is None else self.kink_at_one) > LARGEST_KINK
 
     def as_dict(self) -> dict[str, Any]:
         return asdict(self)
@@ -122,16 +121,13 @@ def certify(
             np.max([jnp.abs(slopes(points, advantages, p)).max() for p in progress_values])
         )
 
-    def kink(distance: float) -> float:
-        points, weights = (
-            jnp.asarray([1.0 + distance, 1.0 - distance]),
-            jnp.exp(-(advantages**2) / 2),
-        )
-        rises = [
-            jnp.sum(weights * (right - left)) / (2 * jnp.sum(weights))
-            for right, left in (slopes(jnp.log(points), advantages, p) for p in progress_values)
-        ]
-        return float(np.max(rises))
+    def kinks(distance: float) -> np.ndarray:
+        """At every fraction of the training."""
+        points = jnp.log(jnp.asarray([1.0 + distance, 1.0 - distance]))
+        weights = jnp.exp(-(advantages**2) / 2)
+        sides = [slopes(points, advantages, progress) for progress in progress_values]
+        rises = [jnp.sum(weights * (right - left)) for right, left in sides]
+        return np.asarray(rises) / (2 * float(jnp.sum(weights)))
 
     grid = [np.asarray(values(log_ratios, advantages, progress)) for progress in progress_values]
     at_one = [np.asarray(values(jnp.zeros(1), advantages, p)) for p in progress_values]
@@ -139,6 +135,7 @@ def certify(
     minimum = float(np.nanmin(grid))
     value_at_one = float(np.abs(at_one).max())
     gradient_at_one = largest_slope([1.0])
+    near, further = kinks(0.001), kinks(0.01)
     return Certificate(
         holds=finite and minimum >= 0.0 and value_at_one == 0.0 and gradient_at_one == 0.0,
         minimum=minimum,
@@ -146,8 +143,8 @@ def certify(
         gradient_at_one=gradient_at_one,
         slope_at_0_001=largest_slope([0.999, 1.001]),
         slope_at_0_01=largest_slope([0.99, 1.01]),
-        kink=kink(0.01),
-        kink_at_0_001=kink(0.001),
+        kink=float(np.max(further)),
+        kink_at_one=float(np.max(10 * near - further) / 9),
         finite=finite,
         grid=f"{len(log_ratios)} log-ratios in [-{MAX_LOG_RATIO:g}, {MAX_LOG_RATIO:g}] x "
         f"{len(advantages)} advantages in [-10, 10] x {len(progress_values)} training fraction"

@@ -122,7 +122,8 @@ class Comparing(Measuring):
     """A command that compares objectives on one environment."""
 
     def growing(self) -> Collection[str]:
-        return "seeds", "objectives"
+        # A suite's --out that is there is completed, and grows by nothing but --resume.
+        return () if self.output.out else ("seeds", "objectives")
 
     def compare(self, objectives: Sequence[Objective]) -> Comparison:
         """Trains with the objectives, and leaves rows, comparison.json and curves.png where a folder is named."""
@@ -171,7 +172,7 @@ class Evaluate(Comparing):
 
     With --out every agent's returns are kept in rows.jsonl as they come, for --resume and for
     other statistics: pandas.read_json("rows.jsonl", lines=True). A resumed comparison may have more --seeds
-    and further --objectives: what is there is not trained again.
+    and further --objectives: what is there is kept.
     """
 
     program = "lpo evaluate"

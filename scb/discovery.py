@@ -46,7 +46,7 @@ from scb.lists import read_lists, write_lists
 from scb.measurement import Judge, Place, train_and_judge
 from scb.refinement import RefinementConfig, refined
 from scb.runs import Run, config_dict
-from scb.spaces import kind_of_actions
+from scb.spaces import check_bounded, kind_of_actions
 from scb.strategies import strategy_for
 from scb.warm_start import WarmStartConfig, expert_agent, warm_start
 
@@ -202,6 +202,7 @@ class BanditDiscovery:
             generations = max(1, config.evolution.num_generations)
             config = replace(config, curriculum=paper_curriculum(config.environment, generations))
         check_algorithms(config.algorithms, kind_of_actions(space))
+        check_bounded(space)
         if config.mode == "all" and len(set(config.algorithms)) < len(config.algorithms):
             raise UserError(
                 f"an algorithm stands twice in {', '.join(config.algorithms)}: name each once, or use the mode "

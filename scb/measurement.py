@@ -282,7 +282,8 @@ def measure(
             lacking = [(name, i) for name, i in batch if agents.names[i] not in cells[name].done]
             if not lacking:
                 continue
-            # With the neighbours that it always has: an agent's last digits depend on its place.
+            # With the neighbours that it has in this measurement, for an agent's last digits depend on its place:
+            # where it goes on after a kill, these are the same.
             padded = [batch[i % len(batch)] for i in range(size)]
             which = np.array([i for _, i in padded])
             hyperparameters = jax.tree.map(itemgetter(which), agents.hyperparameters)

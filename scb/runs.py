@@ -385,7 +385,7 @@ def grown(before: Any, now: Any) -> bool:
         return all(name in now and now[name] == value for name, value in before.items())
     if isinstance(before, list) and isinstance(now, list):
         return all(x in now for x in before)
-    return isinstance(before, int) and isinstance(now, int) and now >= before
+    return type(before) is type(now) is int and now >= before
 
 
 def _wandb() -> Any:

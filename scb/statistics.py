@@ -188,16 +188,19 @@ def few_groups_difference(
     paired_groups: bool = False,
     confidence: float = 0.95,
 ) -> Estimate:
-    """The same difference as `pooled_estimate`'s, with an interval that holds where there are few groups.
+    """The mean over groups of their interquartile means, less that of others, with an interval for few groups.
 
     Resampling five searches covers too little, the less the higher the confidence: no resample is beyond the
-    worst of them. Here it is Student's t with the jackknife's variances over groups and over runs, added, and
-    Satterthwaite's degrees of freedom. Of five groups of 20 runs, normal or with failures, that scatter by up to
-    twice the runs' deviation, it leaves the truth out in 8 % of cases at most where 5 % are meant, and in 2 % for
-    1 %, where resampling does in up to 12 and 7 % (1000 simulations each).
+    worst of them. Here it is Student's t: one interval of the variance over groups, and one of the jackknife's over
+    runs, for what runs of one seed share in all groups; the squares of their halves are added.
+
+    Of five simulated groups of 20 runs (normal, or a fifth of them failing; groups that scatter by up to twice the
+    runs' deviation) it leaves the truth out no more often than it says at 95, 99 and 99.83 %. But where whole groups
+    fail against a single one that never does: that five groups show no failure says little of how many do, and no
+    interval knows.
 
     Args:
-      groups: [G, N] N runs of each of G groups.
+      groups: [G, N] N runs of each of G groups. Unlike in `pooled_estimate`, a group that fails counts in full.
       minus: [G', N] runs on the same seeds. Of one of the two there may be a single group, which nobody drew.
       paired_groups: whether groups of the same position in both belong together.
 
@@ -209,27 +212,23 @@ def few_groups_difference(
         raise UserError(
             "there is one group, or one run: give several, of which each could be others."
         )
-
-    def difference(a: NDArray[np.floating], b: NDArray[np.floating]) -> float:
-        return float(iqm(a) - iqm(b))
-
-    def without(axis: int, *of: int) -> list[float]:
-        both = (first, second)
-        return [
-            difference(*(np.delete(x, i, axis) if j in of else x for j, x in enumerate(both)))
-            for i in range(both[of[0]].shape[axis])
-        ]
-
-    drawn = [(0, 1)] if paired_groups else [(0,), (1,)]
-    samples = [without(0, *of) for of in drawn if len((first, second)[of[0]]) > 1]
-    samples.append(without(1, 0, 1))
-    sizes = np.array([len(x) for x in samples]) - 1
-    variances = np.array([len(x) - 1 for x in samples]) * [float(np.var(x)) for x in samples]
-    variance, value = variances.sum(), difference(first, second)
-    if variance == 0:
-        return Estimate(value, value, value, first.size)
-    freedom = variance**2 / (variances**2 / sizes).sum()
-    half = float(scipy.stats.t.ppf((1 + confidence) / 2, freedom) * np.sqrt(variance))
+    ours, theirs = iqm(first, axis=1), iqm(second, axis=1)
+    drawn = [x for x in ([ours - theirs] if paired_groups else [ours, theirs]) if len(x) > 1]
+    without = [
+        float(
+            np.mean(iqm(np.delete(first, i, 1), axis=1))
+            - np.mean(iqm(np.delete(second, i, 1), axis=1))
+        )
+        for i in range(first.shape[1])
+    ]
+    freedoms = np.array([*(len(x) - 1 for x in drawn), len(without) - 1])
+    variances = np.array(
+        [*(np.var(x, ddof=1) / len(x) for x in drawn), (len(without) - 1) * np.var(without)]
+    )
+    value = float(ours.mean() - theirs.mean())
+    half = float(
+        np.sqrt(np.sum(scipy.stats.t.ppf((1 + confidence) / 2, freedoms) ** 2 * variances))
+    )
     return Estimate(value, value - half, value + half, first.size)
 
 

@@ -89,14 +89,14 @@ def test_claims_follow_the_figures():
     good, bad = [-200.0, -220.0, -180.0, -190.0], [-1000.0, -1020.0, -900.0, -950.0]
     needed = {(r, s): good if s == SYNTHETIC else bad for r, s in REPLACED}
     found = ["holds"] * 3 + ["undecided"] + ["holds"] * 2
-    assert outcomes(with_returns(good, needed, needed)) == found
+    assert outcomes(with_returns(good, *[needed] * 5)) == found
     alike = dict.fromkeys(REPLACED, good)
-    assert outcomes(with_returns(good, alike, alike))[:3] == ["undecided"] * 3
+    assert outcomes(with_returns(good, *[alike] * 5))[:3] == ["undecided"] * 3
     poor = needed | {(r, SYNTHETIC): bad for r in (ACTION, CLONING, Q)}
     found = ["holds", "undecided", "undecided", "holds"] + ["does not hold"] * 2
-    assert outcomes(with_returns(good, poor, poor)) == found
-    # One expert of two from whom cloning learns nothing makes it uncertain: neither worse nor as good.
-    assert outcomes(with_returns(good, needed, poor))[4:] == ["undecided"] * 2
+    assert outcomes(with_returns(good, *[poor] * 5)) == found
+    # One expert of five from whom cloning learns nothing makes it uncertain: neither worse nor as good.
+    assert outcomes(with_returns(good, *[needed] * 4, poor))[4:] == ["undecided"] * 2
 
 
 def test_the_page_and_the_figure_show_every_combination(report):

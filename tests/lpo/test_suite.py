@@ -222,7 +222,11 @@ def test_a_killed_suite_is_completed_to_the_same_scores(tmp_path, tiny_agent, mo
 
     with pytest.raises(UserError, match=r"its config differs at config.seeds \(2 there, 1 now\)"):
         evaluate(seeds=1)
-    evaluate(seeds=3)
+    # A default is a setting too: with --out nothing grows that was not asked for by --resume.
+    with pytest.raises(UserError, match=r"differs at config.objectives \(\['ppo'\] there"):
+        training_commands.Evaluate.parse(["--suite=classic", f"--out={out}"]).run()
+
+    training_commands.Evaluate.parse([f"--resume={out}", "--seeds=3"]).run()
     assert (out / "rows.jsonl").read_bytes().startswith(rows)
     assert json.loads((out / "suite.json").read_text())["seeds"] == [1000, 1001, 1002]
 

@@ -596,7 +596,7 @@ def test_a_process_that_was_killed_mid_way_is_resumed_to_the_same_bytes(tmp_path
     code = f"""
 import os, pathlib, signal, sys, threading, time
 from scb.evolution import EvolutionConfig, evolve
-from scb.runs import Run, config_dict, read_config
+from scb.runs import Run, config_dict
 from tests.scb.probes import Parabola
 
 def kill():

@@ -295,23 +295,32 @@ def test_a_single_run_of_a_group_has_no_interval():
 # ------------------------------------------------------------
 
 
-def with_failures(generator, groups, scatter):
-    """[groups, 20] runs of deviation 1, of which a fifth fails, in groups that scatter by this."""
+def with_failures(generator, groups, scatter, failing):
+    """[groups, 20] runs of deviation 1, of which a fifth fails, in groups that scatter by this, or fail as a whole."""
     runs = generator.normal(0.0, 1.0, (groups, 20))
     runs = np.where(generator.random(runs.shape) < 0.2, runs - 6.0, runs)
-    return runs + generator.normal(0.0, scatter, (groups, 1))
+    whole = np.where(generator.random((groups, 1)) < failing, -10.0, 0.0)
+    return runs + whole + generator.normal(0.0, scatter, (groups, 1))
 
 
-@pytest.mark.parametrize(("others", "scatter"), [(5, 2.0), (1, 0.0)])
-def test_few_groups_leave_the_truth_out_as_seldom_as_they_say(others, scatter):
+@pytest.mark.parametrize("confidence", [0.95, 0.9983])
+@pytest.mark.parametrize("failing", [0.0, 0.3])
+def test_few_groups_leave_the_truth_out_no_more_often_than_they_say(confidence, failing):
     generator, outside, number = np.random.default_rng(0), 0, 200
     for _ in range(number):
-        first, second = with_failures(generator, 5, 2.0), with_failures(generator, others, scatter)
-        found = few_groups_difference(first, second, others > 1, 0.95)
-        assert found.value == pytest.approx(float(iqm(first) - iqm(second)))
+        first, second = (with_failures(generator, 5, 1.0, failing) for _ in range(2))
+        found = few_groups_difference(first, second, True, confidence)
+        assert found.value == pytest.approx(float(np.mean(iqm(first, 1) - iqm(second, 1))))
         outside += not found.low <= 0.0 <= found.high
-    # 5 % are meant: of 200 there are more than 18, or fewer than 3, in one of a hundred such tests.
-    assert 3 <= outside <= 18
+    # More of 200 there are by chance in one of a thousand such tests.
+    assert outside <= scipy.stats.binom.ppf(0.999, number, 1 - confidence)
+
+
+def test_a_group_that_fails_counts_in_full():
+    groups = [[0.0, 0.0]] * 4 + [[-100.0, -100.0]]
+    found = few_groups_difference(groups, [[0.0, 0.0]])
+    # Its variance over groups is 2000, of the mean 400; Student's t of four degrees has 2.776.
+    assert (found.value, found.high) == (-20.0, pytest.approx(-20.0 + 2.776 * 20.0, rel=1e-3))
 
 
 def test_few_groups_that_differ_in_nothing_have_no_width():
