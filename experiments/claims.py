@@ -8,7 +8,7 @@ or one search, nothing is decided.
 
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -77,7 +77,7 @@ class Judged:
 
 def of_agents(evidence: Callable[..., Estimate], number: int) -> Callable[..., Estimate] | Estimate:
     """What so many agents say: without an interval where they are too few."""
-    return evidence if number >= DECIDING else replace(evidence(), low=None, high=None)
+    return evidence if number >= DECIDING else evidence().without_interval()
 
 
 def of_searches(

@@ -88,7 +88,7 @@ def claims(report: Report) -> list[Claim]:
         # Of one search each, which decides nothing.
         evidence = paired(curves[name], curves["ppo"], "final") if name in curves else None
         if callable(evidence):
-            evidence = replace(evidence(), low=None, high=None)
+            evidence = evidence().without_interval()
         text, reason = f"Hopper: {name} ends no lower than PPO", "a twentieth of PPO's mean return"
         found.append(Claim(text, evidence, 0.0, margin, reason, places=0))
     return found
@@ -106,7 +106,7 @@ def _above(returns: Mapping[str, Any], name: str, other: str) -> Callable[..., E
     """How far an objective earns more than another; without an interval where searches are too few."""
     found = of_searches(returns[name], returns[other])
     once = any(len(returns[x]) == 1 for x in (name, other) if x in (BANDIT, ENVIRONMENT))
-    return replace(found(), low=None, high=None) if once and callable(found) else found
+    return found().without_interval() if once and callable(found) else found
 
 
 def cheaper(report: Report) -> float:

@@ -10,7 +10,7 @@ it), in which every agent is a process. What --out holds already is not trained 
 import json
 import subprocess
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -168,7 +168,7 @@ def facts(report: Report) -> dict[str, Any]:
                 returns = returns_of(agents, sorted(agents))
                 row = [estimate(column) for column in returns.T]
                 if len(agents) < DECIDING:
-                    row = [replace(x, low=None, high=None) for x in row]
+                    row = [x.without_interval() for x in row]
                 tables.setdefault(name, {}).setdefault(algorithm, {})[place] = row
     trained = {algorithm for of_it in tables.values() for algorithm in of_it}
     longest = max((n[-1] for n in report["steps"].values()), default=0)

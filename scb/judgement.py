@@ -28,10 +28,7 @@ def check_fits(
     environment_name: str,
 ) -> None:
     """Raises a UserError where a bandit has other observation or action shapes than an environment."""
-    ours, theirs = (
-        shapes(e.observation_space(params), e.action_space(params))
-        for e, params in ((bandit, None), (env, env_params))
-    )
+    ours, theirs = shapes(bandit, None), shapes(env, env_params)
     if ours != theirs:
         raise UserError(
             f"bandit {bandit.name} has {ours}, {environment_name} has {theirs}: take the bandit of that environment."

@@ -6,7 +6,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from gymnax.environments import spaces
+from gymnax.environments import environment, spaces
 
 from scb.errors import UserError
 
@@ -26,12 +26,13 @@ def flat_size(space: spaces.Box | spaces.Discrete) -> int:
     return math.prod(space.shape)
 
 
-def shapes(
-    observations: spaces.Box | spaces.Discrete, actions: spaces.Box | spaces.Discrete
-) -> str:
+def shapes(env: environment.Environment[Any, Any], params: Any) -> str:
     """What decides whether agents fit an environment, such as "4 observations and 2 discrete actions"."""
+    actions = env.action_space(params)
     what = "discrete actions" if isinstance(actions, spaces.Discrete) else "action dimensions"
-    return f"{flat_size(observations)} observations and {action_size(actions)} {what}"
+    return (
+        f"{flat_size(env.observation_space(params))} observations and {action_size(actions)} {what}"
+    )
 
 
 def flat_bounds(space: spaces.Box, xp: Any = jnp) -> tuple[Any, Any]:

@@ -43,6 +43,10 @@ class Estimate:
             f"{self.value:.{places}f} [{self.low:.{places}f}, {self.high:.{places}f}] (n={self.n})"
         )
 
+    def without_interval(self) -> "Estimate":
+        """The value alone, of what is too few to tell its spread."""
+        return replace(self, low=None, high=None)
+
     def as_dict(self) -> dict[str, float | int | None]:
         """{"value", "low", "high", "n"}, ready for JSON: an unknown end is None, never NaN."""
         return asdict(self)

@@ -44,14 +44,13 @@ class AgentConfig(ABC):
     normalize_observations: bool = False
 
     def __post_init__(self) -> None:
-        counts = {f.name: getattr(self, f.name) for f in fields(self) if f.type is int}
-        sizes = self.hidden_sizes
-        if not isinstance(sizes, tuple):
-            raise UserError(f"hidden_sizes is {sizes!r}: give a tuple of one size a layer.")
-        for name, value in {
-            **counts,
-            **{f"hidden_sizes[{i}]": x for i, x in enumerate(sizes)},
-        }.items():
+        if not isinstance(self.hidden_sizes, tuple):
+            raise UserError(
+                f"hidden_sizes is {self.hidden_sizes!r}: give a tuple of one size a layer."
+            )
+        counts = [(f.name, getattr(self, f.name)) for f in fields(self) if f.type is int]
+        counts += [(f"hidden_sizes[{i}]", size) for i, size in enumerate(self.hidden_sizes)]
+        for name, value in counts:
             if not isinstance(value, int | np.integer) or isinstance(value, bool):
                 raise UserError(f"{name} is {value!r}: it must be a whole number.")
             at_least(1, **{name: int(value)})
@@ -214,13 +213,10 @@ class Agent(ABC):
         own_params = env_params
         if env is not self.env:
             own_params = self._default_params()
-            (name, ours), (other, theirs) = (
-                (e.name, shapes(e.observation_space(params), e.action_space(params)))
-                for e, params in ((self.env, own_params), (env, env_params))
-            )
+            ours, theirs = shapes(self.env, own_params), shapes(env, env_params)
             if ours != theirs:
                 raise UserError(
-                    f"{name} has {ours}, {other} has {theirs}: evaluate an agent where these are the same."
+                    f"{self.env.name} has {ours}, {env.name} has {theirs}: evaluate an agent where these are the same."
                 )
 
         def policy(observation: jax.Array, key: jax.Array) -> jax.Array:
