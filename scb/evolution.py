@@ -20,11 +20,12 @@ from scipy.stats import rankdata
 
 from scb import processes, termination
 from scb.artefacts import machine_description
+from scb.checkpoints import continued
 from scb.console import Progress, progress_console
 from scb.errors import UserError, at_least, one_of, positive
 from scb.files import plain
 from scb.keys import key_at, root_key, split_key
-from scb.runs import Run, Stopwatch, continued
+from scb.runs import Run, Stopwatch
 from scb.seeds import VALIDATING, searching
 from scb.statistics import iqm
 from scb.strategies import STRATEGIES, strategy_for

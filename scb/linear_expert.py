@@ -24,13 +24,14 @@ from rich.console import Console
 from scb.agents.agent import AgentConfig
 from scb.agents.networks import MLP
 from scb.agents.normalization import RunningStatistics, merge_statistics, normalize
+from scb.checkpoints import continued
 from scb.console import Progress, progress_console
 from scb.errors import UserError, at_least, positive
 from scb.evaluation import Episodes, Policy, evaluate
 from scb.evolution import map_population
 from scb.experts import EPISODES, Expert, judged
 from scb.keys import key_at, named_key, split_key
-from scb.runs import Stopwatch, continued
+from scb.runs import Stopwatch
 from scb.spaces import action_size, clip_to_space, flat_size, scale_to_space
 
 START_GENERATIONS = 20  # after which one of several searches goes on

@@ -1,19 +1,16 @@
 """Run folders: what a long computation writes, so that it can be watched, killed and resumed.
 
 runs/NAME/config.json       what was asked for, and the command that asks for it; --resume refuses another
-runs/NAME/metrics.jsonl     one line a generation, free of clocks: a resumed run ends with the same
-bytes
+runs/NAME/metrics.jsonl     one line a generation, free of clocks: a resumed run ends with the same bytes
 runs/NAME/timing.jsonl      seconds per generation
 runs/NAME/tensorboard/      the same numbers for TensorBoard
-runs/NAME/checkpoints/      orbax
+runs/NAME/checkpoints/      of `scb.checkpoints`
 runs/NAME/.lock             held by the process that writes here
 """
 
-import hashlib
 import json
 import os
 import secrets
-import shutil
 import socket
 import time
 from collections.abc import Collection, Mapping
@@ -26,15 +23,10 @@ try:
 except ImportError:  # Windows has none, and there nobody is kept out of a run
     fcntl = None  # type: ignore[assignment]
 
-import jax
-import numpy as np
-import orbax.checkpoint as ocp
-from rich.console import Console
 from tensorboardX.event_file_writer import EventsWriter
 from tensorboardX.proto.event_pb2 import Event, SessionLog
 from tensorboardX.summary import scalar
 
-from scb import processes
 from scb.errors import UserError
 from scb.files import cannot_write, make_folder, plain, write_json, write_text
 
@@ -219,118 +211,6 @@ def config_dict(config: Any) -> dict[str, Any]:
     return dict(json.loads(json.dumps(asdict(config))))
 
 
-class Checkpoints:
-    """Orbax checkpoints of a pytree of arrays, each with a digest, restored newest first.
-
-    A checkpoint that cannot be read, or whose digest does not fit (cut in half, altered), is removed where one
-    before it can be read, which is taken, and the caller is told. Where none can, all stay, and it is an error:
-    perhaps it is not they that are at fault, but other versions of packages.
-    """
-
-    def __init__(self, folder: Path) -> None:
-        self.folder = (folder / "checkpoints").resolve()
-        self._manager = self._open()
-
-    def _open(self) -> ocp.CheckpointManager:
-        # Of several processes one writes, and need not wait for the others.
-        here = jax.process_index()
-        alone = ocp.options.MultiprocessingOptions(primary_host=here, active_processes={here})
-        options = ocp.CheckpointManagerOptions(
-            max_to_keep=3, create=False, multiprocessing_options=alone
-        )
-        self.folder.mkdir(parents=True, exist_ok=True)
-        return ocp.CheckpointManager(self.folder, options=options)
-
-    def save(self, step: int, state: Any) -> None:
-        """Writes `state` and waits until it is on disk; a UserError where it cannot be written."""
-        leaves = _leaves(state)
-        items = ocp.args.Composite(
-            state=ocp.args.StandardSave(leaves),
-            digest=ocp.args.JsonSave({"sha256": _digest(leaves)}),
-        )
-        try:
-            self._manager.save(step, args=items)
-            self._manager.wait_until_finished()
-        # Orbax and tensorstore raise many kinds where a disk is full or a folder is gone.
-        except Exception as error:
-            raise UserError(
-                f"checkpoint {step} could not be written to {self.folder} ({_told(error)}): the one before it is "
-                "there; make room, and go on with --resume."
-            ) from error
-
-    def restore(self, template: Any) -> tuple[int, Any, list[int]]:
-        """(step, state, steps of unreadable newer checkpoints); step 0 and the template where there is none.
-
-        Raises:
-          UserError: there are checkpoints, and none can be read.
-        """
-        expected = _leaves(template)
-        damaged: list[int] = []
-        why = "altered"
-        for step in sorted(self._manager.all_steps(), reverse=True):
-            try:
-                restored = self._manager.restore(
-                    step,
-                    args=ocp.args.Composite(
-                        state=ocp.args.StandardRestore(expected), digest=ocp.args.JsonRestore()
-                    ),
-                )
-                intact = _digest(restored["state"]) == restored["digest"]["sha256"]
-                state = _from_leaves(template, restored["state"])
-            # Orbax and tensorstore raise many kinds for a file that is cut or altered.
-            except Exception as error:
-                intact, why = False, _told(error)
-            if intact:
-                break
-            damaged.append(step)
-        else:
-            step, state = 0, template
-            if damaged:
-                raise UserError(
-                    f"no checkpoint in {self.folder} can be read ({why}): resume with the versions of packages that "
-                    "wrote them, or remove that folder to start again at generation 0."
-                )
-        self._discard(damaged)
-        return step, state, damaged
-
-    def _discard(self, steps: list[int]) -> None:
-        # Orbax refuses to save a step that exists, so a damaged one must make room for its
-        # repetition.
-        for step in steps:
-            shutil.rmtree(self.folder / str(step), ignore_errors=True)
-        if steps:
-            self._manager.close()
-            self._manager = self._open()
-
-    def close(self) -> None:
-        self._manager.close()
-
-
-def continued(
-    folder: Path | None, template: Any, console: Console
-) -> tuple[Checkpoints | None, int, Any]:
-    """(checkpoints, step, state) of a search, in all of its processes: the newest state in its folder, and its step.
-
-    The first process alone has checkpoints, and says what was damaged. Without a folder, or with nothing in it, step
-    0 and the template.
-    """
-    if folder is None:
-        return None, 0, template
-    checkpoints, step, state = None, 0, template
-    if processes.first():
-        checkpoints = Checkpoints(folder)
-        step, state, damaged = checkpoints.restore(template)
-        for number in damaged:
-            console.print(
-                f"checkpoint {number} is damaged: resuming from checkpoint {step} before it."
-            )
-    return checkpoints, processes.told(step), processes.agreed(state)
-
-
-def _told(error: Exception) -> str:
-    return (str(error).splitlines() or [type(error).__name__])[0][:200]
-
-
 class Stopwatch:
     """Seconds since it was last read."""
 
@@ -341,25 +221,6 @@ class Stopwatch:
         now = time.perf_counter()
         seconds, self._last = now - self._last, now
         return seconds
-
-
-def _leaves(tree: Any) -> dict[str, np.ndarray]:
-    leaves = jax.tree.leaves(jax.device_get(tree))
-    return {f"leaf_{index:04d}": np.asarray(leaf) for index, leaf in enumerate(leaves)}
-
-
-def _from_leaves(template: Any, leaves: Mapping[str, Any]) -> Any:
-    treedef = jax.tree.structure(template)
-    return jax.tree.unflatten(treedef, [jax.numpy.asarray(leaves[name]) for name in sorted(leaves)])
-
-
-def _digest(leaves: Mapping[str, Any]) -> str:
-    digest = hashlib.sha256()
-    for name in sorted(leaves):
-        array = np.asarray(leaves[name])
-        digest.update(f"{name}:{array.dtype}:{array.shape}".encode())
-        digest.update(np.ascontiguousarray(array).tobytes())
-    return digest.hexdigest()
 
 
 def first_difference(stored: Any, given: Any, growing: Collection[str] = (), path: str = "") -> str:

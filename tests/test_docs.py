@@ -2,6 +2,7 @@
 
 import json
 import re
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -48,6 +49,12 @@ def test_every_page_of_the_documentation_is_in_its_navigation():
     listed = files(yaml.safe_load((ROOT / "mkdocs.yml").read_text())["nav"])
     notebooks = [f"notebooks/{file.stem}.md" for file in (ROOT / "notebooks").glob("*.ipynb")]
     assert sorted(listed) == sorted([*(page.name for page in DOCS.glob("*.md")), *notebooks])
+
+
+def test_the_citation_is_of_this_version():
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert (citation["version"], citation["license"]) == (project["version"], project["license"])
 
 
 def test_the_reference_has_every_public_name():

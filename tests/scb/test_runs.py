@@ -6,9 +6,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from scb.checkpoints import Checkpoints
 from scb.errors import UserError
 from scb.files import write_json
-from scb.runs import Checkpoints, Run, Stopwatch, read_config
+from scb.runs import Run, Stopwatch, read_config
 
 CONFIG = {"seed": 0, "evolution": {"sigma": 0.05, "strategy": "SNES"}, "hidden_sizes": (8, 8)}
 
