@@ -95,8 +95,11 @@ def test_a_bias_of_one_advantage_only_is_found():
     assert found.value_at_one == 0.5
 
 
-def test_a_bias_late_in_training_is_found():
-    found = certificate(lambda x, a, p: jnp.where(p == 1.0, 0.5, 0.0) * jnp.ones_like(x))
+@pytest.mark.parametrize(("begin", "end"), [(0.2, 0.3), (0.999, 1.0)])
+def test_a_bias_of_a_part_of_the_training_is_found(begin, end):
+    found = certificate(
+        lambda x, a, p: jnp.where((begin <= p) & (p <= end), 0.5, 0.0) * jnp.ones_like(x)
+    )
     assert not found.holds
     assert found.value_at_one == 0.5
 
@@ -139,7 +142,7 @@ def test_slope_of_a_clip_between_the_two_points():
 def test_a_certificate_says_on_which_grid():
     # 61 log-ratios in [-3, 3] and 61 // 4 = 15 in [-20, 20], which share 0: 75.
     found = certificate(quadratic)
-    expected = "75 log-ratios in [-20, 20] x 11 advantages in [-10, 10] x 3 training fractions"
+    expected = "75 log-ratios in [-20, 20] x 11 advantages in [-10, 10] x 21 training fractions"
     assert found.grid == expected
     assert found.as_dict()["grid"] == expected
     assert Certificate(**found.as_dict()) == found
