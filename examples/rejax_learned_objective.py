@@ -35,7 +35,8 @@ def drift_from(path: Path) -> Callable[[jax.Array, jax.Array], jax.Array]:
         away = jnp.stack([delta, delta**2, log_ratio, log_ratio**2], axis=-1)
         features = jnp.concatenate([away, advantage[..., None] * away], axis=-1)
         penalty = (jnp.tanh(features @ weights["hidden"]) @ weights["output"])[..., 0]
-        penalty *= -jnp.expm1(-((log_ratio / gate) ** 2))
+        if gate:
+            penalty *= -jnp.expm1(-((log_ratio / gate) ** 2))
         ratio = jnp.exp(log_ratio)
         penalty += jax.nn.relu((ratio - jnp.clip(ratio, 1.0 - clip, 1.0 + clip)) * advantage)
         return jax.nn.relu(penalty - xi)

@@ -35,6 +35,11 @@ from scb.statistics import estimate
 BACKEND = "generalized"
 SEED = 1  # nothing is chosen by it
 STATES = 2048
+CLIPPING = {
+    "apart": (plotting.VERMILLION, "what they would do"),
+    "clipped": (plotting.BLUE, "after the clip at the ends of the range"),
+}
+OF_AGENTS = ("beyond", "apart", "clipped", "returns")  # what a report has of every agent
 
 
 @dataclass(frozen=True)
@@ -62,12 +67,12 @@ def bandits(environment: str, published: Path | None) -> dict[str, Candidate]:
     return {x.kind: x for x in candidates(None, published) if x.environment == environment}
 
 
-def spread(means: np.ndarray) -> dict[str, float]:
+def spread(means: np.ndarray) -> dict[str, Any]:
     """What [N, S, A] means of N agents in the same S states are like, in halves of the actions' range.
 
     Returns:
-      beyond: share of them that lie beyond the ends of the range.
-      apart: root mean square distance of an agent's mean to that of all, and `clipped`: of the actions.
+      beyond: [N] share of an agent's means that lie beyond the ends of the range.
+      apart: [N] root mean square distance of its means to those of all, and `clipped`: of its actions.
       directions: of what all agents do, the mean of the clipped actions, how many the variance over states has
         (its participation ratio, (sum of eigenvalues)^2 / sum of their squares).
     """
@@ -75,10 +80,10 @@ def spread(means: np.ndarray) -> dict[str, float]:
     together = actions.mean(axis=0)
     variances = np.linalg.svd(together - together.mean(axis=0), compute_uv=False) ** 2
     return {
-        "beyond": float((np.abs(means) > 1).mean()),
-        "apart": float(np.sqrt(((means - means.mean(axis=0)) ** 2).mean())),
-        "clipped": float(np.sqrt(((actions - together) ** 2).mean())),
-        "directions": float(variances.sum() ** 2 / (variances**2).sum()),
+        "beyond": (np.abs(means) > 1).mean(axis=(1, 2)),
+        "apart": np.sqrt(((means - means.mean(axis=0)) ** 2).mean(axis=(1, 2))),
+        "clipped": np.sqrt(((actions - together) ** 2).mean(axis=(1, 2))),
+        "directions": round(float(variances.sum() ** 2 / (variances**2).sum()), 4),
     }
 
 
@@ -102,11 +107,12 @@ def measured(candidate: Candidate, options: Options) -> dict[str, Any]:
 
     low, high = np.asarray(space.low), np.asarray(space.high)
     shares = (np.asarray(means(learned["ppo"].states)) - (low + high) / 2) / ((high - low) / 2)
-    found = {name: round(value, 4) for name, value in spread(shares).items()}
     random = environment_spec(candidate.environment).random_return(BACKEND)
     returns, _ = finite(learned["ppo"].returns, random)
+    found = {**spread(shares), "returns": returns}
+    found |= {name: packed([found[name]])[0] for name in OF_AGENTS}
     said = {"bandit": candidate.kind, "sha256": candidate.sha256, "actions": shares.shape[-1]}
-    return {**said, **found, "returns": packed([returns])[0]}
+    return {**said, **found}
 
 
 def parts(options: Options, report: dict[str, Any]) -> Iterator[Part]:
@@ -124,52 +130,35 @@ measure = InParts(parts)
 
 
 def facts(report: Report) -> dict[str, Any]:
-    """A row a bandit."""
-    return {
-        "rows": [
-            {
-                "environment": environment,
-                "kind": kind,
-                **entry[kind],
-                "earned": estimate(unpacked([entry[kind]["returns"]])[0]),
-            }
-            for environment, entry in report["environments"].items()
-            for kind in BANDITS
-            if kind in entry
-        ]
-    }
+    """A row a bandit: estimates over its agents, and how far every agent is from all, before and after the clip."""
+    rows = []
+    for environment, entry in report["environments"].items():
+        for kind in (kind for kind in BANDITS if kind in entry):
+            of_agents = {name: unpacked([entry[kind][name]])[0] for name in OF_AGENTS}
+            estimates = {name: estimate(values) for name, values in of_agents.items()}
+            row = {"environment": environment, "kind": kind, **entry[kind], **estimates}
+            rows.append({**row, "of_agents": of_agents})
+    return {"rows": rows}
 
 
 def draw(report: Mapping[str, Any]) -> Figure:
-    """A row a bandit: how far agents are apart before the clip and after it."""
+    """A row a bandit: how far agents are apart before the clip and after it, with a dot an agent."""
     rows = facts(report)["rows"]
-    figure = Figure(figsize=(7, 0.5 * len(rows) + 1.3))
+    figure = Figure(figsize=(7, 0.55 * len(rows) + 1.5))
     axes = figure.subplots()
     for place, row in enumerate(rows):
-        axes.plot([row["clipped"], row["apart"]], [place, place], color=plotting.GREY, zorder=1)
-        axes.plot(
-            row["apart"],
-            place,
-            "o",
-            color=plotting.VERMILLION,
-            label="" if place else "before the clip",
-        )
-        axes.plot(
-            row["clipped"], place, "o", color=plotting.BLUE, label="" if place else "after it"
-        )
-        axes.annotate(
-            f"{100 * row['beyond']:.0f} % beyond the ends",
-            (row["apart"], place),
-            xytext=(8, 0),
-            textcoords="offset points",
-            va="center",
-            fontsize=8,
-        )
+        for of, (color, _) in CLIPPING.items():
+            plotting.estimate_row(axes, place, row["of_agents"][of], row[of], color)
     axes.set_yticks(range(len(rows)), [f"{row['environment']}, {row['kind']}" for row in rows])
-    axes.invert_yaxis()
-    axes.set_xlim(0, max(row["apart"] for row in rows) * 1.35)
-    axes.set_xlabel("PPO's agents apart from each other, in halves of the actions' range")
-    axes.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=2, frameon=False)
+    axes.set_ylim(len(rows) - 0.5, -0.5)
+    axes.set_xlim(0, None)
+    axes.set_xlabel("an agent of PPO from all, in halves of the actions' range")
+    plotting.figure_title(figure, "How far agents that learned in one bandit are apart")
+    looks = {
+        label: {"color": color, "marker": "o", "linestyle": ""}
+        for color, label in CLIPPING.values()
+    }
+    plotting.legend_of(figure, looks, columns=2)
     return figure
 
 

@@ -66,6 +66,11 @@ class Regime:
             )
         at_least(1, self, "iterations", "epochs", "minibatches", "contexts")
         at_least(0, self, "reward_noise")
+        if self.reward_noise and not environment_spec(self.bandit).is_bandit:
+            raise UserError(
+                f"reward_noise is {self.reward_noise:g}, and {self.bandit!r} is a synthetic MDP, whose reward has "
+                "none: take 0."
+            )
         self.spec()  # which refuses what does not fit, before anything is trained
 
     def spec(self) -> AgentSpec:
@@ -145,8 +150,7 @@ def regime_fitness(
       UserError: every agent diverged.
     """
     check_names(objectives)
-    check_seeds(seeds)
-    found = {}
+    seeds, found = check_seeds(seeds), {}
     for family in families(objectives):
         task = regime.task(family[0])
         size = len(family) * len(seeds)
@@ -301,6 +305,7 @@ def measure_alignment(
     Raises:
       UserError: `done` is of another measurement.
     """
+    seeds = check_seeds(seeds)
     asked = {
         "environment": environment,
         "steps": steps,
@@ -308,6 +313,7 @@ def measure_alignment(
         "policy_output_scale": policy_output_scale,
         "agents": len(seeds),
         "first_seed": min(seeds),
+        "seeds": seeds,
         # Of what files hold, for another may come to have its name.
         "checksums": {o.name: o.metadata["sha256"] for o in objectives if "sha256" in o.metadata},
     }
@@ -318,7 +324,8 @@ def measure_alignment(
         report = {
             **asked,
             "outcome_iqm": {c.objective: float(iqm(c.final)) for c in found},
-            "outcome": {c.objective: np.round(c.final, 2).tolist() for c in found},
+            # To as many digits as tell agents apart, of whatever size returns are.
+            "outcome": {c.objective: [float(f"{x:.6g}") for x in c.final] for c in found},
             "regimes": [],
             "versions": package_versions(),
             "machine": machine_description(),
@@ -328,7 +335,8 @@ def measure_alignment(
     names = {objective.name for objective in objectives}
     if stored != asked or set(report["outcome"]) != names:
         of = ", ".join(report["outcome"])
-        said = ", ".join(f"{k} {v}" for k, v in stored.items() if k != "checksums")
+        told = ("environment", "steps", "backend", "policy_output_scale", "agents", "first_seed")
+        said = ", ".join(f"{name} {stored[name]}" for name in told)
         raise UserError(
             f"{environment} was measured with other objectives, agents or steps ({of}; {said}): choose another --out."
         )

@@ -154,6 +154,10 @@ def certify(
         grid=f"{len(log_ratios)} log-ratios in [-{MAX_LOG_RATIO:g}, {MAX_LOG_RATIO:g}] x "
         f"{len(advantages)} advantages in [-10, 10] x {len(on_whole_grid)} training fraction"
         + ("s" if len(on_whole_grid) > 1 else "")
-        + (f", ratio 1 at {len(progress_values)}" if len(on_whole_grid) < len(progress_values) else ""),
+        + (
+            f", ratio 1 at {len(progress_values)}"
+            if len(on_whole_grid) < len(progress_values)
+            else ""
+        ),
         by_construction=by_construction,
     )

@@ -148,6 +148,7 @@ def distill_command(
                 "distill": config,
                 "of": loaded.name,
                 "of_sha256": loaded.metadata.get("sha256"),
+                "learned_on": list(loaded.learned_on),
             },
             "seeds": {"distill": config.seed},
             "results": {"r2": found.r2, "base_r2": found.base_r2, "front": found.front},

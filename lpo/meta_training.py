@@ -23,8 +23,9 @@ from lpo.objectives import Objective, load_objective, save_objective
 from scb import processes
 from scb.environments.registry import environment_spec
 from scb.environments.zoo import bandit_metadata
+from scb.errors import UserError
 from scb.evolution import EnvironmentSteps, EvolutionConfig, Outcome, evolve
-from scb.keys import split_key
+from scb.keys import root_key, split_key
 from scb.runs import Run, config_dict
 from scb.seeds import VALIDATING
 from scb.statistics import estimate
@@ -39,6 +40,10 @@ class MetaTraining:
     """The evolution problem: a candidate is a drift's weights, worth what agents make of it on every task."""
 
     def __init__(self, config: MetaTrainingConfig) -> None:
+        if not isinstance(jax.eval_shape(config.drift.init, root_key(0)), Mapping):
+            raise UserError(
+                f"the drift is of the family {config.drift.name}, which has nothing to learn: take a LearnedDrift."
+            )
         self.config = config
         self.tasks = {name: TaskTraining(config, name) for name in config.tasks}
         self.judges = self.tasks
@@ -156,7 +161,8 @@ def _story(problem: MetaTraining, outcome: Outcome, mean: Any, command: str) -> 
     """What a learned objective's .json says of its meta-training."""
     evolution: EvolutionConfig = problem.config.evolution
     judged = [
-        {"generation": line["generation"], "fitness": value}
+        # The last judgement is of what the last generation left.
+        {"generation": line["generation"] + (key == "final_mean/fitness"), "fitness": value}
         for line in outcome.metrics
         for key, value in line.items()
         if key in ("mean/fitness", "final_mean/fitness")

@@ -41,9 +41,9 @@ class Objective:
 
     @property
     def learned_on(self) -> tuple[str, ...]:
-        """The tasks of its search; none of a formula, which nobody searched for."""
+        """The tasks of its search, or of that of the objective which a formula writes down; none of other formulas."""
         config = self.metadata.get("config", {})
-        return tuple(config.get("meta_training", {}).get("tasks", ()))
+        return tuple(config.get("meta_training", {}).get("tasks", config.get("learned_on", ())))
 
 
 def zoo_names() -> list[str]:
@@ -147,6 +147,11 @@ def save_objective(
       parameters: its own.
       metadata: config (of the meta-training), seeds, results, cost, command.
     """
+    if not isinstance(parameters, Mapping):
+        raise UserError(
+            f"a drift of the family {drift.name} is its settings, and its parameters are no dict to be saved: name the "
+            "objective, such as ppo-0.3."
+        )
     told = drift.with_parameters(parameters)
     if told != drift:  # trained on: what its text says now is what is saved
         drift, parameters = told, told.init(root_key(0))

@@ -58,8 +58,7 @@ def numpy_drift(
 ) -> Callable[..., np.ndarray]:
     """The drift of an objective for NumPy; arguments and errors as for `drift_function`.
 
-    It computes in the floating-point type of what it is given, and in float64 for lists and
-    integers.
+    It computes in float32 or float64, as what it is given is, and in float64 for lists and integers.
 
     Raises:
       UserError: as `load_objective`.
@@ -156,6 +155,8 @@ def _evaluate(
                 "this drift depends on the fraction of training done: give progress, a number in [0, 1]."
             )
         progress = 0.0
+    if isinstance(progress, int | float) and not 0 <= progress <= 1:
+        raise UserError(f"progress is {progress}: it is the fraction of training done, in [0, 1].")
     # A traced JAX array is on no device yet.
     device = getattr(log_ratio, "device", None)
     like = partial(xp.asarray, dtype=log_ratio.dtype, device=device)

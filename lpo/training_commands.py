@@ -295,7 +295,7 @@ class AlignConfig(Agents):
 
     def regimes(self) -> list[Regime]:
         """Every combination of the values given."""
-        found = [
+        found = dict.fromkeys(
             Regime(*values, policy_output_scale=self.policy_output_scale)
             for values in itertools.product(
                 self.bandits,
@@ -306,7 +306,7 @@ class AlignConfig(Agents):
                 self.minibatches or (None,),
                 self.learning_rates or (None,),
             )
-        ]
+        )
         if not found:
             raise UserError("no regimes: give at least one value of each.")
         return found

@@ -166,11 +166,17 @@ class LongRun(ABC):
                 f"cannot resume {folder}: an earlier version started it, and this one would not end with the same "
                 f"numbers; remove it (rm -r {shlex.quote(str(folder))}), or start another with --out."
             )
-        if not command.startswith(cls.program):
+        try:
+            words, program = shlex.split(command), cls.program.split()
+        except ValueError as error:
+            raise UserError(
+                f"cannot resume {folder}: the command in its config.json is damaged ({error}); start another."
+            ) from error
+        if words[: len(program)] != program:
             raise UserError(
                 f"cannot resume {folder} with {cls.program}: it was started with {command}."
             )
-        return shlex.split(command)[len(cls.program.split()) :]
+        return words[len(program) :]
 
     @property
     def command(self) -> str:

@@ -47,7 +47,7 @@ from scb.measurement import Judge, Place, train_and_judge
 from scb.refinement import RefinementConfig, refined
 from scb.runs import Run, config_dict
 from scb.spaces import check_bounded, kind_of_actions
-from scb.strategies import strategy_for
+from scb.strategies import REMEMBERING, strategy_for
 from scb.warm_start import WarmStartConfig, expert_agent, warm_start
 
 INITS = ("random", "expert")
@@ -175,6 +175,12 @@ class DiscoveryConfig:
         if self.lists and self.fixed_hyperparameters:
             raise UserError(
                 "fixed hyperparameters are not drawn from lists: leave out the lists, or draw."
+            )
+        strategy = self.evolution.strategy
+        if self.mode == "sequential" and strategy in REMEMBERING:
+            raise UserError(
+                f"{strategy} compares fitness with that of earlier generations, which is another algorithm's in the "
+                "mode sequential: use the mode all, or choose another strategy, such as SNES."
             )
         if not self.evolution.num_generations and not (fitted or self.refinement.rounds):
             raise UserError(

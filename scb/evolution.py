@@ -28,7 +28,7 @@ from scb.keys import key_at, root_key, split_key
 from scb.runs import Run, Stopwatch
 from scb.seeds import VALIDATING, searching
 from scb.statistics import iqm
-from scb.strategies import STRATEGIES, strategy_for
+from scb.strategies import REMEMBERING, STRATEGIES, strategy_for
 
 COMBINATIONS = ("mean", "ranks")
 
@@ -80,6 +80,11 @@ class EvolutionConfig:
         if self.strategy == "Open_ES" and self.population_size % 2:
             raise UserError(
                 f"population_size is {self.population_size}: Open_ES samples antithetic pairs, so it must be even."
+            )
+        if self.combine == "ranks" and self.strategy in REMEMBERING:
+            raise UserError(
+                f"{self.strategy} compares fitness with that of earlier generations, which ranks among candidates of "
+                "one do not allow: combine by mean, or choose another strategy, such as SNES."
             )
         at_least(0, self, "num_generations")
         at_least(1, self, "mean_evaluations", "evaluate_mean_every", "checkpoint_every")
@@ -326,7 +331,8 @@ def evolve(
 
     evaluate = map_population(problem.evaluate, config.population_size, (0, None, None))
     steps = problem.steps()
-    history, total_seconds = (run.metrics(), run.seconds()) if run else ([], 0.0)
+    # Of several processes the first alone keeps the log.
+    history, total_seconds = (run.metrics(), run.seconds()) if run and checkpoints else ([], 0.0)
     watch = Stopwatch()
 
     def judge_mean(generation: int) -> dict[str, float]:

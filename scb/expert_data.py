@@ -44,7 +44,7 @@ class DatasetConfig:
         there. Agents that meet more than they need learn better what they need. For
         "action_distance" only.
       jitter: standard deviation of independent noise on every entry of the states, in deviations of the
-        entry, after that; the expert says what it does there. Entries hang together along the expert's
+        entry before it is stretched; the expert says what it does there. Entries hang together along the expert's
         trajectories, and agents that err leave these. For "action_distance" only.
       discount: of the Q-function.
       num_states: states that the dataset holds.
@@ -69,7 +69,9 @@ class DatasetConfig:
     def __post_init__(self) -> None:
         one_of("warm-start construction", self.construction, CONSTRUCTIONS)
         at_least(0, self, "min_spread", "jitter", "expert_noise", "expert_errors", "near_actions")
-        at_least(1, self, "num_states", "num_actions", "horizon")
+        at_least(1, self, "num_states", "horizon")
+        # Of the expert's alone there would be no reward to tell from another.
+        at_least(2, self, "num_actions")
         positive(self, "stretch")
         if not 0 <= self.discount <= 1:
             raise UserError(f"discount is {self.discount}: it must be between 0 and 1.")
@@ -213,8 +215,8 @@ def _stretched(observations: jax.Array, key: jax.Array, config: DatasetConfig) -
     """[S, O] states whose every entry has the least deviation, stretched and jittered."""
     flat = jnp.reshape(observations, (observations.shape[0], -1))
     mean, std = flat.mean(axis=0), flat.std(axis=0)
-    factors = config.stretch * jnp.maximum(1.0, config.min_spread / (std + 1e-8))
-    stretched = mean + (flat - mean) * factors
+    spread = jnp.maximum(1.0, config.min_spread / (std + 1e-8))
+    stretched = mean + (flat - mean) * (config.stretch * spread)
     if config.jitter:
-        stretched += config.jitter * std * jax.random.normal(key, flat.shape)
+        stretched += config.jitter * std * spread * jax.random.normal(key, flat.shape)
     return stretched

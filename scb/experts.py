@@ -216,7 +216,8 @@ def evolve_expert(
     evolution = config.evolution
     problem = _PolicySearch(env, env_params, config)
     outcome = evolve(problem, evolution, quiet=quiet, key=key_search)
-    steps = problem.steps().total * evolution.population_size * evolution.num_generations
+    cost = outcome.cost(problem, evolution, best=False)
+    steps = sum(n for name, n in cost.items() if name.startswith("environment_steps"))
     return judged(problem.policy(outcome.mean), env, env_params, key_judge, steps)
 
 

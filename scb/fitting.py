@@ -123,13 +123,16 @@ def _fit_linear(
     """The closed form, and how much of the expert's actions it explains."""
     check_linear(construction)
     states = np.asarray(dataset.observation)
-    best = np.reshape(dataset.expert_action, (len(states), -1))
+    best = np.reshape(np.asarray(dataset.expert_action), (len(states), -1))
     low, high = bandit.bounds
     weights = fitted(states, best, low, high)
     parts = PolicyDistanceParts.of(weights["reward"], low, high, np)
-    errors, variance = parts.action(parts.best(states)) - best, best.var(axis=0).mean()
-    # Of one action that is held throughout there is nothing to explain.
-    return weights, {"action_r2": float(1.0 - errors.var() / variance) if variance else 1.0}
+    errors = np.asarray(parts.action(parts.best(states)) - best, np.float64)
+    # Of one action that is held throughout there is nothing to explain but rounding.
+    if (np.ptp(best, axis=0) <= 1e-6 * (high - low)).all():
+        return weights, {"action_r2": 1.0}
+    unexplained = np.sum(errors**2) / np.sum((best - best.mean(axis=0, dtype=np.float64)) ** 2)
+    return weights, {"action_r2": float(1.0 - unexplained)}
 
 
 def energy_distance(a: jax.Array, b: jax.Array) -> jax.Array:

@@ -19,6 +19,7 @@ from scb.environments.spec import BANDIT
 from scb.environments.synthetic import BanditConfig, SyntheticBandit, bandit_for
 from scb.environments.zoo import save_bandit
 from scb.errors import UserError, one_of
+from scb.files import make_folder
 
 # The release's name of a bandit -> its evaluation environment.
 PUBLISHED_BANDITS = {
@@ -83,6 +84,7 @@ def import_published(source: str | Path, out: str | Path) -> list[Path]:
       UserError: see `published_bandit`; or the folder is missing or holds no .npz.
     """
     bandits = [(path, published_bandit(path)) for path in _sources(Path(source))]
+    make_folder(Path(out))
     return [
         save_bandit(
             Path(out) / f"{bandit.name}.npz",

@@ -94,6 +94,11 @@ class LinearSearchConfig:
         at_least(1, self, "judge_every", "reach")
         at_least(0, self, "action_noise", "action_errors", "error_warmup")
         positive(self, "sigma", "learning_rate", "decay")
+        if self.starts > 1 and self.generations < 2:
+            raise UserError(
+                f"there are {self.starts} starts, and {self.generations} generation to choose among them and go on: "
+                "take at least 2, or one start."
+            )
         if self.best > self.directions:
             raise UserError(f"best is {self.best} of {self.directions} directions: take no more.")
 
@@ -186,7 +191,8 @@ class _LinearSearch:
             optimizer=optax.sgd(optax.exponential_decay(config.learning_rate, 1, config.decay)),
             std_schedule=optax.exponential_decay(config.sigma, 1, config.decay),
         )
-        self._ars.elite_ratio = config.best / config.directions
+        # Half a direction more, as evosax rounds down.
+        self._ars.elite_ratio = min(1.0, (config.best + 0.5) / config.directions)
         self._roll = map_population(self._episode, 2 * config.directions, (0, None, 0, None))
         self._ask, self._tell = jax.jit(self._asked), jax.jit(self._told)
         self._mean_return = jax.jit(self._judged)

@@ -5,6 +5,7 @@
 training, agent by agent (`scb.rows`), so that a measurement that was killed goes on where it stopped.
 """
 
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import lru_cache
@@ -21,7 +22,7 @@ from scb.agents.agent import Agent
 from scb.agents.spec import AgentSpec
 from scb.artefacts import package_versions
 from scb.environments.registry import environment_spec
-from scb.errors import UserError, at_least
+from scb.errors import UserError, at_least, one_of
 from scb.evaluation import Episodes
 from scb.evolution import map_population
 from scb.files import plain
@@ -151,7 +152,7 @@ class Agents:
     @classmethod
     def seeded(cls, spec: AgentSpec, seeds: Sequence[int]) -> "Agents":
         """One agent a seed, with the specification's own hyperparameters."""
-        check_seeds(seeds)
+        seeds = check_seeds(seeds)
         keys = jax.vmap(root_key)(np.asarray(seeds, np.uint32))
         return cls([(seed, 0) for seed in seeds], keys, spec.repeated(len(seeds)))
 
@@ -177,13 +178,23 @@ def as_random(returns: np.ndarray, place: Place) -> tuple[np.ndarray, np.ndarray
     return returns, failed
 
 
-def check_seeds(seeds: Sequence[int]) -> None:
-    """Raises a UserError where there are no seeds, or one is not a number of 32 bits."""
-    if not seeds:
+def check_seeds(seeds: Sequence[int]) -> list[int]:
+    """The seeds, as Python's integers.
+
+    Raises:
+      UserError: there are none, one is no whole number of 32 bits, or is there twice.
+    """
+    if not len(seeds):
         raise UserError("no seeds: give at least one.")
     for seed in seeds:
-        if not 0 <= seed < 2**32:
-            raise UserError(f"a seed is {seed}: each must be 0 or larger, and below 2^32.")
+        if not (0 <= seed < 2**32 and seed == int(seed)):
+            raise UserError(
+                f"a seed is {seed}: each must be a whole number, 0 or larger, and below 2^32."
+            )
+    whole = [int(seed) for seed in seeds]
+    if repeated := [seed for seed, number in Counter(whole).items() if number > 1]:
+        raise UserError(f"seed {repeated[0]} is there twice: give each once.")
+    return whole
 
 
 def measure(
@@ -229,6 +240,13 @@ def measure(
       UserError: the rows hold such agents measured under another configuration.
     """
     at_least(1, points=points, episodes=episodes, side_by_side=side_by_side)
+    actions = (actions,) if isinstance(actions, str) else actions
+    for kind in actions:
+        one_of("kind of actions", kind, (MODE, SAMPLED))
+    if spec.algorithm != "ppo" and (objectives or diagnose):
+        raise UserError(
+            f"objectives and diagnoses are of PPO's updates, and the algorithm is {spec.algorithm}: leave them out."
+        )
     judge_in, rows = judge_in or train_in, Rows() if rows is None else rows
     agents = agents if isinstance(agents, Agents) else Agents.seeded(spec, agents)
     every, iterations = None, spec.config.num_iterations
@@ -319,7 +337,7 @@ def measure(
                         for kind in actions
                     ],
                 )
-            done = sum(len(cells[name].done) for name in names)
+            done = sum(agents.names[i] in cells[name].done for name, i in wanted)
             tell(f"{', '.join([judge_in.name, *parameters])}: {done} of {len(wanted)} agents")
     return [row for cell in cells.values() for one in agents.names for row in cell.done[one]]
 

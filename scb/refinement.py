@@ -23,7 +23,7 @@ from scb.aggregation import Fit, Learned, Learners, best_round
 from scb.console import progress_console
 from scb.environments.linear import PolicyDistanceParts, units, with_states
 from scb.environments.synthetic import SyntheticBandit, Weights
-from scb.errors import at_least
+from scb.errors import at_least, unused
 from scb.evaluation import evaluate
 from scb.evolution import map_population
 from scb.keys import key_at, split_key
@@ -58,6 +58,13 @@ class RefinementConfig:
     def __post_init__(self) -> None:
         at_least(0, self, "rounds")
         at_least(1, self, "generations", "agents")
+        if not self.rounds:
+            unused(
+                self,
+                "there are no refinement rounds",
+                ("generations", "agents", "visits"),
+                "take at least 1",
+            )
 
 
 def refined(

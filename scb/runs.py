@@ -79,7 +79,7 @@ class Run:
                     f"cannot resume {folder}: its config differs at {difference}; resume with the config it was "
                     "started with, or start a new folder."
                 )
-            make_folder(folder)
+            make_folder(folder, "--resume")
             _lock(folder)
             if stored != asked:
                 write_json(folder / "config.json", config)
@@ -102,12 +102,17 @@ class Run:
             path = self.folder / name
             if not path.exists():
                 continue
-            kept = []
-            for line in path.read_text().splitlines():
+            kept, lines = [], path.read_text().splitlines()
+            for number, line in enumerate(lines, 1):
                 try:
                     generation = json.loads(line)["generation"]
-                except (json.JSONDecodeError, KeyError):
-                    break  # the half line that a kill left at the end
+                except (ValueError, KeyError, TypeError) as error:
+                    if number == len(lines):
+                        break  # the half line that a kill left at the end
+                    raise UserError(
+                        f"line {number} of {path} is damaged ({error}): mend it, or remove the file, of which "
+                        "nothing but the log is lost."
+                    ) from error
                 if generation < step:
                     kept.append(line + "\n")
             write_text(path, "".join(kept))

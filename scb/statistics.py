@@ -211,6 +211,7 @@ def few_groups_difference(
     Raises:
       UserError: another shape; groups of other numbers to pair; a single group, or run; NaN or infinity.
     """
+    _check_confidence(confidence)
     first, second = _comparable(groups, minus, paired_groups)
     if len(first) == len(second) == 1 or first.shape[1] < 2:
         raise UserError(
@@ -283,6 +284,11 @@ def spearman(a: ArrayLike, b: ArrayLike) -> float | None:
     return float(scipy.stats.spearmanr(first, second).statistic)
 
 
+def _check_confidence(confidence: float) -> None:
+    if not 0 < confidence < 1:
+        raise UserError(f"confidence is {confidence}: give a number between 0 and 1, such as 0.95.")
+
+
 def _bootstrapped(
     statistic: Callable[[Rows], NDArray[np.floating]],
     sizes: Sequence[int],
@@ -303,8 +309,7 @@ def _bootstrapped(
       sizes: runs of every group; a single run cannot tell its spread.
       seed: of the resampling; the same input gives the same interval.
     """
-    if not 0 < confidence < 1:
-        raise UserError(f"confidence is {confidence}: give a number between 0 and 1, such as 0.95.")
+    _check_confidence(confidence)
     value, n = float(statistic(lambda size: np.arange(size)[None])[0]), sum(sizes)
     if min(sizes) < 2:
         return Estimate(value, None, None, n)

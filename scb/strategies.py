@@ -41,6 +41,17 @@ STRATEGIES: dict[str, Any] = {
     for name, algorithm in evosax.algorithms.algorithms.items()
     if name not in _UNSUPPORTED
 }
+# These compare a fitness with those of earlier generations, or return the best that ever was, so that fitness has to
+# mean the same in all.
+REMEMBERING = {
+    "CMAAnchoredLES",
+    "EvoTF_ES",
+    "HillClimbing",
+    "LES",
+    "SimulatedAnnealing",
+    "iAMaLGaM_Full",
+    *(STRATEGIES.keys() - evosax.algorithms.distribution_based_algorithms.keys()),
+}
 
 
 class Strategy:

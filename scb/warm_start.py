@@ -169,6 +169,10 @@ class WarmStartConfig(DatasetConfig):
         at_least(1, self, "num_experts", "expert_generations", "expert_starts")
         at_least(1, self, "expert_episode_steps", "expert_reach", "fit_steps", "aggregation_agents")
         positive(self, "expert_sigma", "expert_learning_rate", "expert_decay")
+        if not self.aggregation_rounds:
+            unused(
+                self, "there are no aggregation rounds", ("aggregation_agents",), "take at least 1"
+            )
         if self.expert_error_warmup > self.expert_generations:
             raise UserError(
                 f"expert_error_warmup is {self.expert_error_warmup} of {self.expert_generations} generations: the "
@@ -261,7 +265,7 @@ def warm_start(
 
     expert = find_expert(place, key_expert, config, quiet, worth, folder)
     random = environment_spec(place.name).random_return(place.backend)
-    if expert.mean_return < random:
+    if not expert.mean_return >= random:  # of a simulation that breaks down it is no number
         raise UserError(
             f"the expert of {place.name} earns {expert.mean_return:.4g} and random actions {random:.4g}: give it more "
             "steps or generations, or choose another expert."

@@ -11,7 +11,7 @@ BLOCKS = re.findall(r"```python\n(.*?)```", README.read_text(), re.S)
 SHORTER = (
     ("scb.PPOConfig(activation", "scb.PPOConfig(total_steps=1000, activation"),
     ("scb.SACConfig()", "scb.SACConfig(total_steps=1500)"),
-    ("total_steps=500_000", "total_steps=2048"),
+    ("total_steps=150_000", "total_steps=10_000"),
     (
         "population_size=32, num_generations=30,",
         "population_size=2, num_generations=1, mean_evaluations=2,",

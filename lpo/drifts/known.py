@@ -11,6 +11,7 @@ from lpo.drifts.bases import DPO_ALPHA, DPO_BETA, discovered_drift
 from lpo.drifts.contract import Array, Drift
 from scb.agents.ppo import clipped_surrogate_drift
 from scb.errors import UserError
+from scb.keys import root_key
 
 
 @dataclass(frozen=True)
@@ -51,6 +52,13 @@ class DPODrift(Drift):
 
     def init(self, key: jax.Array, scale: float = 1.0) -> dict[str, jax.Array]:
         return {"alpha": jnp.float32(self.alpha), "beta": jnp.float32(self.beta)}
+
+    def with_parameters(self, parameters: Any) -> "DPODrift":
+        given, own = (
+            {name: float(x) for name, x in of.items()}
+            for of in (parameters, self.init(root_key(0)))
+        )
+        return self if given == own else DPODrift(**given)
 
     def __call__(
         self, parameters: Any, log_ratio: Array, advantage: Array, progress: Array, xp: Any = jnp

@@ -21,7 +21,7 @@ from scb.errors import at_least
 from scb.files import make_folder, write_json
 from scb.judgement import evaluation_place
 from scb.keys import root_key, split_key
-from scb.measurement import Place
+from scb.measurement import Place, check_seeds
 from scb.spaces import flat_bounds
 from scb.statistics import estimate
 
@@ -129,7 +129,7 @@ def explain_command(
     from scb.analysis import figures, page
 
     at_least(1, episodes=episodes)
-    at_least(0, seed=seed)
+    check_seeds([seed])
     if html:
         interactive.plotly()  # before the work, not after it
     loaded = open_bandit(bandit)
@@ -145,6 +145,8 @@ def explain_command(
     )
     for name, share in sorted(numbers["importance"].items(), key=lambda item: -item[1]):
         printer.print(f"  {share:6.1%} of the reward's variance: {name}")
+    if not parts:
+        printer.print("It has a single observation, so that there is no plane to draw.")
     if parts:
         plotting.save(figures.explained(parts), folder / "explain.png")
     if parts and html:

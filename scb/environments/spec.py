@@ -9,6 +9,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache, partial
+from pathlib import Path
 from typing import Any, TypeAlias
 
 from gymnax.environments import environment
@@ -90,12 +91,14 @@ class EnvironmentSpec:
 
     def physics(self, backend: str | None = None) -> str | None:
         """The physics where `backend` is chosen for several environments: None where this one has no choice."""
-        return (backend or self.default_backend) if self.backends else None
+        choice = self.backends or self.family == "custom"  # whose maker knows its own
+        return (backend or self.default_backend) if choice else None
 
     @property
     def bandit(self) -> str:
         """What a bandit for this environment is called; a file may have this name."""
-        return f"Synthetic-{self.name.replace(':', '-')}"
+        name = Path(self.name).stem if self.name.endswith(".npz") else self.name
+        return f"Synthetic-{name.replace(':', '-')}"
 
     @property
     def synthetic(self) -> bool:

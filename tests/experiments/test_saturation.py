@@ -12,10 +12,10 @@ def test_what_lies_beyond_an_end_is_the_same_action():
     # Two agents in two states, two actions: the first 2 and 3, both 1 after the clip; the second switches.
     means = np.array([[[2.0, 0.5], [2.0, -0.5]], [[3.0, 0.5], [3.0, -0.5]]])
     found = spread(means)
-    assert found["beyond"] == 0.5  # the first of each two
+    assert found["beyond"] == pytest.approx([0.5, 0.5])  # the first of each two
     # Each is 0.5 from their mean of 2.5 in one action of two: sqrt(0.5^2 / 2).
-    assert found["apart"] == pytest.approx(np.sqrt(0.125))
-    assert found["clipped"] == 0.0
+    assert found["apart"] == pytest.approx(np.sqrt([0.125, 0.125]))
+    assert found["clipped"] == pytest.approx([0.0, 0.0])
     assert found["directions"] == pytest.approx(1.0)
 
 
@@ -30,8 +30,11 @@ def test_a_bandit_of_ours_is_taken_where_there_is_one():
 
 
 def entry(beyond, apart, clipped):
-    means = {"beyond": beyond, "apart": apart, "clipped": clipped, "directions": 2.0}
-    return {**means, "returns": "100 200 300 400", "actions": 6}
+    means = {"beyond": beyond, "apart": apart, "clipped": clipped}
+    of_agents = {
+        name: " ".join(str(x + d) for d in (-0.04, -0.01, 0.01, 0.04)) for name, x in means.items()
+    }
+    return {**of_agents, "directions": 2.0, "returns": "100 200 300 400", "actions": 6}
 
 
 def test_the_page_says_where_the_clip_takes_most():
@@ -44,11 +47,15 @@ def test_the_page_says_where_the_clip_takes_most():
     }
     page = saturation.EXPERIMENT.page(report)
     assert "Furthest goes the published bandit of halfcheetah: 95 %" in page
-    assert "| hopper, ours | 250 [" in page and "| 20 % | 0.50 | 0.40 | 2.0 of 6 |" in page
+    assert (
+        "| hopper, ours | 250 [" in page
+        and "| 0.20 [0.16, 0.24] | 0.50 [0.46, 0.54] | 0.40 [0.36, 0.44] | 2.0 of 6 |" in page
+    )
     (axes,) = saturation.EXPERIMENT.figures(report)["saturation"].axes
     labels = [label.get_text() for label in axes.get_yticklabels()]
     assert labels == ["hopper, ours", "hopper, published", "halfcheetah, published"]
-    assert "95 % beyond the ends" in {text.get_text() for text in axes.texts}
+    low, high = axes.get_xlim()
+    assert low == 0 and high > 0.74  # the outermost agent
 
 
 @pytest.mark.parametrize(

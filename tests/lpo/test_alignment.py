@@ -22,9 +22,14 @@ from lpo.alignment import (
 from lpo.fitness import LABELS
 from scb import plotting
 from scb.agents.spec import environment_agent
+from scb.environments.registry import make
 from scb.environments.spec import EnvironmentSpec
+from scb.environments.synthetic import BanditConfig
+from scb.environments.synthetic_mdp import synthetic_for
+from scb.environments.zoo import save_bandit
 from scb.errors import UserError
 from scb.evolution import map_population
+from scb.keys import root_key
 
 TINY = Regime(reward_noise=0.0, contexts=10, iterations=4, epochs=1, minibatches=1)
 
@@ -41,6 +46,20 @@ def test_alignment_is_one_where_the_orders_agree_and_minus_one_where_they_are_re
     assert alignment(returns(a=3.0, b=2.0, c=1.0), outcome).spearman == -1.0
     # One pair exchanged: 1 - 6 (0 + 1 + 1) / (3 (9 - 1)) = 0.5.
     assert alignment(returns(a=1.0, b=3.0, c=2.0), outcome).spearman == pytest.approx(0.5)
+
+
+def test_the_mean_of_a_fitness_counts_and_the_interquartile_mean_of_an_outcome():
+    # By their medians the fitnesses of a and b would change places; by its mean c's outcome would be the lowest.
+    fitness = {"a": np.array([0.0, 0.0, 0.0, 100.0]), "b": np.full(4, 10.0), "c": np.full(4, 30.0)}
+    outcome = {"a": np.full(4, 2.0), "b": np.full(4, 1.0), "c": np.array([3.0, 3.0, 3.0, -100.0])}
+    assert alignment(fitness, outcome).spearman == 1.0
+
+
+def test_the_interval_of_an_alignment_leaves_out_a_fortieth_on_either_side():
+    # Drawn anew, all three agents of a are its best in one of 27 resamples, in which it overtakes b.
+    fitness = {"a": np.array([0.0, 0.0, 9.0]), "b": np.full(3, 8.0), "c": np.full(3, 20.0)}
+    found = alignment(fitness, returns(a=1.0, b=2.0, c=3.0))
+    assert (found.spearman, found.low, found.high) == (1.0, 0.5, 1.0)
 
 
 def test_agents_that_scatter_more_than_objectives_differ_leave_a_wide_interval():
@@ -83,9 +102,21 @@ def test_what_cannot_be_ranked_is_refused(fitness, outcome, message, one_sentenc
             {"reward_noise": float("inf")},
             "reward_noise is inf: it must be 0 or larger, and finite.",
         ),
+        (
+            {"bandit": "mdp.npz"},
+            "reward_noise is 5, and 'mdp.npz' is a synthetic MDP, whose reward has none: take 0.",
+        ),
     ],
 )
-def test_a_regime_that_cannot_be_is_refused(arguments, message, one_sentence):
+def test_a_regime_that_cannot_be_is_refused(
+    arguments, message, one_sentence, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    env, params = make("Pendulum-v1")
+    mdp = synthetic_for(env, params, "T", BanditConfig(hidden_size=2), "mdp", None)
+    told = {"config": {"evaluation_environment": "Pendulum-v1"}, "command": "none"}
+    told |= {"seeds": {}, "results": {}, "cost": {}}
+    save_bandit(tmp_path / "mdp.npz", mdp, mdp.init_weights(root_key(0)), told)
     with pytest.raises(UserError) as error:
         Regime(**arguments)
     assert message in one_sentence(str(error.value))
@@ -148,6 +179,28 @@ def test_the_environment_of_a_bandit_has_the_physics_asked_for(monkeypatch):
     regime_fitness(replace(TINY, bandit="Synthetic-hopper"), known_drifts()[:1], [1], "spring")
     assert ("hopper", "spring") in made
     module.forget_programs()
+
+
+def test_a_regime_trains_every_objective_on_every_seed_under_its_noise(monkeypatch):
+    met = {}
+
+    def program(regime, drift, size, backend):
+        def called(*arguments):
+            names = ("clips", "seeds", "hyperparameters", "judged_in", "trained_in")
+            met.update(zip(names, arguments, strict=True))
+            return np.tile(np.arange(float(size))[:, None], len(LABELS))
+
+        return called
+
+    monkeypatch.setattr(module, "_program", program)
+    regime = replace(TINY, reward_noise=5.0, learning_rate=0.5)
+    first, second = known_drifts()[:2]
+    found = regime_fitness(regime, [first, second], [3, 2])
+    np.testing.assert_array_equal(met["seeds"], [3, 2, 3, 2])
+    np.testing.assert_allclose(met["clips"], [0.05, 0.05, 0.1, 0.1])
+    assert met["hyperparameters"].learning_rate == 0.5
+    assert met["judged_in"].reward_noise == 0.0 < met["trained_in"].reward_noise
+    assert found[second.name]["transfer"].tolist() == [2.0, 3.0]
 
 
 @pytest.mark.slow

@@ -166,6 +166,15 @@ def test_the_kink_is_the_rise_of_the_penalty_around_ratio_one():
         assert found.kink == pytest.approx(0.0, abs=1e-3)
 
 
+def test_the_kink_is_over_normal_advantages_and_the_largest_of_the_training():
+    # The mean of |A| is sqrt(2 / pi) = 0.798; the grid has eleven advantages.
+    found = certify(Formula(lambda x, a, p: 0.1 * jnp.abs(a * x)), (), num_advantages=401)
+    assert found.kink == pytest.approx(0.0798, rel=1e-2)
+    early = certificate(lambda x, a, p: jnp.where(p < 0.1, 0.5 * jnp.abs(x), 0.0))
+    assert early.kink == pytest.approx(0.5, rel=1e-2)
+    assert early.slope_at_0_01 == pytest.approx(0.5 / 0.99, rel=1e-3)
+
+
 @pytest.mark.parametrize(
     ("formula", "stalls"),
     [

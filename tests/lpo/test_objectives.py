@@ -15,7 +15,14 @@ from lpo.certificate import certify
 from lpo.drifts import ClipDrift, DPODrift, LearnedDrift, NoDrift
 from lpo.drifts.contract import BASES
 from lpo.drifts.network import FEATURES
-from lpo.objectives import load_objective, objective_names, save_objective, zoo_names
+from lpo.objectives import (
+    Objective,
+    learned_in,
+    load_objective,
+    objective_names,
+    save_objective,
+    zoo_names,
+)
 from scb.environments.synthetic import BanditConfig, SyntheticBandit
 from scb.environments.zoo import save_bandit
 from scb.errors import UserError
@@ -102,6 +109,28 @@ def test_a_saved_objective_charges_the_same_bit_for_bit(tmp_path, base):
     np.testing.assert_array_equal(
         loaded.drift(loaded.parameters, *arguments), drift(parameters, *arguments)
     )
+
+
+def test_a_closed_form_without_parameters_by_name_is_not_saved(tmp_path):
+    drift = ClipDrift(0.3)
+    with pytest.raises(UserError, match=r"family clip is its settings.* such as ppo-0\.3"):
+        save_objective(tmp_path / "mine.npz", drift, drift.init(jax.random.key(0)), METADATA)
+    assert not list(tmp_path.iterdir())
+
+
+def test_dpo_is_saved_with_the_parameters_it_has(tmp_path):
+    trained = {"alpha": jnp.float32(4.0), "beta": jnp.float32(1.5)}
+    path, _ = save_objective(tmp_path / "mine.npz", DPODrift(), trained, METADATA)
+    loaded = load_objective(path)
+    assert loaded.drift == DPODrift(4.0, 1.5) and loaded.parameters == trained
+    path, _ = save_objective(tmp_path / "own.npz", DPODrift(), DPODrift().init(None), METADATA)
+    assert load_objective(path).drift == DPODrift()
+
+
+def test_what_a_formula_writes_down_was_learned_where_its_original_was():
+    config = {"distill": {}, "of": "lpo-pendulum", "learned_on": ["Synthetic-Pendulum-v1"]}
+    formula = Objective("closed_form", DPODrift(), {}, {"config": config})
+    assert learned_in([formula]) == ["Pendulum-v1"]
 
 
 def test_a_copy_goes_by_the_name_of_its_own_file(file):

@@ -94,6 +94,11 @@ def test_a_far_ratio_costs_what_the_farthest_that_training_meets_costs(objective
     np.testing.assert_array_equal(drift(far, advantage, 0.5), drift(bound, advantage, 0.5))
 
 
+def test_a_progress_in_per_cent_is_told():
+    with pytest.raises(UserError, match=r"progress is 50: it is the fraction of training done"):
+        numpy_drift("ta-lpo")([0.1], [1.0], 50)
+
+
 @every_objective
 def test_one_progress_holds_for_the_whole_batch(objective):
     log_ratio, advantage, _ = points(1.0)

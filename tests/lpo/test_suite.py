@@ -53,6 +53,26 @@ def test_zero_is_random_and_one_is_the_reference():
     assert scores.sources[1] == "the best objective here"
 
 
+def scored(scores) -> SuiteScores:
+    """Of one objective."""
+    scores = np.asarray([scores], np.float64)
+    names = [f"e{i}" for i in range(scores.shape[1])]
+    zeros, ones = [0.0] * len(names), [1.0] * len(names)
+    return SuiteScores(names, ["ppo"], scores, zeros, ones, ["published"] * len(names), [])
+
+
+def test_seeds_are_drawn_anew_in_every_environment():
+    # Where both draw the same seeds, the four runs are always two zeros and two ones.
+    (found,) = scored([[0.0, 1.0], [1.0, 0.0]]).aggregate()
+    assert (found.value, found.low, found.high) == (0.5, 0.0, 1.0)
+
+
+def test_the_interval_of_a_suite_leaves_out_a_fortieth_on_either_side():
+    # Of three seeds the lowest is drawn three times in one of 27 resamples.
+    (found,) = scored([[0.0, 1.0, 2.0]]).aggregate()
+    assert (found.value, found.low, found.high) == (1.0, 0.0, 2.0)
+
+
 def test_one_seed_has_no_interval():
     one = suite_scores(
         {"CartPole-v1": comparison("CartPole-v1", ppo=[260.0], dpo=[500.0])}, {"CartPole-v1": 20.0}

@@ -76,6 +76,13 @@ def test_advantages_count_by_the_normal_density():
         advantages=np.array([0.5, 2.0]),
     )
     assert analysis.fractions["rolls back"] == pytest.approx(0.1353 / (0.1353 + 0.8825), abs=1e-4)
+    assert analysis.beyond["positive"]["rolls back"] == analysis.fractions["rolls back"]
+
+
+def test_an_update_stops_where_next_to_nothing_of_the_surrogate_is_left():
+    # Beyond 1.3 four hundredths.
+    slow = objective(lambda x, a, p: 0.96 * a * jax.nn.relu(jnp.exp(x) - 1.3))
+    assert analyze(slow).stops == {1.0: pytest.approx(1.3, rel=1e-3), -1.0: None}
 
 
 def test_without_a_drift_nothing_is_held_back():
@@ -131,6 +138,8 @@ def test_a_drift_that_depends_on_progress_is_judged_at_it():
     assert names(analyze(late, 0.0, **grid)) == [["optimistic"]]
     assert names(analyze(late, 0.5, **grid)) == [["flat"]]
     assert names(analyze(late, 1.0, **grid)) == [["rolls back"]]
+    assert analyze(late, 0.0, **grid).stops[1.0] is None
+    assert analyze(late, 1.0, **grid).stops[1.0] == pytest.approx(1.0, abs=1e-3)
 
 
 def test_gradients_are_those_of_the_objective():

@@ -142,6 +142,15 @@ pytestmark = pytest.mark.usefixtures("small_agents")
             "num_experts is 3, and nothing is fitted to an expert",
         ),
         ("discover --out elsewhere --resume FOLDER", "--out is elsewhere and --resume"),
+        ("explain Synthetic-Pendulum-v1 --seed 4294967296 --out new", "a seed is 4294967296"),
+        (
+            "discover --strategy DifferentialEvolution",
+            "DifferentialEvolution compares fitness with that of earlier generations, which ranks",
+        ),
+        (
+            "discover --strategy HillClimbing --combine mean --mode sequential",
+            "HillClimbing compares fitness with that of earlier generations, which is another",
+        ),
         ("train --seed 4294967296 --out new", "a seed is 4294967296: each must be 0 or larger"),
         ("discover --judge-episodes 0", "judge_episodes is 0: it must be at least 1"),
         ("import-published nowhere", "nowhere does not exist: give the published"),
@@ -247,6 +256,14 @@ OLD = {
         (
             {"command": "lpo meta-train --seed=3", "config": {}},
             "with scb discover: it was started with lpo meta-train --seed=3.",
+        ),
+        (
+            {"command": "scb discovery --seed=3", "config": {}},
+            "with scb discover: it was started with scb discovery --seed=3.",
+        ),
+        (
+            {"command": "scb discover 'x", "config": {}},
+            "the command in its config.json is damaged (No closing quotation)",
         ),
         (
             {"command": "scb discover --seed=7", "config": {"environment": "CartPole-v1"}},

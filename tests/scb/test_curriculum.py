@@ -143,6 +143,11 @@ def test_a_rescaled_curriculum_reaches_its_end_within_the_search(name):
         (("linear", 1, 2, -1, 1), "begins is -1: it must be 0 or larger."),
         (("linear", 1, 2, 0, 0), "transition is 0"),
         (("constant", 1, 2, 0, 1), "cannot go from 1 to 2"),
+        (
+            ("linear", 1, 2**31, 0, 1),
+            "the curriculum's final length is 2147483648: it must be below",
+        ),
+        (("linear", 1, 2, 0, 2**31), "the curriculum's transition is 2147483648: it must be below"),
     ],
 )
 def test_a_curriculum_that_cannot_be_is_refused(arguments, message):

@@ -8,6 +8,7 @@ from scb.cli import main
 from scb.environments.registry import environment_spec, make
 from scb.environments.zoo import bandit_metadata
 from scb.errors import UserError
+from scb.measurement import Place
 
 MODULE = """
 import gymnax
@@ -19,6 +20,10 @@ def alone():
 def with_parameters(length=7):
     env, params = gymnax.make("Pendulum-v1")
     return env, params.replace(max_steps_in_episode=length)
+
+def with_physics(backend="hard"):
+    env, params = gymnax.make("Pendulum-v1")
+    return env, params.replace(g={"soft": 1.0, "hard": 10.0}[backend])
 
 def pole():
     return gymnax.make("CartPole-v1")
@@ -54,6 +59,13 @@ def test_an_environment_is_what_the_factory_returns(module):
     spec = environment_spec(f"{module}:with_parameters")
     assert spec.episode_limit == 7 and spec.bandit == f"Synthetic-{module}-with_parameters"
     assert spec.random_return() < -5
+
+
+def test_the_physics_that_a_factory_takes_is_part_of_the_place(module):
+    name = f"{module}:with_physics"
+    soft, hard = (Place.named(name, backend) for backend in ("soft", "hard"))
+    assert (soft.backend, hard.backend, Place.named(name).backend) == ("soft", "hard", None)
+    assert (soft.params.g, hard.params.g) == (1.0, 10.0)
 
 
 @pytest.mark.parametrize(

@@ -36,6 +36,10 @@ def test_a_bandit_that_says_nothing_goes_by_the_name_it_was_saved_under(tmp_path
         spec.evaluation_environment  # noqa: B018
 
 
+def test_a_bandit_of_a_file_is_called_by_the_files_name(tmp_path):
+    assert environment_spec(saved(tmp_path, {}, "mine")).bandit == "Synthetic-mine"
+
+
 @pytest.mark.parametrize("name", zoo_names())
 def test_the_zoos_bandits_stand_for_environments_whose_bandits_they_are(name):
     home = environment_spec(environment_spec(name).evaluation_environment)

@@ -8,6 +8,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 
 import chex
+import evosax.algorithms
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -26,8 +27,9 @@ from scb.evolution import (
     map_population,
     rank_failed_last,
 )
+from scb.keys import key_at, root_key, split_key
 from scb.runs import Run, config_dict, read_config
-from scb.strategies import STRATEGIES
+from scb.strategies import REMEMBERING, STRATEGIES, Strategy
 from tests.scb.probes import Parabola
 
 CONFIG = EvolutionConfig(
@@ -93,6 +95,32 @@ def test_every_strategy_that_is_offered_gets_closer_to_the_maximum(strategy):
     start = 3.0 * math.sqrt(outcome.best_mean["x"].size)
     assert distance(outcome.best_mean) < 0.75 * start
     assert sum(column(outcome, "failed")) == 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "strategy", sorted(STRATEGIES.keys() & evosax.algorithms.distribution_based_algorithms.keys())
+)
+def test_a_strategy_remembers_fitness_where_another_scale_a_generation_moves_it(strategy):
+    found = []
+    for shift in (0.0, 5.0):
+        config = replace(CONFIG, strategy=strategy, population_size=32, sigma=0.5)
+        search = Strategy(config, jnp.ones(20))
+        state = search.start(root_key(0), jnp.ones(20))
+        for generation in range(4):
+            key_ask, key_tell = split_key(key_at(root_key(1), generation))
+            population, state = search.ask(key_ask, state)
+            fitness = -np.sum(np.square(population), axis=1) - shift * generation
+            state = search.tell(key_tell, population, fitness, state)
+        found.append(search.ask(root_key(2), state)[0])
+    same = np.allclose(*found, atol=1e-6)
+    assert np.isfinite(found).all() and same == (strategy not in REMEMBERING)
+
+
+@pytest.mark.parametrize("strategy", ["DifferentialEvolution", "HillClimbing"])
+def test_ranks_are_not_for_a_strategy_that_remembers_fitness(strategy):
+    with pytest.raises(UserError, match=f"{strategy} compares fitness with that of earlier"):
+        EvolutionConfig(strategy=strategy, combine="ranks")
 
 
 class Slope(Parabola):

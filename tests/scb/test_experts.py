@@ -93,8 +93,10 @@ def test_an_evolved_policy_solves_a_corridor(evolved):
 
 
 def test_the_steps_of_an_evolution_are_counted(evolved):
-    # 12 generations of 16 candidates with 1 episode of 4 steps; then 20 episodes that judge it.
-    assert evolved.environment_steps == 12 * 16 * 4 + 20 * 4
+    # 12 generations of 16 candidates with 1 episode of 4 steps; their mean before and after, by so many agents; then
+    # 20 episodes that judge it.
+    agents = EVOLUTION.mean_evaluations
+    assert evolved.environment_steps == 12 * 16 * 4 + 2 * agents * 4 + 20 * 4
 
 
 def test_the_key_alone_decides_the_expert(evolved):
@@ -128,7 +130,7 @@ def test_a_curriculum_lets_a_policy_see_what_lies_beyond_the_environments_limit(
     assert actions(expert)[3] == paying
     assert expert.mean_return == 0.0
     # Episodes of 4 steps in the search, and of 2 in the judgement.
-    assert expert.environment_steps == 12 * 16 * 4 + 20 * 2
+    assert expert.environment_steps == 12 * 16 * 4 + 2 * EVOLUTION.mean_evaluations * 2 + 20 * 2
 
 
 def test_an_evolved_policy_balances_a_pole():

@@ -160,6 +160,14 @@ def test_a_missing_file_or_folder_is_said_by_name(tmp_path):
         import_published(tmp_path / "nowhere", tmp_path / "out")
 
 
+def test_a_file_in_the_place_of_the_folder_to_write_is_said(tmp_path):
+    source = write(tmp_path / "released")
+    (tmp_path / "file").touch()
+    for out in (tmp_path / "file", tmp_path / "file" / "inside"):
+        with pytest.raises(UserError, match=r"cannot write to .*file"):
+            import_published(source, out)
+
+
 def test_a_folder_without_an_npz_is_refused(tmp_path):
     with pytest.raises(UserError, match=r"holds no \.npz file: give the folder"):
         import_published(tmp_path, tmp_path / "out")

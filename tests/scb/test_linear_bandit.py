@@ -109,15 +109,16 @@ def test_a_file_gives_back_the_same_bandit(bandit, tmp_path):
     assert same[0] == same[1]
 
 
-def test_one_action_that_is_held_is_fitted_too(states):
-    held = np.tile(np.array([1.0, 0.0], np.float32), (len(states), 1))
+@pytest.mark.parametrize("second", [0.0, 1.6])
+def test_one_action_that_is_held_is_fitted_too(states, second):
+    held = np.tile(np.array([1.0, second], np.float32), (len(states), 1))
     dataset = ExpertDataset(jnp.asarray(states), held[:, None], jnp.zeros((len(states), 1)), held)
     bandit = SyntheticBandit(2, SPACE, LINEAR)
     weights, report = fit_bandit(bandit, dataset, jax.random.key(0))
     assert report == {"action_r2": 1.0}  # there is nothing to explain
     reward = jax.vmap(bandit.mean_reward, in_axes=(0, None, None))
-    # Nearly 0 there in every context; at the other end of the second action, 2 halves of its range away, -2.
-    for action, worth in (([1.0, 0.0], 0.0), ([1.0, 4.0], -2.0)):
+    # Nearly 0 there in every context; at the other end of the second action, so many halves of its range away, less.
+    for action, worth in (([1.0, second], 0.0), ([1.0, 4.0], (second - 4) / 2)):
         earned = reward(states, jnp.array(action), bandit.params(weights))
         np.testing.assert_allclose(earned, worth, atol=0.02)
 

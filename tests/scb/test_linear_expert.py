@@ -9,7 +9,13 @@ import pytest
 
 from scb.environments.registry import make
 from scb.errors import UserError
-from scb.linear_expert import LinearSearchConfig, erring, noisy, search_linear_expert
+from scb.linear_expert import (
+    LinearSearchConfig,
+    _LinearSearch,
+    erring,
+    noisy,
+    search_linear_expert,
+)
 from scb.measurement import Place
 from scb.warm_start import WarmStartConfig, expert_agent, find_expert
 from tests.scb.probes import TWO_TARGETS, ContinuousCorridor, assert_solves_two_targets
@@ -437,6 +443,19 @@ def test_a_linear_expert_that_cannot_be_found_is_refused(name, arguments, messag
     with pytest.raises(UserError, match=message):
         config = WarmStartConfig(**{"expert": "linear", **arguments})
         expert_agent(name, env.action_space(params), config)
+
+
+def test_starts_need_generations_that_tell_them_apart():
+    with pytest.raises(UserError, match="there are 5 starts, and 1 generation to choose"):
+        LinearSearchConfig(starts=5, generations=1)
+
+
+@pytest.mark.parametrize(("directions", "best"), [(22, 15), (23, 13), (32, 8), (8, 8)])
+def test_as_many_directions_as_said_are_the_best(directions, best):
+    env, params = make("Pendulum-v1")
+    config = LinearSearchConfig(directions=directions, best=best)
+    search = _LinearSearch(env, params, jax.random.key(0), config, 0.0, None)
+    assert search._ars.num_elites == best
 
 
 def test_more_best_directions_than_there_are_are_refused():

@@ -340,12 +340,25 @@ def test_draws_of_another_number_are_others(bandit, tmp_path):
         drawn(3)
 
 
+def test_seeds_of_numpy_are_kept_as_numbers(measured, file, tmp_path):
+    rows = measured(tmp_path / "rows.jsonl", agents=np.array(SEEDS))
+    assert rows == file[1]
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
         ({"agents": []}, "no seeds: give at least one."),
-        ({"agents": [0, -1]}, "a seed is -1: each must be 0 or larger, and below 2^32."),
+        (
+            {"agents": [0, -1]},
+            "a seed is -1: each must be a whole number, 0 or larger, and below 2^32.",
+        ),
         ({"agents": [2**32]}, "a seed is 4294967296"),
+        ({"agents": [1.5]}, "a seed is 1.5: each must be a whole number"),
+        ({"agents": [3, 4, 3]}, "seed 3 is there twice: give each once."),
+        ({"actions": ("most likely",)}, "unknown kind of actions 'most likely'"),
+        ({"actions": "modes"}, "unknown kind of actions 'modes': did you mean mode"),
+        ({"spec": replace(SPEC, algorithm="sac")}, "of PPO's updates, and the algorithm is sac"),
         ({"points": 0}, "points is 0: it must be at least 1."),
         ({"episodes": 0}, "episodes is 0: it must be at least 1."),
         ({"side_by_side": 0}, "side_by_side is 0: it must be at least 1."),

@@ -26,6 +26,59 @@ from tests.scb.probes import Corridor, CorridorParams, context_bandit
 
 NUM_SEEDS = 64
 
+# -- diagnosis
+# ---------------------------------------------------------------------------------------
+
+
+def test_a_diagnosis_is_of_a_batch_before_and_after_its_update(monkeypatch):
+    monkeypatch.setattr("scb.agents.ppo.DIAGNOSED", 1)
+    params = CorridorParams(rewards=jnp.array([[0.0, 1.0], [3.0, 0.0], [0.5, 0.0]]), random_start=1)
+    config = PPOConfig(num_envs=8, num_steps=8, num_minibatches=2, normalize_observations=True)
+    agent, hyperparameters = PPO(Corridor(), config), PPOHyperparameters(learning_rate=0.05)
+    state = agent.init(jax.random.key(0), hyperparameters, params)
+    state = agent.iterate(state, hyperparameters, params)
+    found = agent.diagnose(state, hyperparameters, params)
+
+    after, batch = agent._iterate(state, hyperparameters, params)
+    # The observations that the update saw are normalised as before it.
+    seen = replace(after, statistics=state.statistics)
+    before, later = (
+        np.asarray(agent._policy(x, batch.observation, params).probs, np.float64)
+        for x in (state, seen)
+    )
+    taken = np.arange(64), np.asarray(batch.action)
+    ratio = later[taken] / before[taken]
+    advantage = np.asarray(batch.advantage, np.float64)
+    expected = {
+        "kl": np.mean(np.sum(before * np.log(before / later), axis=1)),
+        "outside": np.mean(np.abs(ratio - 1) > 0.2),
+        "gain": np.mean(ratio * (advantage - advantage.mean())) / advantage.std(),
+        "value_error": advantage.var() / np.var(batch.target),
+        "entropy": -np.mean(np.sum(before * np.log(before), axis=1)),
+    }
+    assert found.keys() == expected.keys()
+    for name, value in expected.items():
+        assert found[name] == pytest.approx(value, rel=1e-3, abs=1e-5), name
+    assert 0.0 < expected["outside"] < 1.0 and expected["kl"] > 1e-3
+
+
+@pytest.mark.parametrize(("bound", "whole"), [(20.0, True), (np.inf, False)])
+def test_a_drift_meets_no_ratio_beyond_the_bound(monkeypatch, bound, whole):
+    monkeypatch.setattr("scb.agents.ppo.MAX_LOG_RATIO", bound)
+
+    def breaking(parameters, log_ratio, advantage, progress):
+        return log_ratio * jnp.where(jnp.abs(log_ratio) > 20.0, jnp.nan, 0.0)
+
+    config = PPOConfig(num_envs=8, num_steps=8, num_minibatches=2)
+    agent, params = PPO(Corridor(), config, breaking), CorridorParams(random_start=1)
+    hyperparameters = PPOHyperparameters(learning_rate=10.0)
+    state = agent.init(jax.random.key(0), hyperparameters, params)
+    for _ in range(3):
+        state = agent.iterate(state, hyperparameters, params)
+    leaves = jax.tree.leaves(state.params["policy"])
+    assert all(np.isfinite(x).all() for x in leaves) == whole
+
+
 # -- advantages
 # ---------------------------------------------------------------------------------------
 

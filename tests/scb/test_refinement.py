@@ -63,6 +63,33 @@ def test_a_policy_makes_up_for_what_all_its_agents_do_wrong():
     jax.tree.map(np.testing.assert_array_equal, found["initial_state"], weights["initial_state"])
 
 
+def test_algorithms_take_turns_and_a_pair_has_one_agent_and_one_start():
+    bandit, met = bandit_of(CORRIDOR), []
+
+    def recorder(name):
+        def program(changes, which, keys, mean, states, weights):
+            met.append((name, np.asarray(which), jax.random.key_data(keys), states))
+            return np.arange(64.0), np.full(64, 2)
+
+        return program
+
+    refine = Refinement(bandit, {}, CORRIDOR, generations=3)
+    refine._programs = {name: recorder(name) for name in ("ppo", "td3")}
+    learned = {name: Learned(f"{name}'s", np.zeros(3), None) for name in ("ppo", "td3")}
+    _, steps = refine(bandit.init_weights(jax.random.key(0)), learned, jax.random.key(1))
+    assert steps == 3 * 64 * 2
+    assert [(name, states) for name, _, _, states in met] == [
+        ("ppo", "ppo's"),
+        ("td3", "td3's"),
+        ("ppo", "ppo's"),
+    ]
+    for _, which, keys, _ in met:
+        np.testing.assert_array_equal(which[:32], which[32:])
+        np.testing.assert_array_equal(keys[:32], keys[32:])
+        assert set(which) == {0, 1, 2}
+    assert len({keys.tobytes() for _, _, keys, _ in met}) == 3
+
+
 def test_pairs_are_ranked_by_their_difference_whoever_they_are_of():
     # Of three pairs the second is of an agent that earns a thousand times as much.
     ranks = paired_ranks(np.array([1.0, 3000.0, 2.0, 3.0, 2999.0, 7.0]))
@@ -148,6 +175,8 @@ def test_only_a_linear_bandit_is_refined():
     with pytest.raises(UserError, match="there are 1 refinement rounds, and only a linear"):
         DiscoveryConfig(refinement=once)
     DiscoveryConfig(bandit=LINEAR, refinement=once)
+    with pytest.raises(UserError, match="agents is 4, and there are no refinement rounds"):
+        RefinementConfig(agents=4)
 
 
 @pytest.mark.slow

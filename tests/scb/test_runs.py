@@ -205,6 +205,17 @@ def test_rewinding_drops_the_half_line_that_a_kill_left(run):
         assert lines(run) == whole[:2]
 
 
+@pytest.mark.parametrize("damage", ["{", "5", '{"fitness": 1.0}'])
+def test_a_line_that_is_damaged_before_the_last_is_told_and_nothing_dropped(run, damage):
+    for generation in range(3):
+        run.log(generation, {"fitness": 1.0}, seconds=1.0)
+    written = "\n".join([lines(run)[0], damage, lines(run)[2]])
+    (run.folder / "metrics.jsonl").write_text(written)
+    with pytest.raises(UserError, match=r"line 2 of .*metrics\.jsonl is damaged"):
+        run.rewind(3)
+    assert (run.folder / "metrics.jsonl").read_text() == written
+
+
 def test_rewinding_a_run_without_logs_is_nothing(run):
     run.rewind(0)
     assert not (run.folder / "metrics.jsonl").exists()

@@ -15,6 +15,7 @@ from scb.statistics import (
     pooled_estimate,
     spearman,
     stratified_estimate,
+    worst_decile,
 )
 
 
@@ -321,6 +322,37 @@ def test_a_group_that_fails_counts_in_full():
     found = few_groups_difference(groups, [[0.0, 0.0]])
     # Its variance over groups is 2000, of the mean 400; Student's t of four degrees has 2.776.
     assert (found.value, found.high) == (-20.0, pytest.approx(-20.0 + 2.776 * 20.0, rel=1e-3))
+
+
+def test_runs_that_all_groups_share_are_drawn_too():
+    # Without the first run the mean is 10, without the second 0: the jackknife's variance is 1 / 2 of (10 - 5)^2 +
+    # (0 - 5)^2, and Student's t of one degree has 12.706.
+    found = few_groups_difference([[0.0, 10.0]] * 3, [[0.0, 0.0]])
+    assert (found.value, found.high) == (5.0, pytest.approx(5.0 + 12.706 * 5.0, rel=1e-4))
+
+
+@pytest.mark.parametrize("confidence", [95.0, 1.5, 0.0])
+def test_the_confidence_of_few_groups_is_a_probability(confidence):
+    with pytest.raises(UserError, match=f"confidence is {confidence}: give a number between"):
+        few_groups_difference([[1.0, 2.0]] * 5, [[1.0, 2.0]], confidence=confidence)
+
+
+def test_the_worst_decile_is_what_nine_of_ten_are_better_than():
+    assert worst_decile(range(11)) == 1.0
+
+
+def test_a_difference_of_groups_is_drawn_together_only_where_it_is_paired():
+    runs = [[1.0, 2.0, 3.0, 9.0]]
+    together = stratified_estimate(runs, runs)
+    assert (together.low, together.high) == (0.0, 0.0)
+    apart = stratified_estimate(runs, runs, paired=False)
+    assert apart.low < 0.0 < apart.high
+
+
+def test_a_pooled_interval_is_of_the_confidence_asked_for():
+    groups = np.random.default_rng(0).normal(size=(3, 20))
+    half, whole = (pooled_estimate(groups, confidence=x) for x in (0.5, 0.95))
+    assert whole.low < half.low < half.high < whole.high
 
 
 def test_few_groups_that_differ_in_nothing_have_no_width():

@@ -364,6 +364,12 @@ def test_jitter_widens_entries_by_noise_of_their_own():
     np.testing.assert_allclose(jittered.expert_action, np.clip(after, -1, 2), atol=1e-6)
 
 
+def test_jitter_is_in_deviations_of_what_was_given_the_least_one():
+    plain, jittered = (contexts(3.0, jitter=x, stretch=2.0) for x in (0.0, 1.0))
+    added = np.asarray(jittered.observation - plain.observation)[:, 0]
+    assert added.std() == pytest.approx(3.0, rel=0.1)
+
+
 def test_discrete_labels_follow_the_stretched_state_too():
     # The expert takes 1 where the cell's first entry exceeds 0.7. One-hot entries of 0 and 1 about a
     # mean of m, stretched by a factor, go to m - f m and m + f (1 - m): with m near 1/3, a deviation
@@ -550,7 +556,8 @@ def test_evolution_gets_the_papers_curriculum_at_its_own_length(monkeypatch):
         ({"construction": "Q"}, "unknown warm-start construction 'Q': did you mean q"),
         ({"num_experts": 0}, "num_experts is 0: it must be at least 1"),
         ({"num_states": 0}, "num_states is 0"),
-        ({"num_actions": -2}, "num_actions is -2"),
+        ({"num_actions": 1}, "num_actions is 1: it must be at least 2"),
+        ({"aggregation_agents": 4}, "aggregation_agents is 4, and there are no aggregation rounds"),
         (
             {"near_actions": 16},
             "near_actions is 16 of 16 actions, one of them the expert's: take at most 15",
