@@ -75,7 +75,7 @@ def test_algorithms_take_turns_and_a_pair_has_one_agent_and_one_start():
 
     refine = Refinement(bandit, {}, CORRIDOR, generations=3)
     refine._programs = {name: recorder(name) for name in ("ppo", "td3")}
-    learned = {name: Learned(f"{name}'s", np.zeros(3), None) for name in ("ppo", "td3")}
+    learned = {name: Learned(np.zeros(3), f"{name}'s", None) for name in ("ppo", "td3")}
     _, steps = refine(bandit.init_weights(jax.random.key(0)), learned, jax.random.key(1))
     assert steps == 3 * 64 * 2
     assert [(name, states) for name, _, _, states in met] == [
