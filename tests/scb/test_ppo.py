@@ -34,7 +34,7 @@ def test_a_diagnosis_is_of_a_batch_before_and_after_its_update(monkeypatch):
     monkeypatch.setattr("scb.agents.ppo.DIAGNOSED", 1)
     params = CorridorParams(rewards=jnp.array([[0.0, 1.0], [3.0, 0.0], [0.5, 0.0]]), random_start=1)
     config = PPOConfig(num_envs=8, num_steps=8, num_minibatches=2, normalize_observations=True)
-    agent, hyperparameters = PPO(Corridor(), config), PPOHyperparameters(learning_rate=0.05)
+    agent, hyperparameters = PPO(Corridor(), config), PPOHyperparameters(learning_rate=0.005)
     state = agent.init(jax.random.key(0), hyperparameters, params)
     state = agent.iterate(state, hyperparameters, params)
     found = agent.diagnose(state, hyperparameters, params)
