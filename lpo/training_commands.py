@@ -309,7 +309,7 @@ class AlignConfig(Agents):
         )
         if not found:
             raise UserError("no regimes: give at least one value of each.")
-        return found
+        return list(found)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -148,6 +148,13 @@ class DiscoveryConfig:
             )
         if self.parameterization != "I" and self.start is not None:
             raise UserError("a synthetic MDP cannot start from a bandit: leave the start out.")
+        if self.parameterization == "T":
+            unused(
+                self.bandit,
+                "a synthetic MDP T starts where its environment does",
+                ("latent", "latent_size"),
+                "take TI or I",
+            )
         fitted = self.init == "expert" and self.start is None
         if not fitted:
             unused(

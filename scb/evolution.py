@@ -22,13 +22,19 @@ from scb import processes, termination
 from scb.artefacts import machine_description
 from scb.checkpoints import continued
 from scb.console import Progress, progress_console
-from scb.errors import UserError, at_least, one_of, positive
+from scb.errors import UserError, at_least, one_of, positive, unused
 from scb.files import plain
 from scb.keys import key_at, root_key, split_key
 from scb.runs import Run, Stopwatch
 from scb.seeds import VALIDATING, searching
 from scb.statistics import iqm
-from scb.strategies import REMEMBERING, STRATEGIES, strategy_for
+from scb.strategies import (
+    GRADIENT_ESTIMATING,
+    REMEMBERING,
+    SCHEDULED,
+    STRATEGIES,
+    strategy_for,
+)
 
 COMBINATIONS = ("mean", "ranks")
 
@@ -91,6 +97,13 @@ class EvolutionConfig:
         searching(self.seed)
         positive(self, "sigma", "sigma_decay", "learning_rate", "learning_rate_decay")
         at_least(0, self, "sigma_limit", "learning_rate_limit")
+        for needed, settings in (
+            (GRADIENT_ESTIMATING, ("learning_rate", "learning_rate_decay", "learning_rate_limit")),
+            (SCHEDULED, ("sigma_decay", "sigma_limit")),
+        ):
+            if self.strategy not in needed:
+                because = f"{self.strategy} steps by a rule of its own"
+                unused(self, because, settings, "choose a strategy such as Open_ES")
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 _UNSUPPORTED = {"RandomSearch", "SV_CMA_ES", "SV_Open_ES", "GradientlessDescent"}
 # These estimate a gradient and hand it to an optimiser; the others' update rules set their own
 # step.
-_GRADIENT_ESTIMATING = {
+GRADIENT_ESTIMATING = {
     "ARS",
     "ASEBO",
     "ESMC",
@@ -40,6 +40,12 @@ STRATEGIES: dict[str, Any] = {
     name: algorithm
     for name, algorithm in evosax.algorithms.algorithms.items()
     if name not in _UNSUPPORTED
+}
+# Of these the deviation follows a schedule; the others adapt it, or have none.
+SCHEDULED = {
+    name
+    for name, algorithm in STRATEGIES.items()
+    if "std_schedule" in algorithm.__init__.__annotations__
 }
 # These compare a fitness with those of earlier generations, or return the best that ever was, so that fitness has to
 # mean the same in all.
@@ -62,11 +68,11 @@ class Strategy:
         # Others keep a population, and have no mean to judge before the first tell.
         self.has_mean = config.strategy in evosax.algorithms.distribution_based_algorithms
         arguments: dict[str, Any] = {}
-        if "std_schedule" in algorithm.__init__.__annotations__:
+        if config.strategy in SCHEDULED:
             arguments["std_schedule"] = lambda generation: jnp.maximum(
                 config.sigma * config.sigma_decay**generation, config.sigma_limit
             )
-        if config.strategy in _GRADIENT_ESTIMATING:
+        if config.strategy in GRADIENT_ESTIMATING:
             arguments["optimizer"] = optax.adam(
                 lambda count: jnp.maximum(
                     config.learning_rate * config.learning_rate_decay**count,

@@ -343,7 +343,7 @@ def asked_for(words=""):
 EVERY_FLAG = """--preset=paper --tasks=Synthetic-CartPole-v1,hopper --drift=network --temporal --validate
 --fitness=return-sampled --contexts=40 --horizons=0.5,2.0 '--hyperparameters=learning_rate=0.1,0.2 gae_lambda=0.5'
 --reward-noise=1.5 --agents-per-candidate=3 --evaluation-episodes=8 --backend=generalized --initial-scale=0.3
---base=none --clip=0.3 --xi=0.001 --gate=0.2 --hidden-size=8 --strategy=SNES --population-size=6 --generations=7
+--base=none --clip=0.3 --xi=0.001 --gate=0.2 --hidden-size=8 --strategy=ARS --population-size=6 --generations=7
 --sigma=0.2 --sigma-decay=0.9 --sigma-limit=0.1 --learning-rate=0.3 --learning-rate-decay=0.8
 --learning-rate-limit=0.2 --combine=mean --mean-evaluations=5 --evaluate-mean-every=4 --checkpoint-every=3 --seed=9"""
 

@@ -29,18 +29,23 @@ from scb.evolution import (
 )
 from scb.keys import key_at, root_key, split_key
 from scb.runs import Run, config_dict, read_config
-from scb.strategies import REMEMBERING, STRATEGIES, Strategy
+from scb.strategies import GRADIENT_ESTIMATING, REMEMBERING, STRATEGIES, Strategy
 from tests.scb.probes import Parabola
 
 CONFIG = EvolutionConfig(
     population_size=8,
     num_generations=8,
     sigma=0.3,
-    learning_rate=0.3,
     mean_evaluations=4,
     evaluate_mean_every=3,
     checkpoint_every=3,
 )
+
+
+def with_strategy(strategy, **changes):
+    """A short search by it, with steps that get somewhere where it does not size them itself."""
+    steps = {"learning_rate": 0.3} if strategy in GRADIENT_ESTIMATING else {}
+    return replace(CONFIG, strategy=strategy, **steps, **changes)
 
 
 def column(outcome, name):
@@ -59,7 +64,7 @@ START = math.sqrt(2 * 3.0**2)  # distance of (0, 0) from (3, 3)
 
 @pytest.mark.parametrize("strategy", ["SNES", "Open_ES", "CMA_ES", "SimpleGA"])
 def test_strategies_find_the_maximum(strategy):
-    config = replace(CONFIG, strategy=strategy, num_generations=40)
+    config = with_strategy(strategy, num_generations=40)
     outcome = evolve(Parabola(noise=0.5), config, quiet=True)
     assert distance(outcome.mean) < START / 6
     assert distance(outcome.best_mean) < START / 6
@@ -90,7 +95,7 @@ class Wide(Parabola):
 def test_every_strategy_that_is_offered_gets_closer_to_the_maximum(strategy):
     # Of limited memory, LM_MA_ES has none for two numbers: its deviation is 0 soon.
     problem, size = (Wide(), 32) if strategy == "LM_MA_ES" else (Parabola(), 8)
-    config = replace(CONFIG, strategy=strategy, population_size=size, num_generations=40)
+    config = with_strategy(strategy, population_size=size, num_generations=40)
     outcome = evolve(problem, config, quiet=True)
     start = 3.0 * math.sqrt(outcome.best_mean["x"].size)
     assert distance(outcome.best_mean) < 0.75 * start
@@ -104,7 +109,7 @@ def test_every_strategy_that_is_offered_gets_closer_to_the_maximum(strategy):
 def test_a_strategy_remembers_fitness_where_another_scale_a_generation_moves_it(strategy):
     found = []
     for shift in (0.0, 5.0):
-        config = replace(CONFIG, strategy=strategy, population_size=32, sigma=0.5)
+        config = with_strategy(strategy, population_size=32, sigma=0.5)
         search = Strategy(config, jnp.ones(20))
         state = search.start(root_key(0), jnp.ones(20))
         for generation in range(4):
@@ -123,6 +128,19 @@ def test_ranks_are_not_for_a_strategy_that_remembers_fitness(strategy):
         EvolutionConfig(strategy=strategy, combine="ranks")
 
 
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"learning_rate": 0.1}, "learning_rate is 0.1, and SNES steps by a rule of its own"),
+        ({"strategy": "PGPE", "sigma_decay": 0.9}, "sigma_decay is 0.9, and PGPE steps by"),
+        ({"strategy": "CMA_ES", "sigma_limit": 0.1}, "sigma_limit is 0.1, and CMA_ES steps by"),
+    ],
+)
+def test_what_a_strategy_does_not_use_is_refused(arguments, message):
+    with pytest.raises(UserError, match=message):
+        EvolutionConfig(**arguments)
+
+
 class Slope(Parabola):
     """Fitness is x, or -x."""
 
@@ -136,7 +154,7 @@ class Slope(Parabola):
 @pytest.mark.parametrize("strategy", ["SNES", "Open_ES"])
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_fitness_is_maximised(strategy, sign):
-    outcome = evolve(Slope(sign), replace(CONFIG, strategy=strategy), quiet=True)
+    outcome = evolve(Slope(sign), with_strategy(strategy), quiet=True)
     assert sign * float(outcome.mean["x"].sum()) > 0.5
 
 
@@ -148,7 +166,7 @@ def test_the_search_starts_with_the_given_deviation(strategy, sigma):
         def evaluate(self, candidate, key, generation):
             return {"fitness": candidate["x"][0]}
 
-    config = replace(CONFIG, strategy=strategy, sigma=sigma, population_size=400, num_generations=1)
+    config = with_strategy(strategy, sigma=sigma, population_size=400, num_generations=1)
     deviations = column(evolve(Spread(), config, quiet=True), "fitness/std")
     assert deviations[0] == pytest.approx(sigma, rel=0.15)
 
@@ -218,7 +236,7 @@ def test_environment_steps_are_counted_apart(drawn):
 
 
 def test_strategies_that_keep_a_population_are_not_judged_before_they_were_told_anything():
-    config = replace(CONFIG, strategy="SimpleGA", num_generations=4)
+    config = with_strategy("SimpleGA", num_generations=4)
     outcome = evolve(Parabola(), config, quiet=True)
     assert [line["generation"] for line in outcome.metrics if "mean/fitness" in line] == [3]
 
@@ -334,7 +352,7 @@ class Fragile(Parabola):
 @pytest.mark.parametrize("strategy", ["SNES", "Open_ES"])
 @pytest.mark.parametrize("broken", [np.nan, np.inf])
 def test_failed_candidates_are_counted_and_never_poison_the_search(strategy, broken):
-    config = replace(CONFIG, strategy=strategy, num_generations=20)
+    config = with_strategy(strategy, num_generations=20)
     outcome = evolve(Fragile(broken), config, quiet=True)
     # The search starts at x0 = 0, so about half of the first generation fails.
     assert 0 < outcome.metrics[0]["failed"] < 8
@@ -375,7 +393,7 @@ class Broken(Parabola):
 
 @pytest.mark.parametrize("strategy", ["SNES", "Open_ES", "CMA_ES"])
 def test_a_generation_that_fails_altogether_leaves_the_mean_where_it_was(strategy):
-    outcome = evolve(Broken(), replace(CONFIG, strategy=strategy), quiet=True)
+    outcome = evolve(Broken(), with_strategy(strategy), quiet=True)
     np.testing.assert_array_equal(outcome.mean["x"], [0.0, 0.0])
     assert column(outcome, "failed") == 8 * [8]
     # 0 would be the maximum. No number was measured, and the log has none.
@@ -394,7 +412,7 @@ def test_a_generation_that_fails_altogether_leaves_the_mean_where_it_was(strateg
 )
 def test_the_cost_counts_the_judgements_of_the_mean(strategy, judgements):
     # 8 generations of 8 candidates; judged before generations 0, 3 and 6 and after the last, by 4 agents.
-    config = replace(CONFIG, strategy=strategy)
+    config = with_strategy(strategy)
     outcome = evolve(Parabola(), config, quiet=True)
     names = ("mean/fitness", "final_mean/fitness")
     assert sum(name in line for line in outcome.metrics for name in names) == judgements
@@ -522,7 +540,7 @@ def uninterrupted(tmp_path_factory):
     fingerprints = {}
     for strategy in STRATEGIES_RESUMED:
         folder = tmp_path_factory.mktemp(strategy) / "run"
-        outcome = evolve_in(folder, replace(CONFIG, strategy=strategy))
+        outcome = evolve_in(folder, with_strategy(strategy))
         fingerprints[strategy] = fingerprint(folder, outcome)
     return fingerprints
 
@@ -544,7 +562,7 @@ def uninterrupted(tmp_path_factory):
 def test_a_run_that_was_killed_and_resumed_ends_with_the_same_bytes(
     tmp_path, uninterrupted, strategy, kills
 ):
-    config = replace(CONFIG, strategy=strategy)
+    config = with_strategy(strategy)
     folder = tmp_path / "run"
     for attempt, kill_at in enumerate(kills):
         with pytest.raises(Killed):
@@ -693,7 +711,7 @@ def test_impossible_configurations_are_refused(arguments, message):
     [("PGPE", 5, "must be even"), ("DifferentialEvolution", 3, "population_size >= 4")],
 )
 def test_a_size_that_a_strategy_does_not_take_is_refused(strategy, size, reason):
-    config = replace(CONFIG, strategy=strategy, population_size=size)
+    config = with_strategy(strategy, population_size=size)
     message = f"{strategy} does not take a population_size of {size} for 2 weights .*{reason}"
     with pytest.raises(UserError, match=message):
         evolve(Parabola(), config, quiet=True)
