@@ -152,7 +152,7 @@ def draw(report: Mapping[str, Any]) -> Figure:
     axes.set_yticks(range(len(rows)), [f"{row['environment']}, {row['kind']}" for row in rows])
     axes.set_ylim(len(rows) - 0.5, -0.5)
     axes.set_xlim(0, None)
-    axes.set_xlabel("an agent of PPO from all, in halves of the actions' range")
+    axes.set_xlabel("distance of an agent of PPO from all, in halves of the actions' range")
     plotting.figure_title(figure, "How far agents that learned in one bandit are apart")
     looks = {
         label: {"color": color, "marker": "o", "linestyle": ""}
