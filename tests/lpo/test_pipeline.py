@@ -130,7 +130,7 @@ def test_the_learned_objective_is_stored_with_its_certificate(folder):
     assert objective.metadata["cost"]["environment_steps_training"] == 96
     # The mean before the first generation and after the last is judged.
     judged = objective.metadata["results"]["mean_fitness"]
-    assert [line["generation"] for line in judged] == [0, 1]
+    assert [line["generation"] for line in judged] == [0, 2]
 
 
 def test_the_report_shows_every_figure_in_its_place(folder):

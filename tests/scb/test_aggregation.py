@@ -50,7 +50,9 @@ def expert(monkeypatch):
 
 def started(bandit, place, rounds, quiet=True):
     config = WarmStartConfig(
-        num_states=STATES, num_actions=2, aggregation_rounds=rounds, aggregation_agents=2
+        num_states=STATES,
+        num_actions=2,
+        **({"aggregation_rounds": rounds, "aggregation_agents": 2} if rounds else {}),
     )
     return warm_start.warm_start(bandit, SPECS, place, jax.random.key(1), config, quiet)
 
