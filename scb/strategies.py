@@ -56,6 +56,7 @@ REMEMBERING = {
     "LES",
     "SimulatedAnnealing",
     "iAMaLGaM_Full",
+    "iAMaLGaM_Univariate",
     *(STRATEGIES.keys() - evosax.algorithms.distribution_based_algorithms.keys()),
 }
 
