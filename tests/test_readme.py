@@ -36,8 +36,8 @@ def test_every_replacement_finds_its_text():
         assert long != short
 
 
-# Compiling Brax, SAC and a search takes from half a minute to a minute each.
-SLOW = ("hopper", "discover", "SAC", "meta_train")
+# Compiling SAC and a search takes from half a minute to a minute each.
+SLOW = ("discover", "SAC", "meta_train")
 
 
 @pytest.mark.parametrize(
