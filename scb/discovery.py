@@ -18,8 +18,15 @@ import tyro
 from jax.typing import ArrayLike
 
 from scb import processes
-from scb.agents.spec import ALGORITHMS, AgentSpec, algorithms_for, bandit_agent, check_algorithms
-from scb.agents.tables import Lists
+from scb.agents.spec import (
+    ALGORITHMS,
+    AgentSpec,
+    algorithms_for,
+    bandit_agent,
+    check_algorithms,
+    configured,
+)
+from scb.agents.tables import Lists, Values
 from scb.command_line import listed, text
 from scb.curriculum import (
     CurriculumConfig,
@@ -42,7 +49,7 @@ from scb.evolution import EnvironmentSteps, EvolutionConfig, Outcome, evolve
 from scb.fitting import check_linear, standardize_reward
 from scb.judgement import check_fits
 from scb.keys import named_key, root_key, split_key
-from scb.lists import read_lists, write_lists
+from scb.lists import read_configs, read_lists, write_lists
 from scb.measurement import Judge, Place, train_and_judge
 from scb.refinement import RefinementConfig, refined
 from scb.runs import Run, config_dict
@@ -84,7 +91,8 @@ class DiscoveryConfig:
         from the paper's lists.
       lists: {"ppo": {"learning_rate": [0.001, 0.005], ...}, ...}, a JSON file or the text itself, to
         draw from instead of the paper's.
-      configs: {algorithm: static configuration} instead of the paper's.
+      configs: {"ppo": {"num_envs": 1, "num_steps": 2048, ...}, ...}, a JSON file or the text itself, over
+        the inner loop's static configurations: batches, steps, networks.
       agents_per_candidate: agents of each trained algorithm whose returns are a candidate's fitness.
       evaluation_episodes: of each agent in the evaluation environment.
       mode_actions: evaluate the most likely actions during the search, rather than sampled ones.
@@ -117,7 +125,9 @@ class DiscoveryConfig:
         tyro.conf.arg(name="hyperparameters"),
         text(read_lists, write_lists, "FILE|JSON"),
     ] = field(default_factory=dict)
-    configs: tyro.conf.Suppress[Mapping[str, Any]] = field(default_factory=dict)
+    configs: Annotated[Mapping[str, Values], text(read_configs, write_lists, "FILE|JSON")] = field(
+        default_factory=dict
+    )
     agents_per_candidate: int = 4
     evaluation_episodes: int = 16
     mode_actions: bool = False
@@ -221,12 +231,15 @@ class BanditDiscovery:
                 f"an algorithm stands twice in {', '.join(config.algorithms)}: name each once, or use the mode "
                 "sequential, where it then has two turns."
             )
-        unused = [name for name in config.lists if name not in config.algorithms]
-        if len(unused) == len(config.lists) > 0:
-            raise UserError(
-                f"there are hyperparameter lists for {', '.join(unused)}, but the inner loop trains "
-                f"{', '.join(config.algorithms)}: give lists for that."
-            )
+        for what, given in {
+            "hyperparameter lists": config.lists,
+            "configurations": config.configs,
+        }.items():
+            if given and not set(given) & set(config.algorithms):
+                raise UserError(
+                    f"there are {what} for {', '.join(given)}, but the inner loop trains "
+                    f"{', '.join(config.algorithms)}: give them for that."
+                )
         if config.init == "expert" and config.start is None:
             expert_agent(config.environment, space, config.warm_start)
         self.config = config
@@ -272,7 +285,7 @@ class BanditDiscovery:
         return replace(
             spec,
             lists=config.lists.get(name, spec.lists),
-            config=config.configs.get(name, spec.config),
+            config=configured(spec.config, config.configs.get(name, {})),
         )
 
     def _weights_of(self, name: str) -> Weights:

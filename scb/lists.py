@@ -1,48 +1,72 @@
-"""Lists of hyperparameters to draw from, as the command line writes them."""
+"""What agents are trained with, as the command line writes it: lists to draw from, and static configurations."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
-from scb.agents.spec import check_lists, tables_of
-from scb.agents.tables import Lists
+from scb.agents.spec import check_lists, configured, tables_of
+from scb.agents.tables import Lists, Values
 from scb.command_line import numbers
 from scb.errors import UserError
 from scb.files import strict_json
 
-_WANTED = 'give {"ppo": {"learning_rate": [0.001, 0.005]}, ...}'
+T = TypeVar("T")
+_LISTS = 'give {"ppo": {"learning_rate": [0.001, 0.005]}, ...}'
+_CONFIGS = 'give {"ppo": {"num_envs": 1, "num_steps": 2048}, ...}'
 
 
 def read_lists(words: str) -> dict[str, Lists]:
     """{algorithm: {hyperparameter: values}} from a JSON file or its content; what is wrong with it is a UserError."""
+
+    def checked(algorithm: str, values: Mapping[str, Any]) -> Lists:
+        check_lists(values, tables_of(algorithm).algorithm.hyperparameters())
+        return {name: tuple(of_it) for name, of_it in values.items()}
+
+    return _read(words, "hyperparameter lists", _LISTS, checked)
+
+
+def read_configs(words: str) -> dict[str, Values]:
+    """{algorithm: {field of its configuration: value}}, like `read_lists`."""
+
+    def checked(algorithm: str, values: Mapping[str, Any]) -> Values:
+        configured(tables_of(algorithm).algorithm.config(), values)
+        return dict(values)
+
+    return _read(words, "configurations", _CONFIGS, checked)
+
+
+def _read(
+    words: str, what: str, wanted: str, checked: Callable[[str, Mapping[str, Any]], T]
+) -> dict[str, T]:
     source, content = "the text", words
     if not words.lstrip().startswith("{"):
         source = words
         try:
             content = Path(words).read_bytes().decode()
         except OSError as error:
-            raise UserError(f"cannot read {source} ({error.strerror}): {_WANTED}.") from error
+            raise UserError(f"cannot read {source} ({error.strerror}): {wanted}.") from error
         except ValueError as error:
-            raise UserError(f"{source} is no JSON ({error}): {_WANTED}.") from error
+            raise UserError(f"{source} is no JSON ({error}): {wanted}.") from error
     try:
-        lists = strict_json(content)
+        found = strict_json(content)
     except ValueError as error:
-        raise UserError(f"{source} is no JSON ({error}): {_WANTED}.") from error
+        raise UserError(f"{source} is no JSON ({error}): {wanted}.") from error
     if words == "{}":
         return {}
-    if not isinstance(lists, dict) or not lists or not all(map(_is_filled, lists.values())):
-        raise UserError(f"{source} holds no hyperparameter lists: {_WANTED}.")
-    for algorithm, values in lists.items():
+    if not isinstance(found, dict) or not found or not all(map(_is_filled, found.values())):
+        raise UserError(f"{source} holds no {what}: {wanted}.")
+    read = {}
+    for algorithm, values in found.items():
         try:
-            check_lists(values, tables_of(algorithm).algorithm.hyperparameters())
+            read[algorithm] = checked(algorithm, values)
         except UserError as error:
             raise UserError(f"{source}, {algorithm}: {error}") from error
-    return {a: {n: tuple(v) for n, v in values.items()} for a, values in lists.items()}
+    return read
 
 
-def write_lists(lists: Mapping[str, Lists]) -> str:
-    """What `read_lists` reads."""
+def write_lists(lists: Mapping[str, Mapping[str, Any]]) -> str:
+    """What `read_lists` or `read_configs` reads."""
     return json.dumps(lists)
 
 
@@ -65,5 +89,5 @@ def write_values(values: Mapping[str, Sequence[float]]) -> str:
     return " ".join(f"{name}={','.join(map(str, listed))}" for name, listed in values.items())
 
 
-def _is_filled(lists: Any) -> bool:
-    return isinstance(lists, dict) and bool(lists)
+def _is_filled(values: Any) -> bool:
+    return isinstance(values, dict) and bool(values)

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from gymnax.environments import spaces
 
 from scb.agents.agent import Agent
-from scb.agents.tables import ACTIVATIONS, DISCRETE_ONLY, TABLES, Lists, Row, Tables
+from scb.agents.tables import ACTIVATIONS, DISCRETE_ONLY, TABLES, Lists, Row, Tables, Values
 from scb.curriculum import with_limit
 from scb.environments.registry import environment_spec
 from scb.errors import UserError, at_least, one_of
@@ -231,6 +231,21 @@ def check_algorithms(names: Sequence[str], kind: str) -> None:
             raise UserError(
                 f"{name} does not fit the environment's {kind} actions: use {', '.join(fitting)}."
             )
+
+
+def configured(config: Any, values: Values) -> Any:
+    """A static configuration with other values of some fields, sequences as tuples.
+
+    Raises:
+      UserError: it has no such field, or the field cannot have the value.
+    """
+    known = {f.name: getattr(config, f.name) for f in fields(config)}
+    given = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
+    for name, value in given.items():
+        one_of("field of a configuration", name, known)
+        if isinstance(known[name], bool) and not isinstance(value, bool):
+            raise UserError(f"{name} is {value!r}: it must be true or false.")
+    return replace(config, **given)
 
 
 def check_lists(lists: Lists, hyperparameters: Any) -> None:

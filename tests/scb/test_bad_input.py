@@ -219,6 +219,36 @@ def test_a_wrong_file_of_hyperparameters_is_refused(tmp_path, monkeypatch, conte
     assert sorted(tmp_path.iterdir()) == before
 
 
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ('{"ppo": 1}', "the text holds no configurations: give {"),
+        ('{"pop": {"num_steps": 5}}', "unknown algorithm 'pop': did you mean ppo"),
+        (
+            '{"ppo": {"num_step": 5}}',
+            "unknown field of a configuration 'num_step': did you mean num_steps",
+        ),
+        ('{"ppo": {"learning_rate": 0.1}}', "unknown field of a configuration 'learning_rate'"),
+        ('{"ppo": {"num_steps": 0.5}}', "num_steps is 0.5: it must be a whole number"),
+        ('{"ppo": {"num_steps": "5"}}', "num_steps is '5': it must be a whole number"),
+        (
+            '{"ppo": {"num_envs": 1, "num_steps": 3, "num_minibatches": 2}}',
+            "num_minibatches is 2, which does not divide a batch of 3",
+        ),
+        ('{"ppo": {"hidden_sizes": 64}}', "hidden_sizes is 64: give a tuple"),
+        ('{"ppo": {"hidden_sizes": [64, "64"]}}', "hidden_sizes[1] is '64': it must be a whole"),
+        ('{"ppo": {"activation": "tan"}}', "'tan': did you mean tanh"),
+        ('{"ppo": {"activation": 1}}', "unknown activation 1"),
+        ('{"ppo": {"anneal_learning_rate": 1}}', "anneal_learning_rate is 1: it must be true or"),
+        ('{"sac": {"num_envs": 2}}', "configurations for sac, but the inner loop trains ppo"),
+    ],
+)
+def test_wrong_configurations_are_refused(tmp_path, monkeypatch, content, message):
+    monkeypatch.chdir(tmp_path)
+    refused(["discover", "--configs", content], message)
+    assert not list(tmp_path.iterdir())
+
+
 def test_fixed_hyperparameters_and_lists_to_draw_from_contradict_each_other(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "lists.json").write_text('{"ppo": {"discount": [0.9]}}')

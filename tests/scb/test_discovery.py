@@ -1,4 +1,4 @@
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import jax
 import jax.numpy as jnp
@@ -46,7 +46,7 @@ TINY_DQN = DQNConfig(
 CONFIG = DiscoveryConfig(
     environment="CartPole-v1",
     bandit=BanditConfig(hidden_size=4),
-    configs={"ppo": TINY, "dqn": TINY_DQN},
+    configs={"ppo": asdict(TINY), "dqn": asdict(TINY_DQN)},
     agents_per_candidate=3,
     evaluation_episodes=2,
     init="random",
@@ -608,6 +608,13 @@ def test_own_lists_take_the_place_of_the_papers():
     np.testing.assert_array_equal(own.gae_lambda, np.full(4, np.float32(0.95)))
     paper = bandit_agent("dqn", "CartPole-v1")
     assert problem.specs["dqn"].lists == paper.lists
+
+
+def test_own_values_change_the_papers_configuration_and_leave_its_others():
+    configs = {"ppo": {"num_steps": 20, "hidden_sizes": [8]}}
+    problem = BanditDiscovery(replace(CONFIG, environment="Pendulum-v1", configs=configs))
+    changed = PPOConfig(num_steps=20, hidden_sizes=(8,), activation="relu")
+    assert problem.specs["ppo"].config == changed
 
 
 def test_the_inner_loop_is_the_papers_where_no_agent_is_given():

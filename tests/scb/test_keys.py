@@ -1,7 +1,7 @@
 """Random keys come from scb.keys, and no two draws of a run use the same one."""
 
 import re
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import jax
 import numpy as np
@@ -94,7 +94,7 @@ DISCOVERY = DiscoveryConfig(
     environment="CartPole-v1",
     bandit=BanditConfig(hidden_size=4),
     algorithms=("ppo", "dqn"),
-    configs={"ppo": TINY, "dqn": TINY_DQN},
+    configs={"ppo": asdict(TINY), "dqn": asdict(TINY_DQN)},
     agents_per_candidate=2,
     evaluation_episodes=1,
     init="random",
