@@ -38,6 +38,7 @@ from lpo.drifts.sums import (
 )
 from scb.errors import UserError, at_least
 from scb.keys import root_key
+from scb.seeds import searching
 
 if TYPE_CHECKING:
     from lpo.objectives import Objective
@@ -73,7 +74,7 @@ class DistillConfig:
       numbers: that a formula may have.
       tolerance: R² that a shorter formula may lack to be taken instead of the best, and that a
         further term must add.
-      seed: decides everything.
+      seed: decides everything; one of `scb.seeds.SEARCHING`.
     """
 
     samples: int = 1000
@@ -91,6 +92,7 @@ class DistillConfig:
         at_least(20, self, "population_size")
         at_least(1, self, "generations", "candidates", "grown", "numbers")
         at_least(0, self, "parsimony", "tolerance")
+        searching(self.seed)
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import tyro
 from jax.typing import ArrayLike
 
@@ -201,12 +202,14 @@ class TaskTraining:
             self.spec = self.spec.with_steps(self.spec.config.steps_after(iterations))
         self.agent = self.spec.agent(self.env, config.drift)
         self.evaluation_episodes = config.evaluation_episodes or (50 if judged_in.is_bandit else 20)
-        self.training_params = self.env_params
+        self.training_params = self.spec.training_params(self.env_params)
         if spec.is_bandit and config.reward_noise:
             scale = self.env.reward_scale(
                 self.env_params, named_key(root_key(0), f"reward scale of {self.env.name}")
             )
-            self.training_params = self.env_params.replace(reward_noise=config.reward_noise * scale)
+            self.training_params = replace(
+                self.training_params, reward_noise=config.reward_noise * scale
+            )
 
     def fitness(
         self, drift_parameters: Any, key: jax.Array, number: int, horizon: ArrayLike = 1.0
@@ -233,8 +236,7 @@ class TaskTraining:
         hyperparameters = replace(hyperparameters, drift=drift_parameters)
         iterations = None
         if self.config.horizons:
-            iterations = jnp.round(jnp.asarray(horizon) * self.spec.config.num_iterations)
-            iterations = jnp.maximum(1, iterations.astype(jnp.int32))
+            iterations = self._iterations(horizon)
             hyperparameters = replace(hyperparameters, horizon=iterations)
         env, params = self.evaluation_env, self.evaluation_params
         _, earned = train_and_judge(
@@ -249,13 +251,22 @@ class TaskTraining:
         returns = earned["return"].returns.mean(-1)
         return fitness.of(returns if fitness.along else returns[None])
 
-    def steps(self, agents: int, share: float = 1.0) -> EnvironmentSteps:
-        """Of so many agents that train for this share of the agent's steps."""
+    def _iterations(self, horizon: ArrayLike) -> jax.Array:
+        """[...] of trainings of these fractions of the inner loop's iterations, at least one."""
+        share = jnp.asarray(horizon) * self.spec.config.num_iterations
+        return jnp.maximum(1, jnp.round(share).astype(jnp.int32))
+
+    def steps(self, agents: int) -> EnvironmentSteps:
+        """Of so many agents; with several horizons the mean over them."""
+        config, trained = self.spec.config, [self.spec.config.num_iterations]
+        if self.config.horizons:
+            trained = self._iterations(np.asarray(self.config.horizons)).tolist()
+        training = sum(map(config.steps_after, trained)) / len(trained)
         points = 1
         if self.config.judgement.along:
-            points = self.spec.config.num_iterations // self.every + 1
+            points = config.num_iterations // self.every + 1
         return EnvironmentSteps(
-            training=round(agents * self.spec.steps * share),
+            training=round(agents * training),
             evaluation=agents
             * points
             * self.evaluation_episodes

@@ -92,11 +92,7 @@ class MetaTraining:
 
     def steps(self) -> EnvironmentSteps:
         """Of one candidate; with random horizons the mean over them."""
-        horizons = self.config.horizons or (1.0,)
-        share = sum(horizons) / len(horizons)
-        return _sum(
-            task.steps(self.config.agents_per_candidate, share) for task in self.tasks.values()
-        )
+        return _sum(task.steps(self.config.agents_per_candidate) for task in self.tasks.values())
 
     def judgement_steps(self) -> EnvironmentSteps:
         """Of one agent for each judge, trained in full."""

@@ -104,6 +104,7 @@ def torch_loss(objective: Objective | str | Path) -> "TorchFunction":
     log-ratio beyond ±MAX_LOG_RATIO is zero, as in training.
     """
     drift = torch_drift(objective)
+    import torch
 
     def loss(
         log_ratio: "torch.Tensor",
@@ -111,10 +112,15 @@ def torch_loss(objective: Objective | str | Path) -> "TorchFunction":
         progress: "float | torch.Tensor | None" = None,
     ) -> "torch.Tensor":
         penalty = drift(log_ratio, advantage, progress)
-        ratio = log_ratio.clamp(-MAX_LOG_RATIO, MAX_LOG_RATIO).exp()
-        return (penalty - ratio * advantage).mean()
+        result: torch.Tensor = _policy_loss(torch, penalty, log_ratio, advantage)
+        return result
 
     return loss
+
+
+def _policy_loss(xp: Any, penalty: Any, log_ratio: Any, advantage: Any) -> Any:
+    ratio = xp.exp(xp.clip(log_ratio, -MAX_LOG_RATIO, MAX_LOG_RATIO))
+    return (penalty - ratio * advantage).mean()
 
 
 def _loaded(objective: Objective | str | Path) -> Objective:
@@ -155,8 +161,15 @@ def _evaluate(
                 "this drift depends on the fraction of training done: give progress, a number in [0, 1]."
             )
         progress = 0.0
-    if isinstance(progress, int | float) and not 0 <= progress <= 1:
+    # A tensor's or a traced array's values are not looked at: that would wait for a device.
+    given = isinstance(progress, int | float | list | tuple | np.generic | np.ndarray)
+    if given and not np.all((np.asarray(progress) >= 0) & (np.asarray(progress) <= 1)):
         raise UserError(f"progress is {progress}: it is the fraction of training done, in [0, 1].")
+    if np.shape(progress) not in ((), log_ratio.shape):
+        raise UserError(
+            f"progress has shape {np.shape(progress)} and log_ratio {tuple(log_ratio.shape)}: "
+            "give one number, or one for each."
+        )
     # A traced JAX array is on no device yet.
     device = getattr(log_ratio, "device", None)
     like = partial(xp.asarray, dtype=log_ratio.dtype, device=device)

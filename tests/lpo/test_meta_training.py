@@ -386,9 +386,12 @@ def test_a_generation_has_one_horizon_and_generations_differ(config):
 
 
 def test_steps_with_horizons_are_their_mean(config):
-    # Three batches of eight, half, all or twice of them: 24 x 3.5 / 3.
+    # Three batches of eight, half (1.5, which is rounded to 2), all or twice of them: 8 x 11 / 3.
     steps = MetaTraining(replace(config, horizons=(0.5, 1.0, 2.0), reward_noise=0.0)).steps()
-    assert (steps.training, steps.evaluation) == (28, 2)
+    assert (steps.training, steps.evaluation) == (29, 2)
+    # However short, a training has a batch.
+    shortest = MetaTraining(replace(config, horizons=(0.01,), reward_noise=0.0)).steps()
+    assert shortest.training == 8
 
 
 # -- reward noise -------------------------------------------------------------------------------

@@ -14,7 +14,7 @@ import pytest
 from lpo.drifts import ClosedFormDrift, LearnedDrift
 from lpo.drifts.contract import BASES
 from lpo.objectives import Objective, load_objective, objective_names
-from lpo.portable import drift_function, numpy_drift, torch_drift, torch_loss
+from lpo.portable import _policy_loss, drift_function, numpy_drift, torch_drift, torch_loss
 from scb.agents.ppo import MAX_LOG_RATIO
 from scb.errors import UserError
 
@@ -97,6 +97,37 @@ def test_a_far_ratio_costs_what_the_farthest_that_training_meets_costs(objective
 def test_a_progress_in_per_cent_is_told():
     with pytest.raises(UserError, match=r"progress is 50: it is the fraction of training done"):
         numpy_drift("ta-lpo")([0.1], [1.0], 50)
+
+
+@pytest.mark.parametrize("progress", [50.0, np.float32(50), np.array(-0.1), [0.5, 0.5, np.nan]])
+@pytest.mark.parametrize("make", [numpy_drift, drift_function])
+def test_no_progress_outside_of_0_and_1_is_taken(make, progress, one_sentence):
+    with pytest.raises(UserError, match=r"the fraction of training done, in \[0, 1\]") as error:
+        make("ta-lpo")(np.zeros(3), np.ones(3), progress)
+    one_sentence(str(error.value))
+
+
+@pytest.mark.parametrize("make", [numpy_drift, drift_function])
+def test_a_progress_is_one_or_one_for_each(make, one_sentence):
+    each = make("ta-lpo")(np.full(3, 0.3), np.ones(3), np.array([0.0, 0.5, 1.0]))
+    ones = [make("ta-lpo")(np.full(1, 0.3), np.ones(1), p)[0] for p in (0.0, 0.5, 1.0)]
+    np.testing.assert_allclose(each, ones, rtol=1e-5)
+    with pytest.raises(UserError, match=r"progress has shape \(4,\) and log_ratio \(3,\)") as error:
+        make("ta-lpo")(np.zeros(3), np.ones(3), np.zeros(4))
+    one_sentence(str(error.value))
+
+
+def test_numpy_computes_in_the_precision_that_it_is_given():
+    drift, x = numpy_drift("lpo-pendulum"), np.linspace(-1.0, 1.0, 5)
+    assert drift(x, np.ones(5)).dtype == drift([0.1], [1]).dtype == np.float64
+    assert drift(x.astype(np.float32), np.ones(5, np.float32)).dtype == np.float32
+
+
+def test_the_policy_loss_is_what_a_drift_takes_from_the_surrogate():
+    # Ratios 2 and exp(20), which is as far as training goes: (0.5 - 2 x 3 + 0.25 + exp(20)) / 2.
+    log_ratio, advantage = np.array([np.log(2.0), 30.0]), np.array([3.0, -1.0])
+    loss = _policy_loss(np, np.array([0.5, 0.25]), log_ratio, advantage)
+    assert loss == pytest.approx((0.5 - 6.0 + 0.25 + np.exp(20.0)) / 2)
 
 
 @every_objective

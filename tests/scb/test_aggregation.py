@@ -11,14 +11,16 @@ from jax.tree_util import Partial
 from scb import aggregation, warm_start
 from scb.agents.ppo import PPOConfig, PPOHyperparameters
 from scb.agents.spec import AgentSpec
-from scb.aggregation import Learners, Visited
+from scb.aggregation import Learners, Visited, best_round, trajectory
 from scb.environments.registry import environment_spec
 from scb.environments.synthetic import BanditConfig, bandit_for
 from scb.errors import UserError
+from scb.evaluation import Episodes
 from scb.experts import Expert
 from scb.keys import split_key
 from scb.measurement import Place
 from scb.warm_start import WarmStartConfig
+from tests.scb.probes import ContinuousCorridor
 
 TINY = PPOConfig(
     num_envs=2, num_steps=8, num_epochs=1, num_minibatches=1, total_steps=16, hidden_sizes=(4,)
@@ -95,7 +97,7 @@ def test_what_agents_of_a_fit_visit_joins_the_dataset_with_the_experts_actions(
 class Fake:
     """Agents that earn what the test says, at the top where nobody moves."""
 
-    steps = 0
+    steps = 11
 
     def __init__(self, *arguments):
         self.returns = iter([-5.0, -3.0, -4.0])
@@ -122,19 +124,28 @@ def test_the_fit_whose_agents_earn_most_is_kept(
 
 def test_a_search_for_an_expert_is_told_what_its_pupils_earn(bandit, place, monkeypatch):
     """Of two policies the second has the better pupils, whatever it earns itself."""
-    monkeypatch.setattr(warm_start, "Learners", Fake)
+    numbers = []
+
+    class Pupils(Fake):
+        def __init__(self, bandit, specs, place, *numbers_of):
+            numbers.append(numbers_of)
+            super().__init__()
+
+    monkeypatch.setattr(warm_start, "Learners", Pupils)
 
     def find(place, key, config, quiet, worth, folder):
         turned = Partial(lambda sign, observation: sign * turning(observation))
         experts = [Expert(Partial(turned, sign), 0.0, 0) for sign in (-1.0, 1.0)]
         earned, steps = zip(*(worth(expert, key) for expert in experts), strict=True)
-        assert earned == (-5.0, -3.0) and steps == (256 * 200, 256 * 200)
+        # The expert's trajectories, and the pupils' own steps.
+        assert earned == (-5.0, -3.0) and steps == (256 * 200 + 11,) * 2
         return Expert(experts[int(np.argmax(earned))].policy, -1000.0, sum(steps))
 
     monkeypatch.setattr(warm_start, "find_expert", find)
     config = WarmStartConfig(expert="linear", expert_pupils=2, num_states=STATES, num_actions=2)
     weights, report = warm_start.warm_start(bandit, SPECS, place, jax.random.key(1), config)
-    assert report["environment_steps"] == 3 * 256 * 200 and report["action_r2"] > 0.99
+    assert numbers == [(2, warm_start.PUPILS_EPISODES)]
+    assert report["environment_steps"] == 3 * 256 * 200 + 22 and report["action_r2"] > 0.99
     # Its policy is the second: to the right of the top, towards it.
     reward = weights["reward"]
     observation = jnp.array([0.0, 1.0, 0.0])
@@ -161,6 +172,52 @@ def test_agents_whose_training_breaks_count_as_random_actions_and_are_not_follow
     one_of_two = {"ppo": fine["ppo"]._replace(states=states)}
     visited = learners.visits(bandit.init_weights(sound), one_of_two)
     assert visited.observation.shape == (1, 200, 3) and np.isfinite(visited.observation).all()
+
+
+def test_agents_act_by_their_most_likely_actions_and_their_steps_are_counted(
+    bandit, place, monkeypatch
+):
+    seen = []
+
+    def trained(agent, hyperparameters, key, params, judges):
+        seen.append(judges["return"])
+        return (), {"return": Episodes(jnp.ones(3), jnp.ones(3), None)}
+
+    monkeypatch.setattr(aggregation, "train_and_judge", trained)
+    specs = {"ppo": SPECS["ppo"], "other": SPECS["ppo"]}
+    learners = Learners(bandit, specs, place, 2, 3)
+    # Two agents of two algorithms, three episodes of 200 steps.
+    assert learners.steps == 2 * 2 * 3 * 200
+    learners(bandit.init_weights(jax.random.key(0)), jax.random.key(1))
+    assert [(judge.mode, judge.episodes) for judge in seen] == [(True, 3)] * 2
+
+
+def test_a_trajectory_is_cut_where_pendulums_ends():
+    env = ContinuousCorridor(cells=1)
+    params = env.default_params.replace(max_steps_in_episode=1000, last=5)
+    still = Place("corridor", env, params)
+    seen = trajectory(still, lambda o, k: jnp.zeros(1), jax.random.key(0), jax.random.key(1))
+    assert len(seen.observation) == aggregation.LENGTH == 200
+
+
+def test_the_latest_fit_is_made_a_better_one_and_the_best_is_kept():
+    class Earning:
+        steps = 0
+
+        def __init__(self):
+            self.returns = iter([3.0, 1.0, 2.0])
+
+        def __call__(self, weights, key):
+            return next(self.returns), {}
+
+    improved = []
+
+    def improve(weights, learned, key):
+        improved.append(weights)
+        return (weights + 1, {}), 0
+
+    (kept, _), _ = best_round((0, {}), Earning(), 2, jax.random.key(0), improve)
+    assert improved == [0, 1] and kept == 0
 
 
 def test_an_expert_below_random_actions_is_refused(bandit, place, monkeypatch):

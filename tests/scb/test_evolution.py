@@ -29,6 +29,7 @@ from scb.evolution import (
 )
 from scb.keys import key_at, root_key, split_key
 from scb.runs import Run, config_dict, read_config
+from scb.statistics import iqm
 from scb.strategies import GRADIENT_ESTIMATING, REMEMBERING, STRATEGIES, Strategy
 from tests.scb.probes import Parabola
 
@@ -263,6 +264,44 @@ def test_the_best_mean_is_the_one_that_was_judged_best():
 
 # Three candidates on two tasks, the second of which scatters a hundred times more.
 TASKS = np.array([[1.0, 100.0], [2.0, 300.0], [3.0, 200.0]])
+
+
+class Luck(Parabola):
+    """What an agent earns is its key's alone; below `least` it diverges."""
+
+    least = 0.0
+
+    def evaluate_mean(self, candidate, key):
+        drawn = jax.random.uniform(key)
+        return {"fitness": jnp.where(drawn < self.least, jnp.nan, drawn)}
+
+
+def test_means_are_judged_by_agents_of_the_same_seeds():
+    metrics = evolve(Luck(), CONFIG, quiet=True).metrics
+    names = ("mean/fitness", "final_mean/fitness")
+    judged = [line[name] for line in metrics for name in names if name in line]
+    assert len(judged) == 4 and len(set(judged)) == 1
+
+
+def test_a_mean_whose_agents_diverge_is_judged_by_these_too(monkeypatch):
+    monkeypatch.setattr(Luck, "least", 0.5)
+    config = replace(CONFIG, mean_evaluations=16, num_generations=1)
+    (line,) = evolve(Luck(), config, quiet=True).metrics
+    *_, key_mean = split_key(root_key(config.seed), 4)
+    earned = np.asarray(jax.vmap(jax.random.uniform)(split_key(key_mean, 16)))
+    counted = rank_failed_last(np.where(earned < 0.5, np.nan, earned))
+    assert line["mean/fitness_iqm"] == pytest.approx(float(iqm(counted)), rel=1e-5)
+    assert line["mean/fitness_iqm"] < float(iqm(earned[earned >= 0.5])) - 0.02
+
+
+def test_the_best_mean_may_be_the_last():
+    class Slope(Parabola):
+        def evaluate(self, candidate, key, generation):
+            return {"fitness": candidate["x"].sum()}
+
+    outcome = evolve(Slope(), CONFIG, quiet=True)
+    assert outcome.best_mean_generation == CONFIG.num_generations
+    np.testing.assert_array_equal(outcome.best_mean["x"], outcome.mean["x"])
 
 
 def test_tasks_are_combined_by_their_mean():

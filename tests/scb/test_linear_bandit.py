@@ -132,6 +132,17 @@ def test_without_generations_the_fit_is_the_result():
     assert outcome.cost(problem, config.evolution, False)["environment_steps_training"] == 0
 
 
+def test_a_constant_in_its_reward_is_scaled_with_it(bandit):
+    weights = bandit.default_params.weights
+    weights = {**weights, "reward": {**weights["reward"], "offset": jnp.float32(2.0)}}
+    context, action = jnp.asarray(CENTER, jnp.float32), jnp.array([0.7, 1.0])
+    reward, other = (
+        float(bandit.mean_reward(context, action, bandit.params(x)))
+        for x in (weights, bandit.with_reward(weights, 3.0, 1.0))
+    )
+    assert other == pytest.approx(3 * reward + 1, abs=1e-5)
+
+
 def test_its_reward_can_be_given_another_scale(bandit):
     weights = standardize_reward(bandit, bandit.default_params.weights, 3.0)
     rewards = bandit.sample_rewards(bandit.params(weights), jax.random.key(5), 4000)

@@ -1,4 +1,5 @@
 import json
+from itertools import combinations
 
 import chex
 import gymnax
@@ -382,6 +383,25 @@ def test_weight_shapes_are_those_of_the_weights(parameterization):
     assert mdp.weight_shapes() == expected
     flat = artefacts.flatten(jax.jit(mdp.init_weights)(jax.random.key(0)))
     assert {name: array.shape for name, array in flat.items()} == expected
+
+
+def test_networks_start_apart():
+    weights = SyntheticMDP(3, SPACES["discrete"], MDPConfig(4, max_steps=9)).init_weights(
+        jax.random.key(0)
+    )
+    first = [np.asarray(weights[x]["Dense_0"]["kernel"]) for x in ("reward", "transition")]
+    first.append(np.asarray(weights["termination"]["Dense_0"]["kernel"]))
+    assert all((one != other).all() for one, other in combinations(first, 2))
+
+
+@pytest.mark.parametrize("parameterization", ["T", "TI"])
+def test_networks_and_latent_are_as_asked(parameterization):
+    made = synthetic_for(
+        *make("CartPole-v1"), parameterization, BanditConfig(8, "relu", "uniform", 2), "Synthetic"
+    )
+    config = made.config
+    found = (config.hidden_size, config.activation, config.latent, config.latent_size)
+    assert found == (8, "relu", "uniform", 2)
 
 
 def test_every_parameterization_takes_the_shapes_of_the_evaluation_environment():

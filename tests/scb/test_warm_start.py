@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from gymnax.environments import spaces
 
+from scb import warm_start
 from scb.agents.dqn import DQNConfig
 from scb.agents.ppo import PPOConfig, PPOHyperparameters
 from scb.agents.spec import ALGORITHMS, AgentSpec, environment_agent
@@ -17,6 +18,7 @@ from scb.errors import UserError
 from scb.expert_data import expert_dataset
 from scb.experts import Expert, judged, train_expert
 from scb.fitting import ExpertDataset, energy_distance, fit_bandit, reward_targets
+from scb.keys import root_key
 from scb.linear_expert import erring, noisy
 from scb.measurement import Place
 from scb.warm_start import WarmStartConfig, expert_agent, find_expert
@@ -531,6 +533,47 @@ def test_every_expert_has_an_environment_that_it_fits():
             else:
                 with pytest.raises(UserError, match=f"{expert} does not fit the environment's"):
                     expert_agent(name, space, config)
+
+
+def test_a_linear_search_leaves_out_what_standing_still_earns_and_is_told_the_rest(
+    monkeypatch, tmp_path
+):
+    seen = []
+    monkeypatch.setattr(warm_start, "search_linear_expert", lambda *given: seen.append(given))
+    # Of Hopper's name, where standing still earns 1000, with an episode of 200 steps.
+    place = Place("hopper", *make("Pendulum-v1"))
+
+    def worth(expert, key):
+        return 0.0, 0
+
+    find_expert(place, root_key(0), WarmStartConfig(expert="linear"), True, worth, tmp_path)
+    assert seen[0][4:] == (5.0, True, worth, tmp_path)
+
+
+def test_the_best_of_so_many_experts_is_asked_for(monkeypatch):
+    seen = []
+    monkeypatch.setattr(warm_start, "train_expert", lambda *given: seen.append(given[4]))
+    config = WarmStartConfig(expert="ppo", num_experts=3)
+    find_expert(Place.named("Pendulum-v1"), root_key(0), config)
+    assert seen == [3]
+
+
+def test_a_fit_is_made_as_asked_and_an_earlier_searchs_seconds_count(monkeypatch):
+    expert = Expert(lambda observation: observation[1:2], -1000.0, 7, earlier_seconds=1e4)
+    monkeypatch.setattr(warm_start, "find_expert", lambda *given: expert)
+    made = []
+
+    def fit(*given, **settings):
+        made.append(settings)
+        return {}, {}
+
+    monkeypatch.setattr(warm_start, "fit_bandit", fit)
+    place = Place.named("Pendulum-v1")
+    bandit = bandit_for(place.env, place.params, BanditConfig(), "Synthetic-Pendulum-v1")
+    config = WarmStartConfig("q", num_states=8, num_actions=2, horizon=2, fit_steps=7)
+    _, report = warm_start.warm_start(bandit, {}, place, root_key(0), config)
+    assert made == [{"construction": "q", "steps": 7}]
+    assert report["seconds"] >= 1e4
 
 
 def test_evolution_gets_the_papers_curriculum_at_its_own_length(monkeypatch):
