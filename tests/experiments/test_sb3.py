@@ -38,6 +38,19 @@ def peer(tmp_path, monkeypatch):
     return lambda: [tuple(json.loads(x)) for x in log.read_text().splitlines()], write
 
 
+def test_what_is_worse_in_the_bandit_found_for_it_is_told(tmp_path, peer):
+    sb3.EXPERIMENT.main(flags(tmp_path, 10, ["ppo"]))
+    report = json.loads((tmp_path / "sb3.json").read_text())
+    own = report["agents"]["Pendulum-v1"]["ppo"][sb3.OWN]
+    own |= {seed: {**of_it, "returns": "-400 -300 -200 -100 0"} for seed, of_it in own.items()}
+    *_, asked, alike = claims.judge(sb3.claims(report))
+    assert asked.outcome == alike.outcome == claims.FAILS
+    assert (asked.estimate.value, alike.estimate.value) == (-300, pytest.approx(-250.45))
+    # Without agents there, nothing is said of it.
+    del report["agents"]["Pendulum-v1"]["ppo"][sb3.OWN]
+    assert len(sb3.claims(report)) == 2
+
+
 def flags(tmp_path, seeds=2, algorithms=("ppo", "td3")):
     found = ["--python", sys.executable, "--seeds", str(seeds)]
     found += ["--environments", "Pendulum-v1", "--algorithms", *algorithms]
@@ -50,13 +63,14 @@ def test_a_seed_of_everything_is_trained_before_the_next_and_nothing_twice(tmp_p
     first = [
         (place, algorithm, REPORTING[0])
         for algorithm in ("ppo", "td3")
-        for place in ("scb/Synthetic-Pendulum-v1", "Pendulum-v1")
+        for place in ("scb/Synthetic-Pendulum-v1", "scb/Synthetic-Pendulum-sb3-v1", "Pendulum-v1")
     ]
     assert done() == first
     assert sb3.EXPERIMENT.main(flags(tmp_path, 2)) == 0
     assert done() == first + [(*job[:2], REPORTING[1]) for job in first]
     page = (tmp_path / "sb3.md").read_text()
     assert "| Pendulum-v1, PPO, in the bandit | 110 | 120 |" in page
+    assert "| Pendulum-v1, PPO, in SB3's bandit | 110 | 120 |" in page
     assert "| Pendulum-v1, TD3, in itself | 10 |  |" in page
     assert (tmp_path / "figures" / "sb3.png").exists()
 
@@ -75,10 +89,17 @@ def test_an_algorithm_is_judged_by_agents_of_the_same_seeds(tmp_path, peer):
     sb3.EXPERIMENT.main(flags(tmp_path, 10))
     report = json.loads((tmp_path / "sb3.json").read_text())
     judged = claims.judge(sb3.claims(report))
-    assert [x.outcome for x in judged] == [
-        claims.HOLDS
-    ] * 3  # PPO after the fewest and the most steps, TD3
-    assert all(x.estimate.value == pytest.approx(100.0, abs=0.1) for x in judged)
+    better = [x for x in judged if "more in the bandit than in itself" in x.claim.text]
+    # PPO after the fewest and the most steps, TD3.
+    assert [x.outcome for x in better] == [claims.HOLDS] * 3
+    assert all(x.estimate.value == pytest.approx(100.0, abs=0.1) for x in better)
+    asked, *alike = [x for x in judged if x not in better]
+    # After 20 000 steps a tenth of the seed's last digit more than 120, of -250 that are asked.
+    assert asked.estimate.value == pytest.approx(120.45) and asked.claim.least == -250
+    assert [x.estimate.value for x in alike] == [0.0, 0.0]
+    # A twentieth of what lies between -1214 and -137.
+    assert all(x.claim.least == pytest.approx(-53.9, abs=0.1) for x in alike)
+    assert asked.outcome == alike[0].outcome == alike[1].outcome == claims.HOLDS
     both = "steps: 250 trained in the bandit of Pendulum-v1, 150 in Pendulum-v1 itself; TD3"
     assert both in sb3.EXPERIMENT.page(report)
     del report["agents"]["Pendulum-v1"]["ppo"]["environment"][str(REPORTING[0])]

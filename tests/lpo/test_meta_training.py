@@ -284,6 +284,30 @@ def test_every_task_gives_its_own_entries_of_fitness(config):
     }
 
 
+def test_steps_of_several_tasks_are_the_sum_of_each(config):
+    tasks = ("Synthetic-Pendulum-v1", "Synthetic-CartPole-v1")
+    several = replace(config, tasks=tasks, agent=None, contexts=20)
+    problem, alone = (
+        MetaTraining(several),
+        [MetaTraining(replace(several, tasks=(t,))) for t in tasks],
+    )
+    for steps in ("steps", "judgement_steps"):
+        each = [getattr(one, steps)() for one in alone]
+        assert getattr(problem, steps)().training == sum(x.training for x in each)
+        assert getattr(problem, steps)().evaluation == sum(x.evaluation for x in each)
+
+
+def test_tasks_have_keys_of_their_own(config, monkeypatch):
+    def drawn(task, candidate, key, number, horizon=1.0):
+        return jnp.full(number, jax.random.uniform(key))
+
+    monkeypatch.setattr(TaskTraining, "fitness", drawn)
+    tasks = ("Synthetic-Pendulum-v1", "Synthetic-CartPole-v1")
+    problem = MetaTraining(replace(config, tasks=tasks, agent=None))
+    one, other = problem.evaluate({}, jax.random.key(0), jnp.int32(0))["fitness"]
+    assert one != other
+
+
 @pytest.mark.slow
 def test_tasks_of_other_shapes_learn_one_objective(config):
     # Three observations and a torque, four observations and two actions; ranks, since a pendulum

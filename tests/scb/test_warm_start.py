@@ -13,6 +13,7 @@ from scb.agents.spec import ALGORITHMS, AgentSpec, environment_agent
 from scb.agents.td3 import TD3Config
 from scb.curriculum import CurriculumConfig
 from scb.environments.registry import make
+from scb.environments.spec import EnvironmentSpec
 from scb.environments.synthetic import BanditConfig, BanditParams, SyntheticBandit, bandit_for
 from scb.errors import UserError
 from scb.expert_data import expert_dataset
@@ -556,6 +557,23 @@ def test_the_best_of_so_many_experts_is_asked_for(monkeypatch):
     config = WarmStartConfig(expert="ppo", num_experts=3)
     find_expert(Place.named("Pendulum-v1"), root_key(0), config)
     assert seen == [3]
+
+
+def test_an_expert_is_compared_with_random_actions_in_the_same_physics(monkeypatch):
+    asked = []
+
+    def random_return(spec, backend=None):
+        asked.append(backend)
+        return 0.0
+
+    monkeypatch.setattr(EnvironmentSpec, "random_return", random_return)
+    expert = Expert(lambda observation: observation[1:2], -1.0, 7)
+    monkeypatch.setattr(warm_start, "find_expert", lambda *given: expert)
+    place = Place("hopper", *make("Pendulum-v1"), "spring")
+    bandit = bandit_for(place.env, place.params, BanditConfig(), "Synthetic-Pendulum-v1")
+    with pytest.raises(UserError, match="earns -1 and random actions 0"):
+        warm_start.warm_start(bandit, {}, place, root_key(0), WarmStartConfig())
+    assert asked == ["spring"]
 
 
 def test_a_fit_is_made_as_asked_and_an_earlier_searchs_seconds_count(monkeypatch):
