@@ -4,7 +4,9 @@
 
 Its algorithms with their default hyperparameters train in a bandit of the zoo or in Gymnasium's environment, and
 are judged in the environment after several numbers of steps. It has an environment of its own (`make sb3` makes
-it), in which every agent is a process. What --out holds already is not trained again.
+it), in which every agent is a process. What --out holds already is not trained again. In a bandit of one's own alone:
+
+    python -m experiments.sb3 --environments Pendulum-v1 --algorithms ppo --bandit FILE.npz --out FILE.json
 """
 
 import json
@@ -25,8 +27,11 @@ from experiments.parts import InParts, Part
 from experiments.rendering import number
 from scb import plotting
 from scb.environments.registry import environment_spec
+from scb.environments.zoo import bandit_metadata, open_bandit
 from scb.errors import UserError, at_least, one_of
 from scb.gymnasium import NAMESPACE
+from scb.judgement import check_fits
+from scb.measurement import Place
 from scb.plotting import thousands
 from scb.seeds import REPORTING, reporting
 from scb.statistics import DECIDING, Estimate, estimate, paired_difference
@@ -68,29 +73,40 @@ class Options:
     """those of them that an environment's actions allow"""
     seeds: int = 10
     """agents of each"""
+    bandit: Path | None = None
+    """path.npz of a bandit in place of the zoo's; of one environment, in a report of its own (--out)"""
+    longest: int = LONG[-1]
+    """training steps that no agent exceeds"""
 
     def __post_init__(self) -> None:
         at_least(1, self, "seeds")
+        at_least(LONG[0], self, "longest")
         for name in self.environments:
             one_of("environment", name, ALGORITHMS)
         for name in self.algorithms:
             one_of("algorithm", name, STEPS)
+        if self.bandit is not None and len(self.environments) != 1:
+            raise UserError(
+                f"the bandit {self.bandit} is for one environment, and there are {len(self.environments)}: name it by "
+                "--environments."
+            )
 
 
 def parts(options: Options, report: dict[str, Any]) -> Iterator[Part]:
     """A seed of everything at a time, so that all have as many wherever it ends."""
     if not options.python.exists():
         raise UserError(f"{options.python} is not there: run `make sb3`, or give another --python.")
-    settled(report, steps=STEPS, episodes=EPISODES)
+    steps = {name: [n for n in of if n <= options.longest] for name, of in STEPS.items()}
+    settled(report, steps=steps, episodes=EPISODES, bandit=_checksum(options))
     python = str(options.python)
     yield Part(("peer_versions",), partial(_said, python, "versions"))
     for seed in reporting(options.seeds):
         for name, algorithm, place in cells(options):
             job = {
                 "algorithm": algorithm,
-                "train_in": trained_in(name, place),
+                "train_in": trained_in(name, place, options.bandit),
                 "judge_in": name,
-                "steps": STEPS[algorithm],
+                "steps": steps[algorithm],
                 "episodes": EPISODES,
                 "seed": seed,
             }
@@ -122,13 +138,26 @@ def cells(options: Options) -> Iterator[tuple[str, str, str]]:
     for name in options.environments:
         for algorithm in ALGORITHMS[name]:
             if algorithm in options.algorithms:
-                yield from ((name, algorithm, place) for place in PLACES)
+                places = PLACES if options.bandit is None else (BANDIT,)
+                yield from ((name, algorithm, place) for place in places)
 
 
-def trained_in(environment: str, place: str) -> str:
-    """Gymnasium's name of where agents train."""
+def _checksum(options: Options) -> str | None:
+    """Of a bandit in place of the zoo's, which a report is then of; it must stand for the environment."""
+    if options.bandit is None:
+        return None
+    (name,) = options.environments
+    place = Place.named(name)
+    check_fits(open_bandit(str(options.bandit)), place.env, place.params, name)
+    return str(bandit_metadata(str(options.bandit))["sha256"])
+
+
+def trained_in(environment: str, place: str, bandit: Path | None = None) -> str:
+    """Gymnasium's name of where agents train, or a bandit's file."""
     if place == ENVIRONMENT:
         return environment
+    if bandit is not None:
+        return str(bandit.resolve())
     return f"{NAMESPACE}/{environment_spec(environment).bandit}"
 
 

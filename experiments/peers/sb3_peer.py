@@ -5,6 +5,8 @@
 
     python sb3_peer.py versions
 
+`train_in` may also be the file of a bandit, path.npz.
+
 All hyperparameters are the defaults. Prints as JSON the mean return of the most likely actions after each number
 of steps, and the seconds that training took until there.
 """
@@ -62,7 +64,9 @@ def main():
     job = json.loads(sys.argv[1])
     torch.set_num_threads(1)
     algorithm = getattr(stable_baselines3, job["algorithm"].upper())
-    env = gymnasium.make(job["train_in"])
+    train_in = job["train_in"]
+    of_file = train_in.endswith(".npz")
+    env = gymnasium.make("scb/Synthetic", file=train_in) if of_file else gymnasium.make(train_in)
     model = algorithm("MlpPolicy", env, seed=job["seed"], device="cpu")
     judge = Judge(job)
     model.learn(max(job["steps"]), callback=judge)
