@@ -118,7 +118,7 @@ def test_a_discovery_from_a_warm_start_and_its_judgement_use_every_key_at_one_pl
     # An expert of one generation may earn less than random actions, which would be refused.
     monkeypatch.setattr(EnvironmentSpec, "random_return", lambda *arguments: 0.0)
     warm_start = WarmStartConfig(
-        expert="evolution", expert_generations=1, num_states=8, horizon=4, fit_steps=2
+        "q", expert="evolution", expert_generations=1, num_states=8, horizon=4, fit_steps=2
     )
     config = replace(DISCOVERY, init="expert", reward_std=1.0, warm_start=warm_start)
     with recorded() as record:
