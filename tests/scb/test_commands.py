@@ -336,7 +336,16 @@ def test_a_file_gives_the_lists_to_draw_from(tmp_path):
 
 @pytest.mark.slow
 def test_a_synthetic_mdp_is_discovered_and_its_command_asks_for_the_same_again(tmp_path):
-    flags = ["--parameterization", "T", "--max-steps", "3", "--mode", "sequential"]
+    flags = [
+        "--parameterization",
+        "T",
+        "--latent",
+        "normal",
+        "--max-steps",
+        "3",
+        "--mode",
+        "sequential",
+    ]
     flags += ["--algorithms", "ppo,dqn,ppo", "--curriculum", "linear:2:4:0:2", "--mode-actions"]
     flags += ["--fixed-hyperparameters", "--out", tmp_path / "run"]
     result = call(*DISCOVER, *flags, "--judge-agents", "0")
