@@ -195,6 +195,19 @@ class Parabola:
         return EnvironmentSteps(training=7, evaluation=2)
 
 
+class Slope(Parabola):
+    """Fitness is the sum of x, or what that is with the other sign."""
+
+    def __init__(self, sign: float = 1.0) -> None:
+        super().__init__()
+        self.sign = sign
+
+    def evaluate(
+        self, candidate: dict[str, jax.Array], key: jax.Array, generation: jax.Array
+    ) -> dict[str, jax.Array]:
+        return {"fitness": self.sign * candidate["x"].sum()}
+
+
 @contextmanager
 def small_agents() -> Iterator[None]:
     """The paper's tables with 16 steps and networks of four units; numbers, lists and limits as they are."""

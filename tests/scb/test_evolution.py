@@ -31,7 +31,7 @@ from scb.keys import key_at, root_key, split_key
 from scb.runs import Run, config_dict, read_config
 from scb.statistics import iqm
 from scb.strategies import GRADIENT_ESTIMATING, REMEMBERING, STRATEGIES, Strategy
-from tests.scb.probes import Parabola
+from tests.scb.probes import Parabola, Slope
 
 CONFIG = EvolutionConfig(
     population_size=8,
@@ -140,16 +140,6 @@ def test_ranks_are_not_for_a_strategy_that_remembers_fitness(strategy):
 def test_what_a_strategy_does_not_use_is_refused(arguments, message):
     with pytest.raises(UserError, match=message):
         EvolutionConfig(**arguments)
-
-
-class Slope(Parabola):
-    """Fitness is x, or -x."""
-
-    def __init__(self, sign):
-        self.sign = sign
-
-    def evaluate(self, candidate, key, generation):
-        return {"fitness": self.sign * candidate["x"].sum()}
 
 
 @pytest.mark.parametrize("strategy", ["SNES", "Open_ES"])
@@ -295,10 +285,6 @@ def test_a_mean_whose_agents_diverge_is_judged_by_these_too(monkeypatch):
 
 
 def test_the_best_mean_may_be_the_last():
-    class Slope(Parabola):
-        def evaluate(self, candidate, key, generation):
-            return {"fitness": candidate["x"].sum()}
-
     outcome = evolve(Slope(), CONFIG, quiet=True)
     assert outcome.best_mean_generation == CONFIG.num_generations
     np.testing.assert_array_equal(outcome.best_mean["x"], outcome.mean["x"])

@@ -9,16 +9,9 @@ import pytest
 from scb.evolution import EvolutionConfig, evolve
 from scb.keys import root_key
 from scb.strategies import Strategy
-from tests.scb.probes import Parabola
+from tests.scb.probes import Slope
 
 MANY = EvolutionConfig(population_size=400, sigma=0.1)
-
-
-class Slope(Parabola):
-    """The farther, the better."""
-
-    def evaluate(self, candidate, key, generation):
-        return {"fitness": candidate["x"].sum()}
 
 
 def test_every_weight_is_searched_in_its_own_unit():
