@@ -72,10 +72,11 @@ class Options:
 
 def parts(options: Options, report: dict[str, Any]) -> Iterator[Part]:
     """The choice of a clip, then a few seeds of every objective at a time: all have as many wherever it ends."""
-    for name in options.objectives:
+    objectives = tuple(dict.fromkeys((REFERENCE, *options.objectives)))
+    for name in objectives:
         load_objective(name)  # that nobody waits for a name that is none
     for environment in options.environments:
-        names = options.objectives
+        names = objectives
         if options.tuning_agents:
             seeds = validation(options.tuning_agents)
             yield from _of(environment, CLIPS, seeds, options, report, "sweep")
@@ -171,9 +172,10 @@ def claims(report: Report) -> list[Claim]:
     """Of every objective but the reference: no worse at the end and over the last quarter, and better over all."""
     found = []
     for environment, entry in looked_at(report).items():
-        reference, *others = as_comparison(environment, entry).curves
-        for curves in others:
-            found += [_claim(curves, reference, of) for of in ASKED]
+        curves = {x.objective: x for x in as_comparison(environment, entry).curves}
+        reference = curves.pop(REFERENCE)
+        for of_it in curves.values():
+            found += [_claim(of_it, reference, of) for of in ASKED]
     return found
 
 

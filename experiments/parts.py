@@ -18,7 +18,7 @@ from typing import Any, Literal, TypeVar
 import submitit
 from submitit.helpers import Checkpointable
 
-from scb.errors import UserError, at_least
+from scb.errors import UserError, at_least, first_line, unused
 from scb.files import make_folder, write_json
 
 Keys = tuple[str, ...]
@@ -123,6 +123,13 @@ class Jobs:
         for word in self.slurm:
             if not all(word.partition("=")):
                 raise UserError(f"--slurm {word!r}: give KEY=VALUE, as sbatch's --KEY=VALUE.")
+        if self.executor == "here":
+            ours = ("jobs", "hours", "cpus", "gpus", "slurm")
+            unused(
+                self, "the parts are measured here, one after the other", ours, "name --executor"
+            )
+        if self.executor == "local":
+            unused(self, "the jobs are this machine's", ("cpus", "slurm"), "take --executor slurm")
 
     def executor_in(self, folder: Path) -> submitit.Executor:
         """That of submitit, whose files are in a folder.
@@ -167,8 +174,7 @@ class Measurement(Checkpointable):
             try:
                 write_json(self.kept, {"part": self.part.name, "found": self.part.measured()})
             except Exception as error:
-                said = (str(error).strip() or type(error).__name__).splitlines()[0]
-                self.kept.with_suffix(".error").write_text(said)
+                self.kept.with_suffix(".error").write_text(first_line(error))
                 raise
 
 

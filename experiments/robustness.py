@@ -75,9 +75,12 @@ def parts(options: Options, report: dict[str, Any]) -> Iterator[Part]:
     settled(report, first_seed=first)
     loaded = [None if x == DRAWN else load_objective(x) for x in options.objectives]
     check_names([x for x in loaded if x])
+    learned_in([x for x in loaded if x])  # before the first waits, and not after
     objectives = {DRAWN if x is None else x.name: x for x in loaded}
+    settings = _PLAN["settings"]
     for environment in options.environments:
-        for i, setting in enumerate(_PLAN["settings"][environment_spec(environment).family]):
+        family = environment_spec(environment).family
+        for i, setting in enumerate(settings.get(family, settings["classic"])):
             words = ", ".join(f"{name} {value}" for name, value in setting.items())
             key = f"{options.draws} of {words}"
             spec = replace(ppo_spec(environment).with_values(**setting), lists=_PLAN["lists"])

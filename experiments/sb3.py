@@ -22,7 +22,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
 from experiments.claims import Claim, of_agents
-from experiments.harness import Experiment, Report, packed, settled, unpacked
+from experiments.harness import Experiment, Report, bandit_of, packed, settled, unpacked
 from experiments.parts import InParts, Part
 from experiments.rendering import number
 from scb import plotting
@@ -98,6 +98,9 @@ def parts(options: Options, report: dict[str, Any]) -> Iterator[Part]:
         raise UserError(f"{options.python} is not there: run `make sb3`, or give another --python.")
     steps = {name: [n for n in of if n <= options.longest] for name, of in STEPS.items()}
     settled(report, steps=steps, episodes=EPISODES, bandit=_checksum(options))
+    if options.bandit is None:
+        sums = {name: bandit_of(name)[1] for name in options.environments}
+        settled(report.setdefault("sha256", {}), **sums)
     python = str(options.python)
     yield Part(("peer_versions",), partial(_said, python, "versions"))
     for seed in reporting(options.seeds):

@@ -63,8 +63,6 @@ def measure(options: Options, report: dict[str, Any], save: Save) -> None:
             metadata["results"] = measured
             (seed,) = {result["seed"] for result in measured.values()}
             metadata["seeds"] = {**metadata["seeds"], "reporting": seed}
-        for own in ("schema_version", "name", "versions", "sha256", "kind"):
-            metadata.pop(own)
         weights = bandit.default_params.weights
         written = save_bandit(options.folder / path.name, bandit, weights, metadata)
         print(f"{written}: measured {', '.join(metadata['results']) or 'nothing yet'}")

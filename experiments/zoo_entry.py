@@ -61,8 +61,6 @@ def measure(options: Options, report: dict[str, Any], save: Save) -> None:
         } | {name: {short(k): x for k, x in found[name].items()} for name in by_objective}
     metadata["results"] = results
     metadata["seeds"] = {**metadata["seeds"], "reporting": reporting_seeds}
-    for own in ("schema_version", "name", "versions", "sha256", "kind", "certificate"):
-        metadata.pop(own, None)
     path, certificate = save_objective(
         options.folder / f"{options.name}.npz", objective.drift, objective.parameters, metadata
     )

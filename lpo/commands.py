@@ -96,6 +96,9 @@ class MetaTrain(LongRun):
     def growing(self) -> Collection[str]:
         return GENERATIONS
 
+    def inputs(self) -> dict[str, str]:
+        return self.config.checksums()
+
     def run(self) -> None:
         objective = self.objective()
         if not processes.first():
@@ -148,7 +151,8 @@ def distill_command(
                 "distill": config,
                 "of": loaded.name,
                 "of_sha256": loaded.metadata.get("sha256"),
-                "learned_on": list(loaded.learned_on),
+                "learned_on": loaded.learned_on,
+                "homes": loaded.homes,
             },
             "seeds": {"distill": config.seed},
             "results": {"r2": found.r2, "base_r2": found.base_r2, "front": found.front},

@@ -18,6 +18,7 @@ from scb.agents.ppo import PPOConfig, PPOHyperparameters
 from scb.agents.spec import AgentSpec, check_lists, environment_agent
 from scb.command_line import listed, numbers, text
 from scb.environments.registry import check_backend, environment_spec
+from scb.environments.zoo import bandit_metadata
 from scb.errors import UserError, at_least, unknown_name
 from scb.evolution import EnvironmentSteps, EvolutionConfig
 from scb.keys import named_key, root_key, split_key
@@ -162,6 +163,12 @@ class MetaTrainingConfig:
         """Where fitness is earned."""
         return self.homes if self.judgement.at_home else self.tasks
 
+    def checksums(self) -> dict[str, str]:
+        """{task: SHA-256} of the bandits and synthetic MDPs, whose names do not say which weights they stand for."""
+        return {
+            x: bandit_metadata(x)["sha256"] for x in self.tasks if environment_spec(x).synthetic
+        }
+
     def at_home(self) -> "MetaTrainingConfig":
         """The same on the tasks' evaluation environments themselves."""
         return replace(self, tasks=self.homes, fitness="return", agent=None)
@@ -256,10 +263,10 @@ class TaskTraining:
         share = jnp.asarray(horizon) * self.spec.config.num_iterations
         return jnp.maximum(1, jnp.round(share).astype(jnp.int32))
 
-    def steps(self, agents: int) -> EnvironmentSteps:
-        """Of so many agents; with several horizons the mean over them."""
+    def steps(self, agents: int, full: bool = False) -> EnvironmentSteps:
+        """Of so many agents; with several horizons the mean over them, or trained in full whatever these are."""
         config, trained = self.spec.config, [self.spec.config.num_iterations]
-        if self.config.horizons:
+        if self.config.horizons and not full:
             trained = self._iterations(np.asarray(self.config.horizons)).tolist()
         training = sum(map(config.steps_after, trained)) / len(trained)
         points = 1

@@ -22,7 +22,6 @@ from lpo.inner_loop import MetaTrainingConfig, TaskTraining
 from lpo.objectives import Objective, load_objective, save_objective
 from scb import processes
 from scb.environments.registry import environment_spec
-from scb.environments.zoo import bandit_metadata
 from scb.errors import UserError
 from scb.evolution import EnvironmentSteps, EvolutionConfig, Outcome, evolve
 from scb.keys import root_key, split_key
@@ -96,7 +95,7 @@ class MetaTraining:
 
     def judgement_steps(self) -> EnvironmentSteps:
         """Of one agent for each judge, trained in full."""
-        return _sum(judge.steps(1) for judge in self.judges.values())
+        return _sum(judge.steps(1, full=True) for judge in self.judges.values())
 
 
 def _apart(fitness: Mapping[str, jax.Array]) -> dict[str, jax.Array]:
@@ -164,13 +163,12 @@ def _story(problem: MetaTraining, outcome: Outcome, mean: Any, command: str) -> 
         if key in ("mean/fitness", "final_mean/fitness")
     ]
     end = outcome.validate(mean)["fitness"]
-    config: dict[str, Any] = {"meta_training": config_dict(problem.config)}
-    bandits = [name for name in problem.tasks if environment_spec(name).is_bandit]
-    if bandits:
-        # The name alone does not say which weights it stood for.
-        config["bandit_sha256"] = {name: bandit_metadata(name)["sha256"] for name in bandits}
     return {
-        "config": config,
+        "config": {
+            "meta_training": config_dict(problem.config),
+            "homes": problem.config.homes,
+            "bandit_sha256": problem.config.checksums(),
+        },
         "seeds": {"meta_training": evolution.seed, "validation": VALIDATING.start},
         "results": {
             "mean_fitness": judged,

@@ -45,6 +45,16 @@ class Objective:
         config = self.metadata.get("config", {})
         return tuple(config.get("meta_training", {}).get("tasks", config.get("learned_on", ())))
 
+    @property
+    def homes(self) -> tuple[str, ...]:
+        """The environments that it was learned for: its tasks, or what they stand for.
+
+        Raises:
+          UserError: a task is a file that is not there, and what the objective was saved with does not say.
+        """
+        tasks = (environment_spec(task).evaluation_environment for task in self.learned_on)
+        return tuple(self.metadata.get("config", {}).get("homes") or dict.fromkeys(tasks))
+
 
 def zoo_names() -> list[str]:
     """Names of the learned objectives that ship with the library."""
@@ -107,8 +117,7 @@ def load_apart(names: Sequence[str]) -> list[Objective]:
 
 def learned_in(objectives: Sequence[Objective]) -> list[str]:
     """The environments that objectives were learned for: themselves, or what their bandits stand for."""
-    tasks = [task for objective in objectives for task in objective.learned_on]
-    return sorted({environment_spec(task).evaluation_environment for task in tasks})
+    return sorted({home for objective in objectives for home in objective.homes})
 
 
 def run_name(file: Path) -> str:

@@ -255,6 +255,9 @@ class RunAll(LongRun):
     config: Annotated[PipelineConfig, tyro.conf.arg(name="")] = PRESETS["quick"]
     output: Output = field(default_factory=lambda: Output(Path("runs/quick")))
 
+    def inputs(self) -> dict[str, str]:
+        return {} if self.config.objective else self.config.meta_training.checksums()
+
     def run(self) -> None:
         # A mistake must not leave a folder behind.
         if self.config.objective is None:

@@ -220,6 +220,7 @@ class Evaluate(Comparing):
         check_backend(config.backend, environments)
         for environment in environments:
             ppo_spec(environment, config.steps, config.policy_output_scale)
+        homes = learned_in(objectives)
         (folder, rows), printer = self.opened(), console()
         scores, comparisons = run_suite(
             name,
@@ -238,7 +239,6 @@ class Evaluate(Comparing):
             table.add_row(environment, *(str(estimate(c.final)) for c in comparison.curves))
         printer.print(table)
         printer.print(_scores_table(scores, "over all of them"))
-        homes = learned_in(objectives)
         elsewhere = scores.without(*homes) if {*homes} & {*scores.environments} else None
         if elsewhere is not None:
             where = f"without {', '.join(homes)}, for which one of them was learned"
@@ -377,4 +377,7 @@ def _moving(curves: LearningCurves) -> tuple[str, ...]:
         return ()
     above = int((curves.final > standing).sum())
     share = f"{above} of {len(curves.final)}"
-    return share, f"{np.nanmean(speeds[:, -1]):.2f}", f"{np.nanmean(lengths[:, -1]):.0f}"
+    length = f"{np.nanmean(lengths[:, -1]):.0f}"
+    # Not every environment tells a speed.
+    known = np.isfinite(speeds[:, -1]).any()
+    return share, f"{np.nanmean(speeds[:, -1]):.2f}" if known else "", length

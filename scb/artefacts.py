@@ -26,7 +26,7 @@ import numpy as np
 from flax import traverse_util
 
 from scb import schema
-from scb.errors import UserError
+from scb.errors import UserError, first_line
 from scb.files import strict_json, write_bytes
 
 # numpy.ndarray leaves under any depth of dictionaries: {"reward": {"Dense_0": {"kernel": ...}}}.
@@ -75,7 +75,8 @@ def save(path: str | Path, arrays: Mapping[str, Any], metadata: Mapping[str, Any
         **metadata,
         "schema_version": schema.VERSION,
         "name": npz_path.name.removesuffix(".npz"),
-        "versions": package_versions(),
+        # What is saved anew was found with those that it says.
+        "versions": metadata.get("versions", package_versions()),
         "sha256": hashlib.sha256(data).hexdigest(),
     }
     written = {key: written[key] for key in (*schema.FIELDS, *written) if key in written}
@@ -147,9 +148,8 @@ def described(path: str | Path, what: str, entry: str = "a config entry") -> Ite
             f"{path} does not describe a {what}: its .json lacks config entry {error}."
         ) from error
     except Exception as error:
-        reason = (str(error).splitlines() or [type(error).__name__])[0].rstrip(".")
         raise UserError(
-            f"{path} does not describe a {what}: its .json garbles {entry} ({reason})."
+            f"{path} does not describe a {what}: its .json garbles {entry} ({first_line(error).rstrip('.')})."
         ) from error
 
 

@@ -15,7 +15,7 @@ import orbax.checkpoint as ocp
 from rich.console import Console
 
 from scb import processes
-from scb.errors import UserError
+from scb.errors import UserError, first_line
 
 
 class Checkpoints:
@@ -53,7 +53,7 @@ class Checkpoints:
         # Orbax and tensorstore raise many kinds where a disk is full or a folder is gone.
         except Exception as error:
             raise UserError(
-                f"checkpoint {step} could not be written to {self.folder} ({_told(error)}): the one before it is "
+                f"checkpoint {step} could not be written to {self.folder} ({_said(error)}): the one before it is "
                 "there; make room, and go on with --resume."
             ) from error
 
@@ -78,7 +78,7 @@ class Checkpoints:
                 state = _from_leaves(template, restored["state"])
             # Orbax and tensorstore raise many kinds for a file that is cut or altered.
             except Exception as error:
-                intact, why = False, _told(error)
+                intact, why = False, _said(error)
             if intact:
                 break
             damaged.append(step)
@@ -126,8 +126,8 @@ def continued(
     return checkpoints, processes.told(step), processes.agreed(state)
 
 
-def _told(error: Exception) -> str:
-    return (str(error).splitlines() or [type(error).__name__])[0][:200]
+def _said(error: Exception) -> str:
+    return first_line(error)[:200]
 
 
 def _leaves(tree: Any) -> dict[str, np.ndarray]:

@@ -128,6 +128,10 @@ class LongRun(ABC):
         """The deciding flags that a configuration has."""
         return {}
 
+    def inputs(self) -> Mapping[str, str]:
+        """{name: SHA-256} of the bandits that a search begins with, whose names say nothing of what is in them."""
+        return {}
+
     def growing(self) -> Collection[str]:
         """Settings, such as "evolution.num_generations", of which a resumed run may have more than it had."""
         return ()
@@ -163,8 +167,8 @@ class LongRun(ABC):
         command = stored.get("command")
         if "config" not in stored or not isinstance(command, str):
             raise UserError(
-                f"cannot resume {folder}: an earlier version started it, and this one would not end with the same "
-                f"numbers; remove it (rm -r {shlex.quote(str(folder))}), or start another with --out."
+                f"cannot resume {folder} with {cls.program}: an experiment started it, whose command goes on with "
+                "it, or an earlier version, with other numbers; start another with --out."
             )
         try:
             words, program = shlex.split(command), cls.program.split()
@@ -196,7 +200,9 @@ class LongRun(ABC):
         """The run folder, new or resumed."""
         output, wandb = self.output, getattr(self.output, "wandb", None)
         command = " ".join([self.command, *map(shlex.quote, self.further())])
-        stored = {"command": command, "config": config_dict(self.config)}
+        stored: dict[str, Any] = {"command": command, "config": config_dict(self.config)}
+        if inputs := self.inputs():
+            stored["inputs"] = inputs
         folder, resumed, refused, run = (
             output.resume or output.out,
             output.resume is not None,
@@ -265,6 +271,10 @@ def call(
         )
     elif isinstance(command, type) and issubclass(command, LongRun):
         others = flags_given(arguments[1:], "coordinator", "processes", "process")
+        if others and not command.together:
+            raise UserError(
+                f"--{next(iter(others))} is given, and {command.program} is no work of several processes: leave it out."
+            )
         if command.together and "--help" not in arguments:
             processes.start(others)
         command.parse(arguments[1:]).run()

@@ -132,6 +132,10 @@ class Discover(LongRun):
         # The paper's curriculum is stretched to the length of the search.
         return () if self.config.curriculum == "paper" else GENERATIONS
 
+    def inputs(self) -> dict[str, str]:
+        start = self.config.start
+        return {} if start is None else {start: bandit_metadata(start)["sha256"]}
+
     def further(self) -> Iterator[str]:
         yield from flags(self.judgement, Judgement())
 

@@ -41,6 +41,11 @@ def _check(
             raise UserError(f"{name} is {value}: it must be {allowed}{finite}.")
 
 
+def first_line(error: Exception) -> str:
+    """What an error says in its first line; its type's name where it says nothing."""
+    return next(iter(str(error).strip().splitlines()), type(error).__name__)
+
+
 def unused(config: Any, because: str, names: Iterable[str], otherwise: str) -> None:
     """Raises a UserError where a dataclass' field by one of these names is not at its default, and nothing uses it.
 

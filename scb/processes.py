@@ -17,7 +17,7 @@ from jax._src.distributed import global_state
 from jax.experimental import multihost_utils
 
 from scb import termination
-from scb.errors import UserError
+from scb.errors import UserError, first_line
 
 # What a launcher tells the processes that it starts; with all of a line, JAX finds the others by itself.
 _LAUNCHERS = {
@@ -72,7 +72,7 @@ def start(given: Mapping[str, str], environment: Mapping[str, str] = os.environ)
     # Whatever it is, it is about who is there.
     except Exception as error:
         raise UserError(
-            f"the processes did not find each other ({(str(error).splitlines() or ['no reason'])[0]}): start as many "
+            f"the processes did not find each other ({first_line(error)}): start as many "
             "as there are to be, with one coordinator, which process 0 listens at."
         ) from error
     termination.arm()  # JAX has its own use for the signal
@@ -168,7 +168,7 @@ def _all(tree: Any, tiled: bool) -> Any:
         return jax.tree.map(np.asarray, multihost_utils.process_allgather(tree, tiled=tiled))
     # The second where it is noticed as the gathering is begun.
     except (jax.errors.JaxRuntimeError, ValueError) as error:
-        reason = str(error).splitlines()[0].rsplit("] ", 1)[-1].rstrip(".")
+        reason = first_line(error).rsplit("] ", 1)[-1].rstrip(".")
         raise LostProcess(
             f"one of the {jax.process_count()} processes has ended, and process {jax.process_index()} cannot go on "
             f"without it ({reason}): see what it says, and start all of them again with --resume."

@@ -57,7 +57,8 @@ class Run:
         Args:
           folder: where; must not exist or be empty, unless `resume`.
           config: JSON-serialisable; decides the run together with the code's version. An entry
-            "command", by which people and resumptions start it, is stored and not compared.
+            "command", by which people and resumptions start it, is stored and not compared. An entry
+            "inputs", {name: digest} of files, is compared where the folder has one.
           resume: continue the run that is there. Its config must equal `config`.
           wandb_project: also log to this Weights & Biases project (extra `wandb`).
           growing: entries, such as "config.seeds", that may be more than they were (`grown`). The folder
@@ -73,6 +74,13 @@ class Run:
         config = json.loads(json.dumps(config))
         if resume:
             stored, asked = ({**c, "command": None} for c in (read_config(folder), config))
+            inputs, now = (x.pop("inputs", None) or {} for x in (stored, asked))
+            for name in inputs.keys() & now.keys():
+                if inputs[name] != now[name]:
+                    raise UserError(
+                        f"cannot resume {folder}: {name} is not what it was when the run was started; put that back, "
+                        "or start a new folder."
+                    )
             difference = first_difference(stored, asked, growing)
             if difference:
                 raise UserError(

@@ -5,6 +5,7 @@ import sys
 from pathlib import Path
 
 from scb.environments.registry import environment_spec, make
+from scb.environments.spec import EnvironmentSpec
 
 DOCS = Path(__file__).parents[1] / "docs"
 
@@ -29,3 +30,10 @@ def test_an_environment_of_ones_own_is_made(tmp_path, monkeypatch):
     # A random walk from somewhere between -1 and 1.
     spec = environment_spec("point_of_the_guide:Point")
     assert -40 < spec.random_return() < -10 and spec.episode_limit == 50
+
+
+def test_the_guide_says_what_a_bandit_of_ones_own_is_called():
+    guide = (DOCS / "own_environment.md").read_text()
+    (environment,) = set(re.findall(r"--environment (my_package\S+)", guide))
+    names = set(re.findall(r"Synthetic-my_package\S*?(?=\.npz)", guide))
+    assert names == {EnvironmentSpec(environment, "custom", make).bandit}

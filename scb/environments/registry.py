@@ -55,8 +55,10 @@ def environment_spec(name: str | Path) -> EnvironmentSpec:
 def check_backend(backend: str | None, names: Iterable[str]) -> None:
     """Raises a UserError for physics that none of these environments has."""
     names = list(names)
-    known = {x for name in names for x in environment_spec(name).backends}
-    if backend is not None and backend not in known:
+    specs = [environment_spec(name) for name in names]
+    known = {x for spec in specs for x in spec.backends}
+    its_own = any(spec.has_choice and not spec.backends for spec in specs)
+    if backend is not None and backend not in known and not its_own:
         raise UserError(
             f"the backend is {backend!r}, and of {', '.join(names)} "
             + (

@@ -75,7 +75,7 @@ class EnvironmentSpec:
           UserError: arguments, or a choice of physics, that the environment doesn't take.
         """
         if backend is not None:
-            if not self.backends and self.family != "custom":
+            if not self.has_choice:
                 raise UserError(
                     f"the backend is {backend!r}, and {self.name} has no choice of physics: leave it out."
                 )
@@ -89,10 +89,14 @@ class EnvironmentSpec:
                 f"environment {self.name!r} does not take {arguments}: {error}."
             ) from error
 
+    @property
+    def has_choice(self) -> bool:
+        """Whether it may have a choice of physics; a custom environment's maker knows its own."""
+        return bool(self.backends) or self.family == "custom"
+
     def physics(self, backend: str | None = None) -> str | None:
         """The physics where `backend` is chosen for several environments: None where this one has no choice."""
-        choice = self.backends or self.family == "custom"  # whose maker knows its own
-        return (backend or self.default_backend) if choice else None
+        return (backend or self.default_backend) if self.has_choice else None
 
     @property
     def bandit(self) -> str:

@@ -148,6 +148,22 @@ def test_ten_agents_decide_and_fewer_do_not():
     assert {x.outcome for x in claims.judge(module.claims(report(9)))} == {claims.UNDECIDED}
 
 
+def test_the_reference_is_ppo_wherever_it_stands():
+    made, other = report(10), report(10)
+    agents = other["environments"]["hopper"]["agents"]
+    other["environments"]["hopper"]["agents"] = dict(reversed(agents.items()))
+    texts = [
+        {x.claim.text: x.outcome for x in claims.judge(module.claims(r))} for r in (made, other)
+    ]
+    assert texts[0] == texts[1] and not any(": ppo " in text for text in texts[0])
+
+
+def test_all_are_compared_with_ppo_though_it_is_not_named(tmp_path, compared):
+    flags = ["--objectives", "dpo", "lpo-multi", "--seeds", "1", "--out", str(tmp_path / "r.json")]
+    module.EXPERIMENT.main(flags)
+    assert [name for _, name, _ in compared[0]] == ["ppo", "dpo", "lpo-multi"]
+
+
 def test_only_agents_of_the_same_seeds_are_compared():
     made = report(10)
     agents = made["environments"]["hopper"]["agents"]

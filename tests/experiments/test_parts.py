@@ -83,6 +83,20 @@ def test_jobs_measure_what_is_missing_and_say_what_failed(tmp_path, capsys):
     assert not out.with_suffix(".parts").exists()
 
 
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (["--jobs=8"], "jobs is 8, and the parts are measured here, one after the other: leave it"),
+        (["--executor=local", "--cpus=4"], "cpus is 4, and the jobs are this machine's"),
+        (["--executor=local", "--slurm", "partition=long"], "or take --executor slurm"),
+    ],
+)
+def test_what_no_job_would_heed_is_refused(tmp_path, flags, message, capsys):
+    assert counting(tmp_path, "a").main([f"--out={tmp_path / 'report.json'}", *flags]) == 2
+    assert message in capsys.readouterr().err
+    assert not (tmp_path / "measured").exists()
+
+
 def test_what_an_earlier_start_found_is_taken(tmp_path, monkeypatch):
     (part,) = parts_of(tmp_path, "a")
     monkeypatch.setattr(Jobs, "executor_in", lambda *_: pytest.fail("nothing is missing"))

@@ -119,6 +119,13 @@ def test_all_objectives_meet_the_same_draws(tmp_path, monkeypatch):
     assert load_objective("lpo-multi").name in found["returns"]
 
 
+def test_an_environment_of_another_family_has_the_settings_of_classic_control():
+    options = module.Options(environments=("Reacher-misc",), objectives=("ppo",), draws=2)
+    parts = list(module.parts(options, {}))
+    assert ("returns", "ppo", "2 of num_epochs 10, num_minibatches 25") in parts[-1].names
+    assert len(parts) == 3
+
+
 @pytest.mark.parametrize("objective", [None, "dpo"])
 def test_a_part_trains_agents_with_the_draws_that_it_says(tmp_path, objective):
     size = {"total_steps": 64, "num_envs": 2, "num_steps": 8, "num_minibatches": 2}

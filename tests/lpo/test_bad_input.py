@@ -240,12 +240,16 @@ def test_a_run_of_another_command_is_not_resumed(refused, interrupted):
 OLD = {"command": "meta-train", "environment": None, "seed": 3, "preset": "quick", "temporal": None}
 
 
+def test_what_several_processes_do_not_share_is_refused_to_them(refused):
+    message = refused("run", "--coordinator=here:1", "--processes=2", "--process=1")
+    assert "--coordinator is given, and lpo run is no work of several processes" in message
+
+
 def test_a_run_of_an_earlier_version_is_not_resumed(refused, working_folder):
     (working_folder / "config.json").write_text(json.dumps(OLD))
     for command in ("meta-train", "run"):
         message = refused(command, "--resume", working_folder)
-        assert "an earlier version started it, and this one would not end" in message
-        assert f"remove it (rm -r {working_folder}), or start another with --out." in message
+        assert "or an earlier version, with other numbers; start another with --out." in message
 
 
 def test_a_resumed_run_takes_the_stored_settings(interrupted, monkeypatch):

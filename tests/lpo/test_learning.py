@@ -5,10 +5,13 @@ import numpy as np
 import pytest
 
 from lpo import meta_training
+from lpo.commands import MetaTrain
 from lpo.drifts import LearnedDrift
 from lpo.inner_loop import MetaTrainingConfig
 from lpo.meta_training import MetaTraining, learn_objective
-from scb.environments.zoo import bandit_metadata
+from lpo.pipeline import RunAll
+from scb.commands import Discover
+from scb.environments.zoo import bandit_metadata, open_bandit, save_bandit
 from scb.errors import UserError
 from scb.evolution import EvolutionConfig, Outcome
 from scb.runs import Run, config_dict
@@ -52,9 +55,35 @@ def test_with_validation_the_best_mean_is_saved_and_judged(learned, validation, 
     assert story["seeds"] == {"meta_training": 5, "validation": 30_000}
     sums = {name: bandit_metadata(name)["sha256"] for name in BANDITS}
     assert story["config"]["bandit_sha256"] == sums
+    assert story["config"]["homes"] == list(objective.homes)
 
 
 def test_where_no_mean_could_be_judged_nothing_is_saved(learned, tmp_path):
     with pytest.raises(UserError, match="no mean is best"):
         learned(True, generation=-1)
     assert not list((tmp_path / "run").glob("objective*"))
+
+
+@pytest.mark.parametrize(
+    ("command", "flags"),
+    [
+        (MetaTrain, ["--tasks"]),
+        (Discover, ["--environment=CartPole-v1", "--from-bandit"]),
+    ],
+)
+def test_a_search_does_not_go_on_in_another_bandit(tmp_path, command, flags):
+    path, zoo = tmp_path / "mine.npz", "Synthetic-CartPole-v1"
+    bandit, metadata = open_bandit(zoo), bandit_metadata(zoo)
+    weights = bandit.default_params.weights
+    save_bandit(path, bandit, weights, metadata)
+    command.parse([*flags, str(path), f"--out={tmp_path / 'run'}"]).open().close()
+    command.parse([f"--resume={tmp_path / 'run'}"]).open().close()
+    save_bandit(path, bandit, jax.tree.map(lambda x: 2 * x, weights), metadata)
+    with pytest.raises(UserError, match=r"mine\.npz is not what it was when the run was started"):
+        command.parse([f"--resume={tmp_path / 'run'}"]).open()
+
+
+def test_a_whole_run_begins_with_the_bandit_that_ships(tmp_path):
+    inputs = {"Synthetic-Pendulum-v1": bandit_metadata("Synthetic-Pendulum-v1")["sha256"]}
+    assert RunAll.parse([f"--out={tmp_path / 'run'}"]).inputs() == inputs
+    assert RunAll.parse([f"--out={tmp_path / 'run'}", "--objective=lpo-multi"]).inputs() == {}

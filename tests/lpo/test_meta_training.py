@@ -416,6 +416,10 @@ def test_steps_with_horizons_are_their_mean(config):
     # However short, a training has a batch.
     shortest = MetaTraining(replace(config, horizons=(0.01,), reward_noise=0.0)).steps()
     assert shortest.training == 8
+    # What is judged trains in full.
+    for horizons in ((0.5, 1.0, 2.0), (2.0,), ()):
+        steps = MetaTraining(replace(config, horizons=horizons, reward_noise=0.0)).judgement_steps()
+        assert steps.training == 3 * 8
 
 
 # -- reward noise -------------------------------------------------------------------------------

@@ -133,6 +133,15 @@ def test_what_a_formula_writes_down_was_learned_where_its_original_was():
     assert learned_in([formula]) == ["Pendulum-v1"]
 
 
+def test_what_an_objective_was_learned_for_is_known_where_its_bandit_is_gone():
+    config = {"meta_training": {"tasks": ["gone.npz"]}}
+    gone = Objective("mine", DPODrift(), {}, {"config": config})
+    with pytest.raises(UserError, match=r"gone\.npz does not exist"):
+        learned_in([gone])
+    told = Objective("mine", DPODrift(), {}, {"config": {**config, "homes": ["CartPole-v1"]}})
+    assert learned_in([told]) == ["CartPole-v1"]
+
+
 def test_a_copy_goes_by_the_name_of_its_own_file(file):
     # All run folders have an objective.npz: copied under two names they can be compared.
     for suffix in (".npz", ".json"):

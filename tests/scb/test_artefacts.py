@@ -89,6 +89,12 @@ def test_what_was_saved_is_what_is_loaded(saved):
     assert artefact.metadata["versions"]["python"] == platform.python_version()
 
 
+def test_what_is_saved_anew_says_the_versions_that_it_was_found_with(tmp_path):
+    old = {**METADATA, "versions": {"jax": "0.4"}}
+    path = artefacts.save(tmp_path / "old.npz", WEIGHTS, old)
+    assert artefacts.load(path, "bandit").metadata["versions"] == {"jax": "0.4"}
+
+
 @pytest.mark.parametrize("suffix", ["", ".npz", ".json"])
 def test_the_suffix_of_the_path_is_optional(tmp_path, suffix):
     # A dot in the name is part of the name: pathlib's suffix of "hopper-0.5" is ".5".

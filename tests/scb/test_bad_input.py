@@ -281,8 +281,8 @@ OLD = {
 @pytest.mark.parametrize(
     ("config", "message"),
     [
-        (OLD, "an earlier version started it, and this one would not end with the same numbers"),
-        ({}, "an earlier version started it"),
+        (OLD, "an experiment started it, whose command goes on with it, or an earlier version"),
+        ({}, "start another with --out"),
         (
             {"command": "lpo meta-train --seed=3", "config": {}},
             "with scb discover: it was started with lpo meta-train --seed=3.",

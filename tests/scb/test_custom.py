@@ -5,7 +5,7 @@ import sys
 import pytest
 
 from scb.cli import main
-from scb.environments.registry import environment_spec, make
+from scb.environments.registry import check_backend, environment_spec, make
 from scb.environments.zoo import bandit_metadata
 from scb.errors import UserError
 from scb.measurement import Place
@@ -66,6 +66,9 @@ def test_the_physics_that_a_factory_takes_is_part_of_the_place(module):
     soft, hard = (Place.named(name, backend) for backend in ("soft", "hard"))
     assert (soft.backend, hard.backend, Place.named(name).backend) == ("soft", "hard", None)
     assert (soft.params.g, hard.params.g) == (1.0, 10.0)
+    check_backend("soft", [name, "Pendulum-v1"])
+    with pytest.raises(UserError, match="none has a choice: leave it out"):
+        check_backend("soft", ["Pendulum-v1"])
 
 
 @pytest.mark.parametrize(

@@ -129,6 +129,24 @@ def test_a_run_that_may_grow_may_not_shrink(run, change, message):
     assert read_config(run.folder) == {**CONFIG, "hidden_sizes": [8, 8]}
 
 
+@pytest.mark.parametrize("growing", [(), GROWING])
+def test_a_bandit_that_was_replaced_cannot_go_on_with_a_run(tmp_path, growing):
+    began = {**CONFIG, "inputs": {"mine.npz": "a", "zoo": "b"}}
+    Run.open(tmp_path, began).close()
+    Run.open(tmp_path, began, resume=True, growing=growing).close()
+    replaced = {**began, "inputs": {"mine.npz": "a", "zoo": "c"}}
+    with pytest.raises(
+        UserError, match="zoo is not what it was when the run was started; put that"
+    ):
+        Run.open(tmp_path, replaced, resume=True, growing=growing)
+    assert read_config(tmp_path)["inputs"] == began["inputs"]
+
+
+def test_a_run_that_does_not_say_what_it_began_with_goes_on(run):
+    Run.open(run.folder, {**CONFIG, "inputs": {"mine.npz": "a"}}, resume=True).close()
+    assert "inputs" not in read_config(run.folder)
+
+
 @pytest.mark.parametrize("content", [None, "", "{", '{"seed": ', "[1]", "3", "null"])
 def test_what_is_no_run_cannot_be_resumed(tmp_path, content):
     if content is not None:
