@@ -19,13 +19,12 @@ from matplotlib.figure import Figure
 
 from experiments import zoo_table, zoo_table_page
 from experiments.claims import Claim, of_agents
-from experiments.harness import Experiment, Preset, Report, bandit_of
+from experiments.harness import Experiment, Preset, Report
 from experiments.parts import InParts, Part
 from lpo.full_size import full_size
 from scb import measurement, plotting
 from scb.agents.spec import AgentSpec, bandit_agent, environment_agent
 from scb.environments.registry import environment_spec
-from scb.importer import PUBLISHED_BANDITS, published_bandit
 from scb.rows import Rows, pivot
 from scb.seeds import REPORTING
 from scb.statistics import estimate
@@ -91,18 +90,14 @@ measure = InParts(parts)
 def _in_bandit(
     kind: str, environment: str, backend: str | None, plan: Mapping[str, Any], algorithm: str
 ) -> dict[str, Any]:
-    if kind == OURS:
-        bandit, digest = bandit_of(environment)
-    else:
-        (name,) = (n for n, home in PUBLISHED_BANDITS.items() if home == environment)
-        folder = Path(plan["published"])
-        bandit = published_bandit(folder / f"{name}.npz")
-        digest = zoo_table.arrays_digest(folder / f"{name}.npz")
+    published = Path(plan["published"]) if kind == PUBLISHED else None
+    candidate = zoo_table.bandits(environment, published)[kind]
     spec = bandit_agent(algorithm, environment)
     name = task(kind, environment, backend)
-    train_in = measurement.Place(name, bandit, bandit.default_params)
+    train_in = measurement.Place(name, candidate.bandit, candidate.bandit.default_params)
     judge_in = measurement.Place.named(environment, backend)
-    return {"sha256": digest, **_curves(spec, train_in, judge_in, plan["bandit_agents"], plan)}
+    curves = _curves(spec, train_in, judge_in, plan["bandit_agents"], plan)
+    return {"sha256": candidate.sha256, **curves}
 
 
 def _in_environment(

@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 
 from experiments.harness import Experiment, Report, finite, packed, settled, unpacked
 from experiments.parts import InParts, Part
-from experiments.zoo_table import Candidate, candidates
+from experiments.zoo_table import Candidate, bandits
 from experiments.zoo_table_page import BANDITS
 from scb import plotting
 from scb.agents.spec import bandit_agent
@@ -60,11 +60,6 @@ class Options:
         at_least(1, self, "episodes")
         for name in self.environments:
             one_of("environment of a published bandit", name, PUBLISHED_BANDITS.values())
-
-
-def bandits(environment: str, published: Path | None) -> dict[str, Candidate]:
-    """{kind: the bandit of this environment}, of the kinds that there are."""
-    return {x.kind: x for x in candidates(None, published) if x.environment == environment}
 
 
 def spread(means: np.ndarray) -> dict[str, Any]:

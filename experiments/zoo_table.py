@@ -13,7 +13,6 @@ the same command continues an interrupted one. The table and the figure are made
 `--only-render` does nothing but that.
 """
 
-import hashlib
 import json
 import time
 from collections.abc import Iterable, Mapping, Sequence
@@ -37,6 +36,7 @@ from experiments.zoo_table_page import (
     rank,
 )
 from scb.agents.spec import AgentSpec, algorithms_for, bandit_agent
+from scb.artefacts import arrays_digest
 from scb.environments.registry import environment_spec
 from scb.environments.synthetic import BanditConfig, SyntheticBandit
 from scb.environments.zoo import bandit_metadata, open_bandit, zoo_names
@@ -115,7 +115,7 @@ def candidates(
         wanted.add(environment)
         found.append(Candidate(environment, "ours", bandit, digest))
     found += [
-        Candidate(environment, "published", published_bandit(path), arrays_digest(path))
+        Candidate(environment, "published", published_bandit(path), _digest(path))
         for environment, path in paths.items()
         if names is None or environment in wanted
     ]
@@ -125,15 +125,15 @@ def candidates(
     return sorted(found, key=lambda x: (rank(x.environment), BANDITS.index(x.kind)))
 
 
-def arrays_digest(path: Path) -> str:
-    """SHA-256 of an .npz's arrays; packing them anew does not change it."""
-    digest = hashlib.sha256()
+def bandits(environment: str, published: Path | None) -> dict[str, Candidate]:
+    """{kind: the bandit of this environment}, of the kinds that there are."""
+    return {x.kind: x for x in candidates((environment_spec(environment).bandit,), published)}
+
+
+def _digest(path: Path) -> str:
+    """Of an .npz's arrays; packing them anew does not change it."""
     with np.load(path, allow_pickle=False) as arrays:
-        for name in sorted(arrays.files):
-            array = arrays[name]
-            digest.update(f"{name}:{array.dtype}:{array.shape}".encode())
-            digest.update(np.ascontiguousarray(array).tobytes())
-    return digest.hexdigest()
+        return arrays_digest(arrays)
 
 
 def measure_bandits(

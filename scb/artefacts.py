@@ -96,6 +96,16 @@ def save(path: str | Path, arrays: Mapping[str, Any], metadata: Mapping[str, Any
     return npz_path
 
 
+def arrays_digest(arrays: Mapping[str, Any]) -> str:
+    """SHA-256 of arrays by name, whatever their order and however they are packed."""
+    digest = hashlib.sha256()
+    for name in sorted(arrays):
+        array = np.asarray(arrays[name])
+        digest.update(f"{name}:{array.dtype}:{array.shape}".encode())
+        digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()
+
+
 def load(path: str | Path, *kinds: str) -> Artefact:
     """Reads and checks an artefact.
 

@@ -3,7 +3,6 @@
 They lie in a run's folder (`scb.runs`), under checkpoints/.
 """
 
-import hashlib
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
@@ -15,6 +14,7 @@ import orbax.checkpoint as ocp
 from rich.console import Console
 
 from scb import processes
+from scb.artefacts import arrays_digest
 from scb.errors import UserError, first_line
 
 
@@ -45,7 +45,7 @@ class Checkpoints:
         leaves = _leaves(state)
         items = ocp.args.Composite(
             state=ocp.args.StandardSave(leaves),
-            digest=ocp.args.JsonSave({"sha256": _digest(leaves)}),
+            digest=ocp.args.JsonSave({"sha256": arrays_digest(leaves)}),
         )
         try:
             self._manager.save(step, args=items)
@@ -74,7 +74,7 @@ class Checkpoints:
                         state=ocp.args.StandardRestore(expected), digest=ocp.args.JsonRestore()
                     ),
                 )
-                intact = _digest(restored["state"]) == restored["digest"]["sha256"]
+                intact = arrays_digest(restored["state"]) == restored["digest"]["sha256"]
                 state = _from_leaves(template, restored["state"])
             # Orbax and tensorstore raise many kinds for a file that is cut or altered.
             except Exception as error:
@@ -138,12 +138,3 @@ def _leaves(tree: Any) -> dict[str, np.ndarray]:
 def _from_leaves(template: Any, leaves: Mapping[str, Any]) -> Any:
     treedef = jax.tree.structure(template)
     return jax.tree.unflatten(treedef, [jax.numpy.asarray(leaves[name]) for name in sorted(leaves)])
-
-
-def _digest(leaves: Mapping[str, Any]) -> str:
-    digest = hashlib.sha256()
-    for name in sorted(leaves):
-        array = np.asarray(leaves[name])
-        digest.update(f"{name}:{array.dtype}:{array.shape}".encode())
-        digest.update(np.ascontiguousarray(array).tobytes())
-    return digest.hexdigest()

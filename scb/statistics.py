@@ -147,12 +147,7 @@ def stratified_estimate(
     return replace(found, n=sum(sizes[: len(first)]))
 
 
-def pooled_estimate(
-    groups: ArrayLike,
-    minus: ArrayLike | None = None,
-    paired_groups: bool = False,
-    confidence: float = 0.95,
-) -> Estimate:
+def pooled_estimate(groups: ArrayLike) -> Estimate:
     """The interquartile mean over groups and their runs, with an interval that resamples both.
 
     For groups that are drawn themselves: what one search would find, or one expert teach, is as
@@ -161,29 +156,17 @@ def pooled_estimate(
 
     Args:
       groups: [G, N] N runs of each of G groups (searches, experts).
-      minus: [G', N] runs on the same seeds; the estimate is then that of the difference, paired by run.
-      paired_groups: whether groups of the same position in both belong together too.
 
     Raises:
-      UserError: another shape; groups of other numbers to pair; NaN or infinity.
+      UserError: another shape; NaN or infinity.
     """
-    first, second = _groups("the groups", groups), None
-    if minus is not None:
-        first, second = _comparable(groups, minus, paired_groups)
-
-    def middle(
-        of: NDArray[np.floating], group: NDArray[np.integer], run: NDArray[np.integer]
-    ) -> NDArray[np.floating]:
-        return iqm(of[group[:, :, None], run[:, None, :]].reshape(len(group), -1), axis=1)
+    runs = _groups("the groups", groups)
 
     def pooled(rows: Rows) -> NDArray[np.floating]:
-        run, group = rows(first.shape[1]), rows(len(first))
-        found = middle(first, group, run)
-        if second is None:
-            return found
-        return found - middle(second, group if paired_groups else rows(len(second)), run)
+        run, group = rows(runs.shape[1]), rows(len(runs))
+        return iqm(runs[group[:, :, None], run[:, None, :]].reshape(len(group), -1), axis=1)
 
-    return _bootstrapped(pooled, [first.shape[1]] * len(first), confidence, num_resamples=5000)
+    return _bootstrapped(pooled, [runs.shape[1]] * len(runs), 0.95, num_resamples=5000)
 
 
 def few_groups_difference(

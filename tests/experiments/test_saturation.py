@@ -26,7 +26,8 @@ def test_two_actions_that_move_apart_are_two_directions():
 
 def test_a_bandit_of_ours_is_taken_where_there_is_one():
     assert set(bandits("hopper", None)) == {"ours"}
-    assert bandits("ant", None) == {}
+    with pytest.raises(UserError, match="unknown bandit 'Synthetic-ant'"):
+        bandits("ant", None)
 
 
 def entry(beyond, apart, clipped):

@@ -311,9 +311,7 @@ def test_the_digest_is_of_the_arrays_and_not_of_their_packing(tmp_path):
     np.savez(tmp_path / "one.npz", **arrays)
     np.savez_compressed(tmp_path / "two.npz", **dict(reversed(arrays.items())))
     np.savez(tmp_path / "three.npz", a=arrays["a"] + 1, b=arrays["b"])
-    one, two, three = (
-        zoo_table.arrays_digest(tmp_path / f"{x}.npz") for x in ("one", "two", "three")
-    )
+    one, two, three = (zoo_table._digest(tmp_path / f"{x}.npz") for x in ("one", "two", "three"))
     assert one == two != three
 
 

@@ -252,37 +252,9 @@ def test_groups_that_differ_widen_the_interval_beyond_that_of_their_runs():
     assert apart.high - apart.low > 5 * (alike.high - alike.low)
 
 
-def test_a_pooled_difference_is_paired_by_run():
-    # Every run is 10 better than the reference's: a difference of exactly 10, whoever is drawn.
-    reference = [0.0, 100.0, -300.0, 50.0]
-    x = pooled_estimate([[r + 10.0 for r in reference]], [reference])
-    assert (x.value, x.low, x.high) == pytest.approx((10.0, 10.0, 10.0))
-
-
-def test_a_difference_to_groups_that_disagree_is_uncertain():
-    reference = [50.0] * 4
-    others = [[50.0 + shift] * 4 for shift in (-30.0, -10.0, 10.0, 30.0)]
-    x = pooled_estimate([reference], others)
-    assert x.value == pytest.approx(0.0, abs=1e-9)
-    assert x.low < -15.0 and x.high > 15.0
-
-
-def test_a_difference_of_paired_groups_cancels_what_is_common_to_a_group():
-    rng = np.random.default_rng(0)
-    both = rng.normal(size=(5, 20)) + rng.normal(scale=50.0, size=(5, 1))
-    paired = pooled_estimate(both + 1.0, both, paired_groups=True)
-    assert (paired.value, paired.low, paired.high) == pytest.approx((1.0, 1.0, 1.0))
-    alone = pooled_estimate(both + 1.0, both)
-    assert alone.high - alone.low > 20.0
-
-
-def test_a_pooled_estimate_refuses_what_it_cannot_pair():
+def test_a_pooled_estimate_refuses_what_it_cannot_pool():
     with pytest.raises(UserError, match=r"shape \(3,\): give a row for each"):
         pooled_estimate([1.0, 2.0, 3.0])
-    with pytest.raises(UserError, match="pair run by run\\."):
-        pooled_estimate([[1.0, 2.0]], [[1.0]])
-    with pytest.raises(UserError, match="group by group"):
-        pooled_estimate([[1.0]], [[1.0], [2.0]], paired_groups=True)
     with pytest.raises(UserError, match="1 NaN"):
         pooled_estimate([[1.0, np.nan]])
 
@@ -347,12 +319,6 @@ def test_a_difference_of_groups_is_drawn_together_only_where_it_is_paired():
     assert (together.low, together.high) == (0.0, 0.0)
     apart = stratified_estimate(runs, runs, paired=False)
     assert apart.low < 0.0 < apart.high
-
-
-def test_a_pooled_interval_is_of_the_confidence_asked_for():
-    groups = np.random.default_rng(0).normal(size=(3, 20))
-    half, whole = (pooled_estimate(groups, confidence=x) for x in (0.5, 0.95))
-    assert whole.low < half.low < half.high < whole.high
 
 
 def test_few_groups_that_differ_in_nothing_have_no_width():
