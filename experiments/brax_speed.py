@@ -9,7 +9,6 @@ the machine's.
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -103,7 +102,6 @@ EXPERIMENT = Experiment(
     facts=facts,
     options=Options,
     keys=("environments",),
-    out=Path("docs/data/brax_speed.json"),
 )
 
 

@@ -10,7 +10,6 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -125,7 +124,6 @@ EXPERIMENT = Experiment(
     facts=facts,
     options=Options,
     keys=("bandits",),
-    out=Path("docs/data/gymnasium_speed.json"),
 )
 
 

@@ -194,9 +194,7 @@ class Experiment:
         docs = files.docs or (DOCS if files.out is None else out.parent)
         make_folder(docs, "--docs")
         report = read(out, missing_is_new=not files.only_render, keys=self.keys)
-        # Studies of before November 2026 do not say what they are; they lack a key of another's.
-        unnamed = None if self.presets and not self.keys else self.name
-        if report and report.get("experiment", unnamed) != self.name:
+        if report and report.get("experiment") != self.name:
             raise UserError(f"{out} is no report of {self.name}: choose another --out.")
         if not files.only_render:
             make_folder(out.parent)

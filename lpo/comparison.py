@@ -190,7 +190,7 @@ def compare(
       objectives: what replaces PPO's surrogate; the first is what the others are compared with.
       seeds: one agent each; the same seeds pair agents of different objectives.
       spec: PPO's; the environment's own where None.
-      backend: Brax physics ("generalized", "positional", "spring"); only for Brax environments.
+      backend: of an environment with a choice of physics, such as "spring" in Brax.
       points: about how many evaluations along the training, the untrained agent not counted.
       episodes: of each evaluation.
       mode_actions: evaluate the most likely actions rather than sampled ones.

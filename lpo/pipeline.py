@@ -5,7 +5,6 @@ Every stage leaves a file in the run folder; a resumed run does what is missing.
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 from typing import Annotated, Any
@@ -74,34 +73,36 @@ class PipelineConfig:
         return replace(self.search, evolution=replace(self.search.evolution, seed=self.seed))
 
 
-_QUICK, _PAPER = (MetaTrain.presets[name] for name in ("quick", "paper"))
-PRESETS = {
-    "tiny": PipelineConfig(
-        search=replace(
-            _QUICK({}),
-            agents_per_candidate=1,
-            evolution=replace(_QUICK({}).evolution, population_size=4, num_generations=2),
-        ),
+def _tiny(given: Mapping[str, str]) -> PipelineConfig:
+    search = MetaTrain.presets["quick"]({})
+    evolution = replace(search.evolution, population_size=4, num_generations=2)
+    return PipelineConfig(
+        search=replace(search, agents_per_candidate=1, evolution=evolution),
         evaluations=(Evaluation("Pendulum-v1", None, seeds=2, steps=10_000),),
-    ),
-    "quick": PipelineConfig(
-        search=_QUICK({}),
+    )
+
+
+def _quick(given: Mapping[str, str]) -> PipelineConfig:
+    return PipelineConfig(
+        search=MetaTrain.presets["quick"]({}),
         evaluations=(
             Evaluation("Pendulum-v1", None, seeds=10, steps=150_000),
             # That Brax works, within minutes: what objectives are worth there takes the full size, whose
             # measurement the report shows.
             Evaluation("hopper", "spring", seeds=4, steps=200_000, points=5, episodes=10),
         ),
-    ),
-    "paper": PipelineConfig(
+    )
+
+
+def _paper(given: Mapping[str, str]) -> PipelineConfig:
+    return PipelineConfig(
         # So long a search overfits the bandit: the mean that was judged best on Pendulum is kept.
-        search=_PAPER({"validate": ""}),
+        search=MetaTrain.presets["paper"]({"validate": ""}),
         evaluations=(
             Evaluation("Pendulum-v1", None, seeds=20, steps=150_000),
             Evaluation("hopper", "generalized", seeds=10, steps=5 * 2**20),
         ),
-    ),
-}
+    )
 
 
 def run_pipeline(run: Run, config: PipelineConfig, preset: str, command: str) -> Path:
@@ -230,11 +231,6 @@ def _figures(
     return paths
 
 
-def _constant(config: PipelineConfig, given: Mapping[str, str]) -> PipelineConfig:
-    """A preset of which no flag decides more than itself."""
-    return config
-
-
 @dataclass(frozen=True, kw_only=True)
 class RunAll(LongRun):
     """The whole path: learn an objective on the Pendulum bandit, train PPO with it, judge it.
@@ -248,11 +244,11 @@ class RunAll(LongRun):
     """
 
     program = "lpo run"
-    presets = MappingProxyType(
-        {name: partial(_constant, config) for name, config in PRESETS.items()}
-    )
+    presets = MappingProxyType({"tiny": _tiny, "quick": _quick, "paper": _paper})
 
-    config: Annotated[PipelineConfig, tyro.conf.arg(name="")] = PRESETS["quick"]
+    config: Annotated[PipelineConfig, tyro.conf.arg(name="")] = field(
+        default_factory=lambda: _quick({})
+    )
     output: Output = field(default_factory=lambda: Output(Path("runs/quick")))
 
     def inputs(self) -> dict[str, str]:

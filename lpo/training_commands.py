@@ -47,7 +47,7 @@ class Agents:
       policy_output_scale: factor on the policy's last layer at initialisation; many public PPOs take
         0.01.
       seed: the first of the agents' seeds.
-      backend: Brax physics: generalized, positional or spring.
+      backend: Brax physics: generalized, positional, spring or mjx.
     """
 
     environment: str | None = None

@@ -220,7 +220,7 @@ class TrainConfig:
       algorithm: such as ppo, sac, dqn, ddqn, ddpg or td3; dqn draws whether it is double, and is with fixed
         hyperparameters.
       evaluation_environment: where to evaluate; the bandit's own where left out.
-      backend: Brax's physics: generalized, positional or spring.
+      backend: Brax's physics: generalized, positional, spring or mjx.
       agents: how many to train, with the paper's 10 000 steps each.
       episodes: of each agent's evaluation.
       seed: decides everything.

@@ -79,7 +79,7 @@ class DiscoveryConfig:
     Attributes:
       environment: the evaluation environment (Pendulum-v1, CartPole-v1, hopper, ..., or one's own as
         package.module:factory, which returns a gymnax environment).
-      backend: Brax's physics: generalized, positional or spring.
+      backend: Brax's physics: generalized, positional, spring or mjx.
       parameterization: I (the bandit), TI or T (fully synthetic MDPs: learned transition, reward and
         termination, with or without a learned initial state).
       max_steps: a synthetic MDP's maximum episode length; the environment's own where None.

@@ -51,8 +51,8 @@ def check_bounded(space: spaces.Box | spaces.Discrete) -> None:
     for bound in (space.low, space.high):
         if not isinstance(bound, jax.core.Tracer) and not np.isfinite(bound).all():
             raise UserError(
-                f"an action's bound is {bound}: only PPO takes actions without bounds; give the environment finite "
-                "ones."
+                f"an action's bound is {bound}, and actions are drawn or scaled between bounds (PPO alone trains "
+                "without any): give the environment finite ones."
             )
 
 

@@ -142,7 +142,7 @@ def clone(
     Args:
       contexts: key -> [O] one state.
       learning_rate: of Adam, traced.
-      config: network, batches, epochs and minibatches; by default those of the inner loop.
+      config: network, batches, epochs and minibatches.
 
     Returns:
       The trained policy's most likely actions.

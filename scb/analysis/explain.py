@@ -120,7 +120,7 @@ def explain_command(
       bandit: a zoo name such as Synthetic-Pendulum-v1, or path.npz.
       out: folder for explain.png, explain.json and explain.html; runs/explain/NAME where left out.
       evaluation_environment: where the bandit's optimal policy acts; the bandit's own where left out.
-      backend: Brax's physics: generalized, positional or spring.
+      backend: Brax's physics: generalized, positional, spring or mjx.
       episodes: of the optimal policy.
       seed: decides everything.
       html: also write a page where the reward's surface can be turned and the action moved (extra `html`).

@@ -74,7 +74,7 @@ def make(name: str | Path, backend: str | None = None, **arguments: Any) -> Made
 
     Args:
       name: as `environment_spec` takes it.
-      backend: "generalized", "positional" or "spring" for Brax environments; None for their own, and
+      backend: "generalized", "positional", "spring" or "mjx" for Brax environments; None for their own, and
         for every other environment.
       arguments: for the environment's constructor.
 

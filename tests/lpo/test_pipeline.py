@@ -20,7 +20,7 @@ from tests.recording import recorded_seeds
 @pytest.fixture(scope="module", autouse=True)
 def small(tiny_agent, tiny_drift):
     """The preset "tiny" with smaller networks, fewer contexts and steps than any preset has."""
-    tiny = pipeline.PRESETS["tiny"]
+    tiny = RunAll.presets["tiny"]({})
     search = replace(
         tiny.search,
         agent=tiny_agent,
@@ -218,10 +218,10 @@ def fake_comparison(environment, objectives, seeds, *_, **named):
     )
 
 
-@pytest.mark.parametrize("preset", pipeline.PRESETS)
+@pytest.mark.parametrize("preset", RunAll.presets.values(), ids=RunAll.presets)
 def test_seeds_that_judge_are_not_those_that_learn(preset):
     # Learning takes the seed itself; and runs of neighbouring seeds are judged by different agents.
-    for evaluation in pipeline.PRESETS[preset].evaluations:
+    for evaluation in preset({}).evaluations:
         first = pipeline.reporting_seeds(0, evaluation.seeds)
         second = pipeline.reporting_seeds(1, evaluation.seeds)
         assert min(first) == 10_000

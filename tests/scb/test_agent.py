@@ -77,9 +77,9 @@ class Unbounded(ContinuousCorridor):
 def test_actions_without_bounds_are_for_ppo_alone():
     env, key = Unbounded(), jax.random.key(0)
     PPO(env, PPOConfig()).init(key, PPOHyperparameters(), env.default_params)
-    with pytest.raises(UserError, match="only PPO takes actions without bounds"):
+    with pytest.raises(UserError, match="give the environment finite ones"):
         TD3(env, TD3Config()).train(key, TD3Hyperparameters(), env.default_params)
-    with pytest.raises(UserError, match="only PPO takes actions without bounds"):
+    with pytest.raises(UserError, match="give the environment finite ones"):
         random_return(env, env.default_params, 2)
 
 
