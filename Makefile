@@ -35,13 +35,13 @@ format: $(INSTALLED) ## put every file into the project's format
 	@$(BIN)/ruff format
 
 bench: $(INSTALLED) .venv-rejax/.installed ## train agents in the bandits beside rejax's: time and return
-	@$(BIN)/python -m experiments.benchmark --rejax-python .venv-rejax/bin/python
+	@$(BIN)/python -m experiments benchmark --rejax-python .venv-rejax/bin/python
 
 sb3: $(INSTALLED) .venv-sb3/.installed ## train Stable-Baselines3's agents in the bandits and in Gymnasium: docs/sb3.md
-	@$(BIN)/python -m experiments.sb3 --python .venv-sb3/bin/python --executor local
+	@$(BIN)/python -m experiments sb3 --python .venv-sb3/bin/python --executor local
 
 torture: $(INSTALLED) ## kill runs at random moments, damage files at random: docs/reliability.md
-	@$(BIN)/python -m experiments.reliability
+	@$(BIN)/python -m experiments reliability
 
 experiments: $(INSTALLED) ## the paper's experiments: measure what is missing (quick presets), write docs/experiments.md
 	@$(BIN)/python -m experiments --preset quick

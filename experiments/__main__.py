@@ -16,13 +16,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import tyro
 
 from experiments import claims, harness, rendering
 from experiments.harness import DATA, DOCS, Experiment, Files
-from scb.errors import UserError
+from scb.errors import UserError, unknown_name
 from scb.files import make_folder
 
 
@@ -49,6 +49,19 @@ def found() -> dict[str, Experiment]:
     others = [x for x in names if x != "__main__"]
     modules = (importlib.import_module(f"experiments.{name}") for name in others)
     return {m.EXPERIMENT.name: m.EXPERIMENT for m in modules if hasattr(m, "EXPERIMENT")}
+
+
+def named(name: str) -> Experiment:
+    """An experiment by name, of which nothing else is imported; a UserError for one that is none."""
+    try:
+        module = importlib.import_module(f"experiments.{name}")
+    except ModuleNotFoundError as error:
+        if error.name != f"experiments.{name}":  # it is there, and what it needs is not
+            raise
+        module = None
+    if not hasattr(module, "EXPERIMENT"):
+        raise unknown_name("experiment", name, found())
+    return cast(Experiment, module.EXPERIMENT)
 
 
 def of_the_paper() -> list[Experiment]:
@@ -111,11 +124,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     given = list(sys.argv[1:] if argv is None else argv)
     if given and not given[0].startswith("-"):
         name, *rest = given
-        if (experiment := found().get(name)) is None:
-            names = ", ".join(found())
-            print(f"experiments: no experiment {name!r}: choose from {names}.", file=sys.stderr)
-            return 2
-        return experiment.main(rest)
+        return harness.exit_status("experiments", lambda: named(name).main(rest))
     arguments = tyro.cli(
         tyro.conf.FlagCreatePairsOff[All],
         args=given,

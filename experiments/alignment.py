@@ -1,6 +1,6 @@
 """Which inner loop on a bandit ranks objectives as an environment does, and does the choice hold elsewhere.
 
-    python -m experiments.alignment
+    python -m experiments alignment
 
 First the choice: the family of known drifts and learned ones of the zoo train agents on Pendulum-v1,
 and in regimes of the Pendulum bandit that differ from the default in one thing each (reward noise,
@@ -209,7 +209,3 @@ EXPERIMENT = Experiment(
     options=Options,
     keys=("stages",),
 )
-
-
-if __name__ == "__main__":
-    raise SystemExit(EXPERIMENT.main())

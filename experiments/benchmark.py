@@ -294,7 +294,3 @@ EXPERIMENT = Experiment(
     options=Options,
     out=Path("runs/benchmark.json"),
 )
-
-
-if __name__ == "__main__":
-    raise SystemExit(EXPERIMENT.main())

@@ -1,6 +1,6 @@
 """Hopper's bandit with and without a curriculum of the evaluation episodes' length.
 
-    python -m experiments.brax_curriculum
+    python -m experiments brax_curriculum
 
 Searches from random weights that differ in the curriculum's shape alone; run folders are under
 runs/brax_curriculum and are resumed.
@@ -117,7 +117,3 @@ def draw(report: Mapping[str, Any]) -> Figure:
 
 
 EXPERIMENT = Experiment.of_the_paper("brax_curriculum", measure, draw, claims, facts=facts)
-
-
-if __name__ == "__main__":
-    raise SystemExit(EXPERIMENT.main())

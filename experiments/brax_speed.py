@@ -1,6 +1,6 @@
 """How fast Brax's generalized physics are here: this library's environments beside Brax's own, in one process.
 
-    python -m experiments.brax_speed
+    python -m experiments brax_speed
 
 Random actions in many environments; both are timed in turn, several times over. Compare the ratios: the seconds are
 the machine's.
@@ -103,7 +103,3 @@ EXPERIMENT = Experiment(
     options=Options,
     keys=("environments",),
 )
-
-
-if __name__ == "__main__":
-    raise SystemExit(EXPERIMENT.main())

@@ -1,6 +1,6 @@
 """Training in a Brax environment's bandit against training in the environment itself.
 
-    python -m experiments.brax_training
+    python -m experiments brax_training
 
 Learning curves of agents in bandits (ours and the published ones, each said) and of agents with the
 paper's expert hyperparameters in the environments, the final returns, and the steps that the latter
@@ -307,7 +307,3 @@ def draw(report: Mapping[str, Any]) -> Figure:
 EXPERIMENT = Experiment.of_the_paper(
     "brax_training", measure, draw, claims, facts=facts, options=Options
 )
-
-
-if __name__ == "__main__":
-    raise SystemExit(EXPERIMENT.main())

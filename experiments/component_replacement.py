@@ -1,6 +1,6 @@
 """What of Pendulum's bandit is needed: its reward and its contexts, each replaced by an expert's.
 
-    python -m experiments.component_replacement
+    python -m experiments component_replacement
 
 Four ways to learn (the bandit's reward, online behavioural cloning of a SAC expert, its action as the
 reward, its Q-function as the reward) on two distributions of states (the bandit's, the expert's). What
@@ -234,7 +234,3 @@ def draw(report: Mapping[str, Any]) -> Figure:
 
 
 EXPERIMENT = Experiment.of_the_paper("component_replacement", measure, draw, claims, facts=facts)
-
-
-if __name__ == "__main__":
-    raise SystemExit(EXPERIMENT.main())

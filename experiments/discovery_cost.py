@@ -1,6 +1,6 @@
 """What discovering a bandit costs: those that ship, and searches from a warm start and from random weights.
 
-    python -m experiments.discovery_cost runs/warm-1 runs/random-1 ...
+    python -m experiments discovery_cost runs/warm-1 runs/random-1 ...
 
 Reads run folders of `scb discover`, finished or not. How good the search is at a generation is the
 mean return of the agents that judge its distribution's mean; it is drawn against minutes and against
@@ -305,7 +305,3 @@ EXPERIMENT = Experiment(
     options=Options,
     keys=("runs",),
 )
-
-
-if __name__ == "__main__":
-    raise SystemExit(EXPERIMENT.main())

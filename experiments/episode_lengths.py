@@ -1,6 +1,6 @@
 """Synthetic MDPs that may take many steps end after one: episode lengths, and what the limit is worth.
 
-    python -m experiments.episode_lengths
+    python -m experiments episode_lengths
 
 Searches of the parameterisation TI (initial state, transition, reward and termination are learned)
 with several limits of the episode's length, in run folders under runs/episode_lengths.
@@ -226,7 +226,3 @@ def draw(report: Mapping[str, Any]) -> Figure:
 
 
 EXPERIMENT = Experiment.of_the_paper("episode_lengths", measure, draw, claims, facts=facts)
-
-
-if __name__ == "__main__":
-    raise SystemExit(EXPERIMENT.main())

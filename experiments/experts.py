@@ -1,6 +1,6 @@
 """SAC experts on classic control: the paper's table, with agents of this library.
 
-python -m experiments.experts
+python -m experiments experts
 """
 
 import time
@@ -111,7 +111,3 @@ def draw(report: Mapping[str, Any]) -> Figure:
 
 
 EXPERIMENT = Experiment.of_the_paper("experts", measure, draw, claims, facts=facts)
-
-
-if __name__ == "__main__":
-    raise SystemExit(EXPERIMENT.main())

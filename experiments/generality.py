@@ -1,6 +1,6 @@
 """Does a bandit train agents that its search never saw: drawn hyperparameters, other networks, no gradients?
 
-    python -m experiments.generality
+    python -m experiments generality
 
 Agents of the paper's algorithms are trained for the inner loop's 10 000 steps in the zoo's bandit, in
 bandits of one recipe with drawn and with fixed hyperparameters of the inner agents, and in the
@@ -298,7 +298,3 @@ def draw(report: Mapping[str, Any]) -> Figure:
 
 
 EXPERIMENT = Experiment.of_the_paper("generality", measure, draw, claims, facts=facts)
-
-
-if __name__ == "__main__":
-    raise SystemExit(EXPERIMENT.main())

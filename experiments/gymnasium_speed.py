@@ -1,6 +1,6 @@
 """How fast bandits step for Gymnasium: this library's own environments beside gymnax's wrappers of the same bandits.
 
-    python -m experiments.gymnasium_speed
+    python -m experiments gymnasium_speed
 
 One environment alone, an episode (a reset and a step) at a time, and many together. Both ways are timed in turn
 in one process, several times over; compare the ratios, for the seconds are the machine's.
@@ -125,7 +125,3 @@ EXPERIMENT = Experiment(
     options=Options,
     keys=("bandits",),
 )
-
-
-if __name__ == "__main__":
-    raise SystemExit(EXPERIMENT.main())

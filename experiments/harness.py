@@ -173,7 +173,7 @@ class Experiment:
             make_dataclass("Flags", parts),
             config=(tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff),
             args=argv,
-            prog=f"python -m experiments.{self.name}",
+            prog=f"python -m experiments {self.name}",
             description=self.description(),
         )
         return self.run(arguments.options, arguments.files, getattr(arguments, "jobs", Jobs()))
@@ -260,7 +260,7 @@ class Experiment:
         """
         if self.presets and not complete(report):
             raise UserError(
-                f"the report of {self.name} is not complete: run python -m experiments.{self.name} "
+                f"the report of {self.name} is not complete: run python -m experiments {self.name} "
                 f"--preset {report.get('preset', 'quick')}, which goes on where it was."
             )
         if rendering.has_template(self.name):
@@ -308,7 +308,7 @@ def read(path: Path, missing_is_new: bool = False, keys: Iterable[str] = ()) -> 
 def command_of(name: str, options: Any) -> str:
     """The command that measures with these options; where it writes is none of them."""
     words = shlex.join(flags(options, type(options)()))
-    return f"python -m experiments.{name} {words}".rstrip()
+    return f"python -m experiments {name} {words}".rstrip()
 
 
 def settled(report: dict[str, Any], **settings: Any) -> None:

@@ -1,6 +1,6 @@
 """What the bandits of classic control say about their environments: best actions, and what the reward depends on.
 
-    python -m experiments.interpretability
+    python -m experiments interpretability
 
 `scb explain NAME` shows the same of any bandit.
 """
@@ -189,7 +189,3 @@ def draw(report: Mapping[str, Any]) -> Figure:
 
 
 EXPERIMENT = Experiment.of_the_paper("interpretability", measure, draw, claims, facts=facts)
-
-
-if __name__ == "__main__":
-    raise SystemExit(EXPERIMENT.main())

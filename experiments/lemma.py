@@ -1,6 +1,6 @@
 """The paper's lemma, checked by exact dynamic programming over random Markov decision processes.
 
-    python -m experiments.lemma
+    python -m experiments lemma
 
 For every finite MDP M there is a contextual bandit B such that each policy that is optimal in B is
 optimal in M: the reward is M's optimal Q-function, or any function with the same maximisers, and the
@@ -196,7 +196,3 @@ def draw(report: Mapping[str, Any]) -> Figure:
 
 
 EXPERIMENT = Experiment.of_the_paper("lemma", measure, draw, claims)
-
-
-if __name__ == "__main__":
-    raise SystemExit(EXPERIMENT.main())

@@ -1,6 +1,6 @@
 """What must a linear expert bear for agents to learn from the bandit that is fitted to it?
 
-    python -m experiments.linear_fits
+    python -m experiments linear_fits
 
 A linear policy of an environment is searched for without errors, under noise on its actions, and under errors that are
 a function of the observation; a bandit is fitted to each on contexts as they were visited, stretched, and jittered
@@ -218,7 +218,3 @@ EXPERIMENT = Experiment(
     options=Options,
     keys=("environments",),
 )
-
-
-if __name__ == "__main__":
-    raise SystemExit(EXPERIMENT.main())

@@ -1,6 +1,6 @@
 """Does an objective carry over to locomotion? PPO's setting of the paper and its full number of steps, on Brax.
 
-    python -m experiments.locomotion --environments hopper --seeds 10
+    python -m experiments locomotion --environments hopper --seeds 10
 
 Physics is `generalized`, on which agents hop: 5.24 million steps, minutes an agent. A few agents of every objective
 are trained at a time, and --out is saved after each few: the same command goes on where it was, and with more
@@ -269,7 +269,3 @@ EXPERIMENT = Experiment(
     keys=("environments",),
     out=Path("lpo/measured/locomotion.json"),
 )
-
-
-if __name__ == "__main__":
-    raise SystemExit(EXPERIMENT.main())

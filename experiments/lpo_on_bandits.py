@@ -1,6 +1,6 @@
 """The paper's figure of learned policy optimisation: learned on a bandit and on the environment, judged on two.
 
-    python -m experiments.lpo_on_bandits --preset quick
+    python -m experiments lpo_on_bandits --preset quick
 
 (i) Meta-training on the bandit and on Pendulum: what agents trained on Pendulum with the mean of the
 search distribution earn, over generations. (ii) The same over environment steps and over wall-clock.
@@ -338,7 +338,3 @@ EXPERIMENT = Experiment.of_the_paper(
     options=Options,
     keys=("preset", "searches", "evaluations"),
 )
-
-
-if __name__ == "__main__":
-    raise SystemExit(EXPERIMENT.main())

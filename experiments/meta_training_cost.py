@@ -1,6 +1,6 @@
 """What meta-training costs on the bandit and on the environment that it stands for: steps and wall-clock.
 
-    python -m experiments.meta_training_cost
+    python -m experiments meta_training_cost
 
 Times a few generations of the same population on either, after the first, which compiles.
 """
@@ -75,7 +75,3 @@ EXPERIMENT = Experiment(
     options=Options,
     out=Path("runs/meta_training_cost.json"),
 )
-
-
-if __name__ == "__main__":
-    raise SystemExit(EXPERIMENT.main())

@@ -393,7 +393,3 @@ EXPERIMENT = Experiment(
     options=Options,
     keys=("seed", "kills", "mutations"),
 )
-
-
-if __name__ == "__main__":
-    raise SystemExit(EXPERIMENT.main())

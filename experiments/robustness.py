@@ -1,8 +1,8 @@
 """What is an objective worth to somebody who does not tune? PPO with drawn hyperparameters, all objectives' the same.
 
-    python -m experiments.robustness
-    python -m experiments.robustness --environments Asterix-MinAtar --objectives ppo dpo lpo-multi
-    python -m experiments.robustness --validation --objectives ppo dpo OBJECTIVE.npz --out runs/validation.json
+    python -m experiments robustness
+    python -m experiments robustness --environments Asterix-MinAtar --objectives ppo dpo lpo-multi
+    python -m experiments robustness --validation --objectives ppo dpo OBJECTIVE.npz --out runs/validation.json
 
 Learning rate, discount, GAE's lambda, entropy, initialisation, epochs and minibatches are drawn from the paper's lists
 and usual public defaults (plans/robustness.toml), once for all objectives, so that these are compared in pairs.
@@ -245,7 +245,3 @@ EXPERIMENT = Experiment(
     options=Options,
     keys=("environments",),
 )
-
-
-if __name__ == "__main__":
-    raise SystemExit(EXPERIMENT.main())

@@ -1,6 +1,6 @@
 """How agents of PPO act that learned from a bandit: within the actions' range, or beyond its ends, where errors vanish.
 
-    python -m experiments.saturation --published DIRECTORY
+    python -m experiments saturation --published DIRECTORY
 
 PPO's Gaussian has a mean of any size, and the environment clips the action. Agents train in a bandit; in states that
 they visit in its environment, this takes the mean that each of them would act by, and asks how far agents are from
@@ -166,7 +166,3 @@ EXPERIMENT = Experiment(
     options=Options,
     keys=("environments", "size"),
 )
-
-
-if __name__ == "__main__":
-    raise SystemExit(EXPERIMENT.main())

@@ -6,7 +6,7 @@ Its algorithms with their default hyperparameters train in a bandit of the zoo o
 are judged in the environment after several numbers of steps. It has an environment of its own (`make sb3` makes
 it), in which every agent is a process. What --out holds already is not trained again. In a bandit of one's own alone:
 
-    python -m experiments.sb3 --environments Pendulum-v1 --algorithms ppo --bandit FILE.npz --out FILE.json
+    python -m experiments sb3 --environments Pendulum-v1 --algorithms ppo --bandit FILE.npz --out FILE.json
 """
 
 import json
@@ -297,7 +297,3 @@ EXPERIMENT = Experiment(
     options=Options,
     keys=("agents", "steps"),
 )
-
-
-if __name__ == "__main__":
-    raise SystemExit(EXPERIMENT.main())

@@ -1,6 +1,6 @@
 """What several processes are worth, and from where on more of them would not be: a population that grows with them.
 
-    python -m experiments.scaling
+    python -m experiments scaling
 
 Meta-trainings on the Pendulum bandit, each a command, of 1 to 4 processes with one device and as many candidates
 each, bound to a core each as far as there are cores. Then by itself what is not divided among processes: gathering
@@ -219,7 +219,3 @@ EXPERIMENT = Experiment(
     options=Options,
     keys=("generations", "gathering", "strategy"),
 )
-
-
-if __name__ == "__main__":
-    raise SystemExit(EXPERIMENT.main())

@@ -1,6 +1,6 @@
 """The states of an expert in its environment, and those that a bandit shows, over the best actions.
 
-    python -m experiments.state_distributions
+    python -m experiments state_distributions
 
 The experts are those of `experiments.experts`, trained again.
 """
@@ -191,7 +191,3 @@ def draw(report: Mapping[str, Any]) -> Figure:
 
 
 EXPERIMENT = Experiment.of_the_paper("state_distributions", measure, draw, claims, facts=facts)
-
-
-if __name__ == "__main__":
-    raise SystemExit(EXPERIMENT.main())

@@ -1,6 +1,6 @@
 """What makes an objective carry over from a bandit: every lever of the meta-training, one at a time.
 
-    python -m experiments.transfer_study
+    python -m experiments transfer_study
 
 Each variation changes one setting of `lpo meta-train`, learns an objective with it, and trains PPO
 with what it learned: on Pendulum, with Flax's initialisation of the policy and with a small last layer,
@@ -283,7 +283,3 @@ EXPERIMENT = Experiment(
     options=Options,
     keys=("searches", "objectives"),
 )
-
-
-if __name__ == "__main__":
-    raise SystemExit(EXPERIMENT.main())

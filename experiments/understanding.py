@@ -1,13 +1,13 @@
 r"""What the drifts do to an update: PPO's clip, DPO's closed form and every learned one of the zoo.
 
-    python -m experiments.understanding
+    python -m experiments understanding
 
 writes docs/understanding.md, its figure and its numbers; all of its sentences are made from the
 numbers. Learned drifts that were written down as formulas join it with what they earn:
 
     lpo distill lpo-pendulum --out runs/distill
     lpo evaluate --objectives ppo dpo lpo-pendulum runs/distill/closed_form.npz --seed 31000 --out runs/formula
-    python -m experiments.understanding --formulas runs/distill/closed_form.npz \
+    python -m experiments understanding --formulas runs/distill/closed_form.npz \
         --comparisons runs/formula/comparison.json
 
 What the file of numbers holds of formulas and comparisons is kept where they aren't given again.
@@ -145,7 +145,3 @@ EXPERIMENT = Experiment(
     keys=("analyses",),
     dpi=100,  # half the usual: it is a tall figure of smooth maps, which compress badly
 )
-
-
-if __name__ == "__main__":
-    raise SystemExit(EXPERIMENT.main())

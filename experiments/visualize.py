@@ -1,6 +1,6 @@
 """Agents that were trained in a bandit, acting in the environment: classic control as GIFs, Hopper as a page.
 
-    python -m experiments.visualize
+    python -m experiments visualize
 
 PPO agents train for 10 000 steps in each bandit of the zoo; the best of them by other episodes is
 shown. The GIFs lie beside the page, Brax's viewer (which loads its script from the web) in
@@ -146,7 +146,3 @@ def draw(report: Mapping[str, Any]) -> Figure:
 EXPERIMENT = Experiment.of_the_paper(
     "visualize", measure, draw, claims, facts=facts, extras=animate
 )
-
-
-if __name__ == "__main__":
-    raise SystemExit(EXPERIMENT.main())

@@ -1,6 +1,6 @@
 """Which bandit fitted to an expert trains best, per environment and algorithm.
 
-    python -m experiments.warm_start --environment MountainCar-v0
+    python -m experiments warm_start --environment MountainCar-v0
 
 For one expert and one set of states, the bandit is fitted to each construction of the paper's lemma
 (the Q-function, the normalised advantage, −‖a − a*‖, and that last one on states stretched to
@@ -125,7 +125,3 @@ EXPERIMENT = Experiment(
     options=Options,
     out=Path("runs/warm_start.json"),
 )
-
-
-if __name__ == "__main__":
-    raise SystemExit(EXPERIMENT.main())

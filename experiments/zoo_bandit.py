@@ -1,6 +1,6 @@
 """Puts discovered bandits into the zoo, with what they were measured to be worth.
 
-    python -m experiments.zoo_bandit runs/mine/Synthetic-Pendulum-v1.npz --table docs/data/zoo_table.json
+    python -m experiments zoo_bandit runs/mine/Synthetic-Pendulum-v1.npz --table docs/data/zoo_table.json
 
 Results are those of `experiments.zoo_table` for exactly these weights, else those that `scb discover`
 measured at its end; nothing is edited by hand. A new bandit enters with what it has, `zoo_table`
@@ -71,7 +71,3 @@ def measure(options: Options, report: dict[str, Any], save: Save) -> None:
 EXPERIMENT = Experiment(
     "zoo_bandit", "Discovered bandits into the zoo", measure, options=Options, reports=False
 )
-
-
-if __name__ == "__main__":
-    raise SystemExit(EXPERIMENT.main())

@@ -1,6 +1,6 @@
 """Puts a learned objective into the zoo, with what it was measured to be worth.
 
-    python -m experiments.zoo_entry runs/mine/objective.npz lpo-pendulum --comparisons runs/eval/comparison.json
+    python -m experiments zoo_entry runs/mine/objective.npz lpo-pendulum --comparisons runs/eval/comparison.json
 
 The comparisons are what `lpo evaluate --out` wrote for that objective; nothing is edited by hand.
 """
@@ -70,7 +70,3 @@ def measure(options: Options, report: dict[str, Any], save: Save) -> None:
 EXPERIMENT = Experiment(
     "zoo_entry", "A learned objective into the zoo", measure, options=Options, reports=False
 )
-
-
-if __name__ == "__main__":
-    raise SystemExit(EXPERIMENT.main())

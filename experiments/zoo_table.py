@@ -1,6 +1,6 @@
 """What agents of every algorithm earn after training in the bandits: the zoo's beside the published ones.
 
-    python -m experiments.zoo_table --published DIRECTORY
+    python -m experiments zoo_table --published DIRECTORY
 
 For every bandit and every algorithm of the paper that fits its actions, agents with hyperparameters
 drawn from the paper's lists (in Brax: its fixed ones) train for 10 000 steps in the bandit and are
@@ -249,7 +249,3 @@ EXPERIMENT = Experiment(
     draw=figures,
     options=Options,
 )
-
-
-if __name__ == "__main__":
-    raise SystemExit(EXPERIMENT.main())

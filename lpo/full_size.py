@@ -1,6 +1,6 @@
 """Learning curves of full-size trainings that ship with the library, for a short run to be seen beside.
 
-`python -m experiments.locomotion` measures them and writes measured/locomotion.json.
+`python -m experiments locomotion` measures them and writes measured/locomotion.json.
 """
 
 import json

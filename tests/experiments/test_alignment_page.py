@@ -51,7 +51,7 @@ def test_the_files_of_a_stage_have_no_spaces_in_their_names():
 
 def test_a_reports_command_says_what_is_measured_and_not_where_it_is_written():
     options = alignment.Options(agents=8, held_out=(Path("a.npz"),), skip_confirmation=True)
-    command = "python -m experiments.alignment --agents=8 --held-out a.npz --skip-confirmation"
+    command = "python -m experiments alignment --agents=8 --held-out a.npz --skip-confirmation"
     assert command_of("alignment", options) == command
 
 

@@ -1,6 +1,8 @@
 import json
+import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import jinja2
 import pytest
@@ -192,12 +194,14 @@ def test_the_list_names_every_command(capsys):
 
 
 def test_one_experiment_is_run_by_its_name(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(everything, "found", lambda: {"counting": counting()})
+    module = SimpleNamespace(EXPERIMENT=counting())
+    monkeypatch.setitem(sys.modules, "experiments.counting", module)
     flags = ["--out", str(tmp_path / "c.json"), "--docs", str(tmp_path)]
     assert everything.main(["counting", *flags, "--preset", "paper"]) == 0
     assert json.loads((tmp_path / "c.json").read_text())["preset"] == "paper"
-    assert everything.main(["countin"]) == 2
-    assert "no experiment 'countin': choose from counting" in capsys.readouterr().err
+    for name in ("lema", "harness", "lemma.x"):  # none, and a module without one
+        assert everything.main([name]) == 2
+        assert f"unknown experiment {name!r}: did you mean" in capsys.readouterr().err
 
 
 def test_all_experiments_in_one_go_leave_one_page(tmp_path, monkeypatch):
@@ -231,7 +235,7 @@ def test_a_report_that_is_not_complete_makes_no_page(tmp_path, capsys):
         counting(fail_at="b").main(flags)
     assert counting().main([*flags, "--only-render"]) == 2
     assert (
-        "not complete: run python -m experiments.counting --preset quick" in capsys.readouterr().err
+        "not complete: run python -m experiments counting --preset quick" in capsys.readouterr().err
     )
     (tmp_path / "empty.json").write_text("{}")
     empty = ["--out", str(tmp_path / "empty.json"), "--docs", str(tmp_path), "--only-render"]

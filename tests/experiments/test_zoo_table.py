@@ -42,7 +42,8 @@ def entry(environment, algorithm, kind, mode, sampled, **changes):
 
 def report(*entries):
     return {
-        "commands": ["python -m experiments.zoo_table"],
+        "experiment": "zoo_table",
+        "commands": ["python -m experiments zoo_table"],
         "machine": MACHINE,
         "differences": zoo_table.differences(entries),
         "entries": list(entries),
