@@ -53,12 +53,12 @@ def found() -> dict[str, Experiment]:
 
 def named(name: str) -> Experiment:
     """An experiment by name, of which nothing else is imported; a UserError for one that is none."""
+    module: Any = None
     try:
         module = importlib.import_module(f"experiments.{name}")
     except ModuleNotFoundError as error:
         if error.name != f"experiments.{name}":  # it is there, and what it needs is not
             raise
-        module = None
     if not hasattr(module, "EXPERIMENT"):
         raise unknown_name("experiment", name, found())
     return cast(Experiment, module.EXPERIMENT)
