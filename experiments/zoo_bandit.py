@@ -35,6 +35,8 @@ def results_of(table: Mapping[str, Any], sha256: str, backend: str | None = None
             "sampled_actions": entry["sampled_actions"]["iqm"],
             "mode_actions": entry["mode_actions"]["iqm"],
         }
+        if failed := max(entry[x]["failed"] for x in ("sampled_actions", "mode_actions")):
+            result["failed"] = failed
         if entry["backend"] is not None:
             result["backend"] = entry["backend"]
         results[entry["algorithm"].upper()] = result

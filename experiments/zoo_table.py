@@ -28,12 +28,12 @@ from experiments.zoo_table_page import (
     ACTIONS,
     BANDITS,
     TARGETS,
-    counted,
     facts,
     figures,
     pairs,
     place,
     rank,
+    returns_of,
 )
 from scb.agents.spec import AgentSpec, algorithms_for, bandit_agent
 from scb.artefacts import arrays_digest
@@ -43,7 +43,7 @@ from scb.environments.zoo import bandit_metadata, open_bandit, zoo_names
 from scb.errors import UserError, at_least
 from scb.importer import PUBLISHED_BANDITS, published_bandit
 from scb.judgement import BRAX_EPISODES, EPISODES, check_fits, judge
-from scb.measurement import Place
+from scb.measurement import Place, as_random
 from scb.runs import config_dict
 from scb.seeds import REPORTING
 from scb.statistics import estimate, paired_difference
@@ -152,7 +152,8 @@ def measure_bandits(
         backend = home.physics(options.backend)
         if candidate.environment != environment:
             environment, bandits = candidate.environment, {}
-            env, env_params = home.make(backend)
+            judge_in = Place.named(environment, backend)
+        env, env_params = judge_in.env, judge_in.params
         check_fits(candidate.bandit, env, env_params, environment)
         for algorithm in algorithms_for(env.action_space(env_params)):
             spec = bandit_agent(algorithm, environment)
@@ -175,14 +176,14 @@ def measure_bandits(
                 spec,
                 bandits.setdefault(candidate.bandit.config, candidate.bandit),
                 candidate.bandit.default_params.weights,
-                Place(environment, env, env_params, backend),
+                judge_in,
                 REPORTING.start,
                 row["agents"],
                 row["episodes"],
             )
             row["activation"] = candidate.bandit.config.activation
             row["seconds"] = round(time.perf_counter() - start, 1)
-            row |= {actions: summary(x) for actions, x in returns.items()}
+            row |= {actions: summary(x, judge_in) for actions, x in returns.items()}
             entries[:] = [entry for entry in entries if place(entry) != place(row)] + [row]
             entries.sort(key=place)
             report["differences"] = differences(entries)
@@ -203,12 +204,12 @@ def _comparable(entry: Mapping[str, Any]) -> dict[str, Any]:
     return {k: v for k, v in entry.items() if not isinstance(v, dict)}
 
 
-def summary(returns: np.ndarray) -> dict[str, Any]:
-    """{"iqm", "failed", "agents"} of [N] returns; one that is not finite is None, and counts as the worst."""
-    agents = [round(float(r), 3) if np.isfinite(r) else None for r in returns]
-    finite = [r for r in agents if r is not None]
-    iqm = estimate(counted(agents)).as_dict() if finite else None
-    return {"iqm": iqm, "failed": len(agents) - len(finite), "agents": agents}
+def summary(returns: np.ndarray, judge_in: Place) -> dict[str, Any]:
+    """{"iqm", "failed", "agents"} of [N] returns; one that is not finite is None, and counts as random actions."""
+    values, failed = as_random(np.round(np.asarray(returns, float), 3), judge_in)
+    agents = [None if bad else value for value, bad in zip(values.tolist(), failed, strict=True)]
+    iqm = None if failed.all() else estimate(values).as_dict()
+    return {"iqm": iqm, "failed": int(failed.sum()), "agents": agents}
 
 
 def differences(entries: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
@@ -220,9 +221,9 @@ def differences(entries: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
             continue
         row: dict[str, Any] = {"environment": name, "algorithm": algorithm}
         for actions in ACTIONS:
-            both = [pair[kind][actions] for kind in BANDITS]
-            if all(x["iqm"] is not None for x in both):
-                ours, theirs = (counted(x["agents"]) for x in both)
+            both = [pair[kind] for kind in BANDITS]
+            if all(x[actions]["iqm"] is not None for x in both):
+                ours, theirs = (returns_of(x, actions) for x in both)
                 row[actions] = paired_difference(ours, theirs).as_dict()
         rows.append(row)
     return rows

@@ -95,10 +95,13 @@ def _target(pair: Mapping[str, Mapping[str, Any]]) -> tuple[float | None, list[s
     return target, ["yes" if iqm and iqm["value"] >= target else "no" for iqm in iqms]
 
 
-def counted(agents: Sequence[float | None]) -> list[float]:
-    """Every agent's return; one without a finite return counts as the worst."""
-    worst = min(r for r in agents if r is not None)
-    return [worst if r is None else r for r in agents]
+def returns_of(entry: Mapping[str, Any], actions: str) -> list[float]:
+    """Every agent's return; one without a finite return counts as random actions."""
+    agents = entry[actions]["agents"]
+    if None not in agents:
+        return list(agents)
+    random = environment_spec(entry["environment"]).random_return(entry["backend"])
+    return [random if r is None else r for r in agents]
 
 
 BOTH = "all that have both"
@@ -114,12 +117,12 @@ def brax_scores(
     """
     groups: dict[str, dict[str, list[Any]]] = {}
     for entry in sorted(entries, key=place):
-        agents, name = entry[actions]["agents"], entry["environment"]
+        name = entry["environment"]
         expert = _best_of_the_paper(name)
         if entry["backend"] != "generalized" or expert is None or entry[actions]["iqm"] is None:
             continue
         random = environment_spec(name).random_return(entry["backend"])
-        score = normalized_score(counted(agents), random, expert)
+        score = normalized_score(returns_of(entry, actions), random, expert)
         groups.setdefault(name, {}).setdefault(entry["bandit"], []).append(score)
     both = [kinds for kinds in groups.values() if len(kinds) == len(BANDITS)]
     if both:

@@ -11,7 +11,7 @@ IQM = {"value": -1.0, "low": -2.0, "high": -0.5, "n": 20}
 
 
 def entry(**fields):
-    measured = {"iqm": IQM, "failed": 0, "agents": []}
+    measured = {"iqm": IQM, "failed": 2, "agents": []}
     row = {"environment": "CartPole-v1", "algorithm": "ppo", "bandit": "ours", "sha256": "a"}
     row |= {"agents": 20, "episodes": 50, "seed": 10_000, "backend": None}
     return row | {"sampled_actions": measured, "mode_actions": measured} | fields
@@ -21,7 +21,7 @@ def test_only_what_was_measured_with_these_weights_counts():
     table = {"entries": [entry(), entry(sha256="b"), entry(algorithm="sac", bandit="published")]}
     results = zoo_bandit.results_of(table, "a")
     assert list(results) == ["PPO"]
-    assert results["PPO"]["mode_actions"] == IQM
+    assert results["PPO"]["mode_actions"] == IQM and results["PPO"]["failed"] == 2
     assert results["PPO"]["hyperparameters"] == "sampled from the paper's lists"
     assert zoo_bandit.results_of({}, "a") == {}
 

@@ -34,10 +34,11 @@ def entry(environment, algorithm, kind, mode, sampled, **changes):
         "backend": None,
         "training_steps": 10_000,
         "inner_loop": algorithm,
-        "mode_actions": zoo_table.summary(np.asarray(mode, float)),
-        "sampled_actions": zoo_table.summary(np.asarray(sampled, float)),
-    }
-    return made | changes
+    } | changes
+    judge_in = Place(environment, None, None, made["backend"])
+    for actions, returns in (("mode_actions", mode), ("sampled_actions", sampled)):
+        made[actions] = zoo_table.summary(np.asarray(returns, float), judge_in)
+    return made
 
 
 def report(*entries):
@@ -86,12 +87,15 @@ def test_bandits_measured_differently_are_not_subtracted():
         assert zoo_table.differences([ours, theirs | changed]) == []
 
 
-def test_an_agent_without_a_finite_return_counts_as_the_worst_and_is_told():
-    # Of -4, -3, -2 and the NaN, which counts as -4, the middle two are -4 and -3.
-    broken = zoo_table.summary(np.array([-4.0, np.nan, -3.0, -2.0]))
-    assert broken["iqm"]["value"] == pytest.approx(-3.5)
-    assert broken["agents"] == [-4.0, None, -3.0, -2.0]
-    made = entry("Pendulum-v1", "ppo", "ours", [np.nan, -4, -3, -2], [-1, -2, -3, -4])
+def test_an_agent_without_a_finite_return_counts_as_random_actions_and_is_told():
+    made = entry("Pendulum-v1", "ppo", "ours", [np.nan, -4, -3, -2000], [-1, -2, -3, -4])
+    # The NaN counts as what random actions earn, about -1200: it is next to the worst.
+    random = environment_spec("Pendulum-v1").random_return()
+    assert made["mode_actions"]["iqm"]["value"] == pytest.approx((random - 4) / 2)
+    assert made["mode_actions"]["agents"] == [None, -4.0, -3.0, -2000.0]
+    assert zoo_table_page.returns_of(made, "mode_actions") == [random, -4.0, -3.0, -2000.0]
+    none = entry("Pendulum-v1", "ppo", "ours", [np.nan] * 2, [-1, -2])["mode_actions"]
+    assert none == {"iqm": None, "failed": 2, "agents": [None, None]}
     text = zoo_table.EXPERIMENT.page(report(made))
     assert "PPO on Pendulum-v1 (ours, most likely actions): 1 of 4" in text
 
