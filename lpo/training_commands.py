@@ -57,13 +57,13 @@ class Agents:
     backend: str | None = None
 
     # The field that says how many agents of each objective there are.
-    counted: ClassVar[str] = "seeds"
+    number_field: ClassVar[str] = "seeds"
 
     def seed_list(self) -> list[int]:
         """Consecutive seeds; a UserError for none or a negative one."""
-        at_least(1, self, self.counted)
+        at_least(1, self, self.number_field)
         at_least(0, self, "seed")
-        seeds = list(range(self.seed, self.seed + getattr(self, self.counted)))
+        seeds = list(range(self.seed, self.seed + getattr(self, self.number_field)))
         check_seeds(seeds)
         return seeds
 
@@ -291,7 +291,7 @@ class AlignConfig(Agents):
     agents: int = 16
     seed: int = 500
 
-    counted = "agents"
+    number_field = "agents"
 
     def regimes(self) -> list[Regime]:
         """Every combination of the values given."""

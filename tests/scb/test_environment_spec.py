@@ -2,6 +2,7 @@
 
 import pytest
 
+from experiments.returns import EXPERIMENT
 from scb.agents.spec import bandit_agent, environment_agent
 from scb.discovery import BanditDiscovery, DiscoveryConfig
 from scb.environments import returns
@@ -71,9 +72,9 @@ def test_the_table_of_random_returns_is_what_is_measured(name):
 
 
 def test_the_table_is_written_by_its_command(corridors, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(returns, "_TABLE", tmp_path / "returns.json")
-    returns._TABLE.write_text('{"random": {"hopper:spring": 128.5}, "idle": {}}')
-    returns.main(["Corridor-v0"])
+    monkeypatch.setattr(returns, "TABLE", tmp_path / "returns.json")
+    returns.TABLE.write_text('{"random": {"hopper:spring": 128.5}, "idle": {}}')
+    assert EXPERIMENT.main(["Corridor-v0"]) == 0
     assert capsys.readouterr().out == "Corridor-v0: {'random': 3.0}\n"
     returns.table.cache_clear()
     assert returns.table("random") == {"hopper": {"spring": 128.5}, "Corridor-v0": {None: 3.0}}
