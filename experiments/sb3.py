@@ -11,6 +11,7 @@ it), in which every agent is a process. What --out holds already is not trained 
 
 import json
 import subprocess
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -21,7 +22,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
-from experiments.claims import Claim, of_agents
+from experiments.claims import Claim, judge, of_agents
 from experiments.harness import Experiment, Report, bandit_of, packed, settled, unpacked
 from experiments.parts import InParts, Part
 from experiments.rendering import number
@@ -182,7 +183,7 @@ def claims(report: Report) -> list[Claim]:
                 if shared:
                     here, there = (returns_of(cell, shared)[:, point] for cell in both)
                     evidence = of_agents(partial(paired_difference, here, there), len(shared))
-                text = f"{name}, {algorithm.upper()} after {thousands(steps[point])} steps"
+                text = _claimed(name, algorithm, steps[point])
                 found.append(Claim(text, evidence, places=0))
     return found
 
@@ -208,7 +209,8 @@ def facts(report: Report) -> dict[str, Any]:
         "tables": tables,
         "every": sorted({n for x in report["steps"].values() for n in x}),
         "counts": sorted(counts),
-        "ends": "; ".join(_ends(tables, report["steps"])),
+        "ends": {name: ends for name, x in tables.items() if (ends := _ends(x, report["steps"]))},
+        "number": Counter(_outcomes(report)),
         "short": [x for x, n in report["steps"].items() if x in trained and n[-1] < longest],
         "deciding": DECIDING,
         "expert": {name: environment_spec(name).reference() for name in tables},
@@ -218,45 +220,53 @@ def facts(report: Report) -> dict[str, Any]:
 
 
 def _ends(
-    tables: Mapping[str, Mapping[str, Mapping[str, list[Estimate]]]],
-    steps: Mapping[str, Sequence[int]],
-) -> Iterator[str]:
-    """Of each algorithm that has enough agents in an environment what it ends with, in words."""
-    for name, algorithms in tables.items():
-        for algorithm, places in algorithms.items():
-            if len(places) < len(PLACES) or min(row[-1].n for row in places.values()) < DECIDING:
-                continue
+    algorithms: Mapping[str, Mapping[str, list[Estimate]]], steps: Mapping[str, Sequence[int]]
+) -> list[str]:
+    """Of each algorithm of an environment that has enough agents there what it ends with, in words."""
+    found = []
+    for algorithm, places in algorithms.items():
+        if len(places) == len(PLACES) and min(row[-1].n for row in places.values()) >= DECIDING:
             here, there = (number(places[place][-1].value, 0) for place in PLACES)
             after = thousands(steps[algorithm][-1])
-            yield (
-                f"{algorithm.upper()} after {after} steps: {here} trained in the bandit of {name}, {there} in {name} "
-                "itself"
-            )
+            found.append(f"{algorithm.upper()} {here} and {there} after {after} steps")
+    return found
+
+
+def _outcomes(report: Report) -> list[str]:
+    """What becomes of the claims after the most steps, of the algorithms that have enough agents."""
+    ends = {
+        _claimed(name, algorithm, report["steps"][algorithm][-1])
+        for name, algorithms in report["agents"].items()
+        for algorithm in algorithms
+    }
+    return [
+        x.outcome
+        for x in judge(claims(report))
+        if x.claim.text in ends and x.estimate and x.estimate.n >= DECIDING
+    ]
+
+
+def _claimed(environment: str, algorithm: str, steps: int) -> str:
+    return f"{environment}, {algorithm.upper()} after {thousands(steps)} steps"
 
 
 def draw(report: Mapping[str, Any]) -> Figure:
-    """A row an environment: return after each number of steps, and of what has one number each agent a dot."""
+    """An environment a panel: return after each number of steps; beside it what has one number, each agent a dot."""
     shown = facts(report)
     tables = shown["tables"]
-    figure = Figure(figsize=(plotting.WIDTH, 3.1 * max(1, len(tables))))
+    short = {name: [x for x in of if len(report["steps"][x]) == 1] for name, of in tables.items()}
+    number = len(tables) + sum(map(bool, short.values()))
+    figure = Figure(figsize=(plotting.WIDTH, 2.9 * max(1, -(-number // 2))))
     if not tables:
         return figure
-    panels = figure.subplots(len(tables), 2, squeeze=False, width_ratios=(3, 2))
-    for (curves, dots), (name, algorithms) in zip(panels, tables.items(), strict=True):
-        once = [x for x in algorithms if len(report["steps"][x]) == 1]
+    panels = iter(figure.subplots(-(-number // 2), 2, squeeze=False).flat)
+    for name, algorithms in tables.items():
+        curves, once = next(panels), short[name]
         for algorithm, places in algorithms.items():
-            color = COLORS[algorithm]
-            for place, found in places.items():
-                if algorithm not in once:
-                    steps = report["steps"][algorithm]
-                    plotting.estimate_curve(
-                        curves, steps, found, color, LINES[place], marker=MARKERS[place]
-                    )
-                    continue
-                position = once.index(algorithm) + 0.4 * PLACES.index(place)
-                agents = report["agents"][name][algorithm][place]
-                earned = returns_of(agents, sorted(agents))[:, 0]
-                plotting.estimate_row(dots, position, earned, found[0], color)
+            for place, found in places.items() if algorithm not in once else ():
+                steps, color = report["steps"][algorithm], COLORS[algorithm]
+                line, marker = LINES[place], MARKERS[place]
+                plotting.estimate_curve(curves, steps, found, color, line, marker=marker)
         for label, level in (
             ("expert", shown["expert"][name].value),
             ("random", shown["random"][name]),
@@ -265,16 +275,10 @@ def draw(report: Mapping[str, Any]) -> Figure:
             curves.annotate(label, (1.0, level), xycoords=("axes fraction", "data"), fontsize=7)
         curves.set(title=name, xlabel="training steps", ylabel="return", xscale="log")
         curves.xaxis.set_major_formatter(EngFormatter(sep=""))
-        dots.set_visible(bool(once))
         if once:
-            after = thousands(report["steps"][once[0]][0])
-            dots.set(title=f"after {after} steps", xlabel="return, each agent a dot")
-            rows = [(i, x, j, p) for i, x in enumerate(once) for j, p in enumerate(PLACES)]
-            dots.set_yticks(
-                [i + 0.4 * j for i, _, j, _ in rows],
-                [f"{x.upper()}, {'bandit' if p == BANDIT else 'itself'}" for _, x, _, p in rows],
-            )
-            dots.set_ylim(len(once) - 0.3, -0.3)
+            _draw_once(next(panels), name, once, report, tables[name])
+    for unused in panels:
+        unused.set_visible(False)
     used = [x for x in COLORS if any(x in algorithms for algorithms in tables.values())]
     looks: dict[str, Mapping[str, Any]] = {x.upper(): {"color": COLORS[x]} for x in used}
     for place, line in LINES.items():
@@ -285,6 +289,33 @@ def draw(report: Mapping[str, Any]) -> Figure:
         }
     plotting.legend_of(figure, looks, columns=4)
     return figure
+
+
+def _draw_once(
+    axes: Any,
+    name: str,
+    algorithms: Sequence[str],
+    report: Report,
+    tables: Mapping[str, Mapping[str, Sequence[Estimate]]],
+) -> None:
+    """What agents earn of algorithms that are judged after one number of steps."""
+    rows = {
+        (algorithm, place): i + 0.4 * j
+        for i, algorithm in enumerate(algorithms)
+        for j, place in enumerate(PLACES)
+        if place in tables[algorithm]
+    }
+    for (algorithm, place), position in rows.items():
+        agents = report["agents"][name][algorithm][place]
+        earned = returns_of(agents, sorted(agents))[:, 0]
+        plotting.estimate_row(
+            axes, position, earned, tables[algorithm][place][0], COLORS[algorithm]
+        )
+    after = thousands(report["steps"][algorithms[0]][0])
+    axes.set(title=f"{name}, after {after} steps", xlabel="return, each agent a dot")
+    labels = [f"{x.upper()}, {'bandit' if p == BANDIT else 'itself'}" for x, p in rows]
+    axes.set_yticks(list(rows.values()), labels)
+    axes.set_ylim(len(algorithms) - 0.3, -0.3)
 
 
 EXPERIMENT = Experiment(
