@@ -1,6 +1,6 @@
 """What the meta-evolution needs: learned initial states, no transitions, continuous latents, curricula.
 
-    python -m experiments.ablations
+    python -m experiments ablations
 
 Searches from random weights that differ in one thing each: what of the synthetic environment is
 learned (T the transition, I the initial state, C with a curriculum), the latent's distribution, the
@@ -21,10 +21,12 @@ from experiments.parts import InParts, Part
 from experiments.searches import NONE
 from scb import plotting
 from scb.discovery import DiscoveryConfig
+from scb.environments.registry import environment_spec
 from scb.environments.synthetic import BanditConfig
 
-ENVIRONMENTS = ("Pendulum-v1", "MountainCar-v0")
-# The paper finds no curriculum for Pendulum.
+# The paper's two, and Acrobot, where searches of a laptop's size come to something.
+ENVIRONMENTS = ("Pendulum-v1", "MountainCar-v0", "Acrobot-v1")
+# The paper has none for the others.
 WITH_CURRICULUM = ("MountainCar-v0",)
 WORST = {"MountainCar-v0": -200.0}  # what an agent earns that never reaches the goal
 LATENTS = {
@@ -97,9 +99,13 @@ def _never_reached(report: Mapping[str, Any], environment: str, search: str) -> 
     return environment in WORST and bool(means) and max(means) <= WORST[environment]
 
 
-def _goal_unseen(report: Mapping[str, Any], environment: str) -> bool:
-    """Whether no agent of any search ever reached the goal."""
-    return all(_never_reached(report, environment, x) for x in searches_of(environment))
+def _at_the_start(report: Mapping[str, Any], environment: str) -> bool:
+    """Whether no search ends a tenth of the way from random actions to the expert: such searches test no claim."""
+    least = environment_spec(environment).random_return() + of_the_way(environment)
+    curves = report["environments"][environment]
+    return all(
+        x < least for search in searches_of(environment) for x in searches.last(curves[search])
+    )
 
 
 def claims(report: Report) -> list[Claim]:
@@ -108,7 +114,7 @@ def claims(report: Report) -> list[Claim]:
 
 
 def _claims_of(report: Report, environment: str) -> list[Claim]:
-    curves, untold = report["environments"][environment], _goal_unseen(report, environment)
+    curves, untold = report["environments"][environment], _at_the_start(report, environment)
 
     def above(text: str, row: str, label: str, other: str, margin: float = 0.0) -> Claim:
         one, than = (curves[rows(environment)[row][x]] for x in (label, other))
@@ -148,12 +154,12 @@ def facts(report: Report) -> dict[str, Any]:
                     "failing": max(max(c["failed"]) for c in curves.values()) / candidates,
                     "seconds": float(np.mean([c["seconds"] for c in curves.values()])),
                 }
-    unseen = [x for x in ENVIRONMENTS if _goal_unseen(report, x)]
-    return {"rows": found, "unseen": unseen, "enough": ENOUGH}
+    untold = [x for x in ENVIRONMENTS if _at_the_start(report, x)]
+    return {"rows": found, "untold": untold, "enough": ENOUGH}
 
 
 def draw(report: Mapping[str, Any]) -> Figure:
-    """The paper's six panels; a line is left out where a search's mean failed."""
+    """The paper's panels, and Acrobot's; a line is left out where a search's mean failed."""
     colors = (
         plotting.BLACK,
         plotting.ORANGE,
@@ -172,15 +178,16 @@ def draw(report: Mapping[str, Any]) -> Figure:
         ):
             if row not in drawn:
                 axes.axis("off")
-                axes.text(0.5, 0.5, "the paper has no curriculum for it", ha="center")
+                axes.text(0.5, 0.5, "the paper has\nno curriculum", ha="center")
                 continue
             for (label, search), color, style in zip(
                 drawn[row].items(), colors, styles, strict=False
             ):
                 curves = list(report["environments"][environment][search].values())
                 plotting.search_curve(axes, curves, label, color, style)
-            axes.set(title=f"{environment}: {row}", xlabel="generation", ylabel="return of agents")
-            axes.legend(fontsize=8, ncols=2)
+            axes.set_title(f"{environment}:\n{row}", fontsize=10)
+            axes.set(xlabel="generation", ylabel="return of agents" if column == 0 else "")
+            axes.legend(fontsize=7, handlelength=1.8)
     plotting.figure_title(
         figure, "Meta-training curves: mean over searches, 95 % interval over searches"
     )
@@ -188,7 +195,3 @@ def draw(report: Mapping[str, Any]) -> Figure:
 
 
 EXPERIMENT = Experiment.of_the_paper("ablations", measure, draw, claims, facts=facts)
-
-
-if __name__ == "__main__":
-    raise SystemExit(EXPERIMENT.main())
