@@ -58,7 +58,7 @@ def main(
     steps: int = 100_000,
     seed: int = 1,
 ) -> float:
-    """Train PPO with an objective, then evaluate it. Hyperparameters are those of SB3's zoo for Pendulum.
+    """Train PPO with an objective, then evaluate it. Hyperparameters are those of SB3's zoo for Pendulum, but for gSDE.
 
     Args:
       objective: ppo, ppo-0.3, dpo, a name of the zoo (lpo-pendulum) or path/to/objective.npz.

@@ -66,12 +66,17 @@ class SyntheticEnv(gymnasium.Env[np.ndarray, Any]):
 
     Args:
       file: NAME.npz, or the name of a bandit of the zoo.
+      render_mode: None, as many scripts say it.
 
     Raises:
-      UserError: the file cannot be read, or is none of them.
+      UserError: the file cannot be read, or is none of them; another render mode.
     """
 
-    def __init__(self, file: str) -> None:
+    def __init__(self, file: str, render_mode: None = None) -> None:
+        if render_mode is not None:
+            raise UserError(
+                f"render_mode is {render_mode!r}, and a bandit has nothing to show: leave it out."
+            )
         self._functions, self.observation_space, self.action_space = _opened(file)
         self._observation: np.ndarray | None = None
         self._starts = np.empty((0, 0), np.float32)

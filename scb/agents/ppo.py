@@ -216,16 +216,14 @@ class PPO(Agent):
         return policy, networks.ValueNetwork(sizes, activation)
 
     def _check_parameters(self, parameters: Any) -> None:
-        """A UserError where the hyperparameters still hold a clip, which the drift cannot take."""
-        if not isinstance(parameters, float):
-            return
+        """A UserError where the drift cannot take what the hyperparameters hold, such as their default clip."""
         one = jnp.zeros(1)
         try:
             jax.eval_shape(self.drift, parameters, one, one, one)
         except Exception as error:  # what a drift raises for parameters of another kind is its own
             raise UserError(
-                f"the hyperparameters' drift is {parameters}, which the drift cannot take: give the objective's "
-                "parameters."
+                "the agent's drift cannot take the hyperparameters' drift: of an objective give "
+                "objective.drift to the agent, and objective.parameters as the hyperparameters' drift."
             ) from error
 
     def init(

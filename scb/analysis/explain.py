@@ -144,7 +144,7 @@ def explain_command(
         f"The bandit's optimal policy earns {earned['value']:.1f} in {place.name} ({episodes} episodes)."
     )
     for name, share in sorted(numbers["importance"].items(), key=lambda item: -item[1]):
-        printer.print(f"  {share:6.1%} of the reward's variance: {name}")
+        printer.print(f"  {share:6.1%} of the reward's variance, alone or with others: {name}")
     if not parts:
         printer.print("It has a single observation, so that there is no plane to draw.")
     if parts:

@@ -332,7 +332,8 @@ def test_meta_train_writes_an_objective_that_loads(
     assert config_dict(again) == config
     stored = json.loads((working_folder / "learned" / "config.json").read_text())
     longer_config = longer["config"]["meta_training"]
-    assert stored == {"command": longer["command"], "config": longer_config}
+    sums = longer["config"]["bandit_sha256"]
+    assert stored == {"command": longer["command"], "config": longer_config, "inputs": sums}
 
 
 def asked_for(words=""):

@@ -42,9 +42,14 @@ def test_what_is_no_environment_and_what_is_no_drift_are_told_apart_from_bugs():
         PPO(env, PPOConfig(), objective)
     agent = PPO(env, PPOConfig(), objective.drift)
     with pytest.raises(
-        UserError, match=r"the hyperparameters' drift is 0\.2, which the drift cannot take"
+        UserError, match="the agent's drift cannot take the hyperparameters' drift: of an objective"
     ):
         agent.init(jax.random.key(0), PPOHyperparameters(), params)
+    with pytest.raises(UserError, match=r"and objective\.parameters as the hyperparameters' drift"):
+        jax.jit(agent.train)(jax.random.key(0), PPOHyperparameters(), params)
+    with pytest.raises(UserError, match="the agent's drift cannot take"):  # PPO's own clip
+        given = PPOHyperparameters(drift=objective.parameters)
+        PPO(env, PPOConfig()).init(jax.random.key(0), given, params)
     agent.init(jax.random.key(0), PPOHyperparameters(drift=objective.parameters), params)
 
 

@@ -222,6 +222,15 @@ def test_actions_that_are_none_are_refused(name, actions, message):
         envs.step(actions)
 
 
+def test_nothing_is_rendered():
+    name = "scb/Synthetic-Pendulum-v1"
+    assert gymnasium.make(name, render_mode=None).reset(seed=0)[0].shape == (3,)
+    with pytest.raises(
+        UserError, match="render_mode is 'rgb_array', and a bandit has nothing to show"
+    ):
+        SyntheticEnv("Synthetic-Pendulum-v1", render_mode="rgb_array")
+
+
 def test_a_bandits_episode_is_one_step():
     env = gymnasium.make(BANDIT)
     first, info = env.reset(seed=1)
