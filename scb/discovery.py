@@ -148,10 +148,9 @@ class DiscoveryConfig:
     )
 
     def __post_init__(self) -> None:
-        if isinstance(self.algorithms, str):
-            raise UserError(
-                f"the algorithms are {self.algorithms!r}, a text: give a tuple of names."
-            )
+        algorithms: Any = self.algorithms
+        if isinstance(algorithms, str):
+            raise UserError(f"the algorithms are {algorithms!r}, a text: give a tuple of names.")
         one_of("initialisation", self.init, INITS)
         one_of("mode", self.mode, MODES)
         one_of("selection", self.select, SELECTIONS)

@@ -664,6 +664,7 @@ def test_the_inner_loop_is_the_papers_where_no_agent_is_given():
             {"lists": {"sac": {"discount": (0.9,)}}},
             "there are hyperparameter lists for sac, but the inner loop trains ppo",
         ),
+        ({"algorithms": "ppo"}, "the algorithms are 'ppo', a text: give a tuple of names"),
         (
             {"lists": {"ppo": {"discount": (0.9,)}}, "fixed_hyperparameters": True},
             "fixed hyperparameters are not drawn from lists",
