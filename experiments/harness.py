@@ -225,7 +225,7 @@ class Experiment:
         # What measures nothing leaves the report to the machine that made it.
         here = {"versions": package_versions(), "machine": machine_description()}
         report |= {"experiment": self.name, **fixed}
-        saved = json.dumps(report)
+        began = saved = json.dumps(report)
 
         def save() -> None:
             nonlocal saved
@@ -247,6 +247,8 @@ class Experiment:
             shutil.rmtree(kept)
         else:
             self.measure(given, report, save)
+        if json.dumps(report) == began:
+            print(f"{self.name}: {out} has all that is asked for already.")
         if self.presets:
             report["complete"] = True
         write_json(out, report)

@@ -74,7 +74,7 @@ class DistillConfig:
       numbers: that a formula may have.
       tolerance: R² that a shorter formula may lack to be taken instead of the best, and that a
         further term must add.
-      seed: decides everything; one of `scb.seeds.SEARCHING`.
+      seed: decides everything; 0 to 9999, which are for searches.
     """
 
     samples: int = 1000

@@ -84,6 +84,10 @@ def load_objective(name: str | Path) -> Objective:
             return _from_file(folder / f"{text}.npz")
     if text.endswith(".npz"):
         return _from_file(Path(text))
+    if Path(text).is_dir():
+        raise UserError(
+            f"{text} is a folder: give the objective's file in it, such as {Path(text) / 'objective.npz'}."
+        )
     raise unknown_name("objective", text, [*objective_names(), "path/to/objective.npz"])
 
 

@@ -58,7 +58,7 @@ class EvolutionConfig:
       mean_evaluations: agents that judge the mean of the search distribution.
       evaluate_mean_every: generations between those judgements (and one after the last generation).
       checkpoint_every: generations between checkpoints.
-      seed: decides everything else; one of `scb.seeds.SEARCHING`.
+      seed: decides everything else; 0 to 9999, which are for searches.
     """
 
     strategy: str = "SNES"

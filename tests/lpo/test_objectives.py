@@ -44,6 +44,10 @@ def refusal(path: Path) -> str:
     return str(error.value)
 
 
+def test_of_a_run_folder_the_file_is_asked_for(tmp_path):
+    assert refusal(tmp_path).endswith(f"such as {tmp_path / 'objective.npz'}.")
+
+
 def edit(path: Path, change) -> None:
     """Changes a copy of the metadata in place, or replaces it by what `change` returns."""
     json_path = path.with_suffix(".json")
