@@ -182,7 +182,7 @@ def test_explain_writes_what_it_found(tmp_path, capsys):
     # A car is pushed the way it rolls.
     assert numbers["importance"]["velocity"] > numbers["importance"]["position"]
     assert (tmp_path / "a" / "explain.png").stat().st_size > 10_000
-    assert "of the reward's variance: velocity" in capsys.readouterr().out
+    assert "of the reward's variance, alone or with others: velocity" in capsys.readouterr().out
 
 
 PENDULUM = "Synthetic-Pendulum-v1"
