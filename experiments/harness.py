@@ -31,7 +31,7 @@ from scb.artefacts import machine_description, package_versions
 from scb.command_line import flags
 from scb.environments.registry import environment_spec, families
 from scb.environments.synthetic import SyntheticBandit
-from scb.environments.zoo import bandit_metadata, open_bandit, zoo_names
+from scb.environments.zoo import bandit_metadata, load_bandit, zoo_names
 from scb.errors import UserError
 from scb.files import make_folder, write_json
 from scb.runs import grown
@@ -331,7 +331,7 @@ def settled(report: dict[str, Any], **settings: Any) -> None:
 def bandit_of(environment: str) -> tuple[SyntheticBandit, str]:
     """The zoo's bandit of an environment, and the checksum of its weights."""
     name = environment_spec(environment).bandit
-    return open_bandit(name), bandit_metadata(name)["sha256"]
+    return load_bandit(name), bandit_metadata(name)["sha256"]
 
 
 def forget_replaced(report: dict[str, Any]) -> None:

@@ -28,7 +28,7 @@ from experiments.parts import InParts, Part
 from experiments.rendering import number
 from scb import plotting
 from scb.environments.registry import environment_spec
-from scb.environments.zoo import bandit_metadata, open_bandit
+from scb.environments.zoo import bandit_metadata, load_bandit
 from scb.errors import UserError, at_least, one_of
 from scb.gymnasium import NAMESPACE
 from scb.judgement import check_fits
@@ -152,7 +152,7 @@ def _checksum(options: Options) -> str | None:
         return None
     (name,) = options.environments
     place = Place.named(name)
-    check_fits(open_bandit(str(options.bandit)), place.env, place.params, name)
+    check_fits(load_bandit(str(options.bandit)), place.env, place.params, name)
     return str(bandit_metadata(str(options.bandit))["sha256"])
 
 

@@ -39,7 +39,7 @@ from scb.agents.spec import AgentSpec, algorithms_for, bandit_agent
 from scb.artefacts import arrays_digest
 from scb.environments.registry import environment_spec
 from scb.environments.synthetic import BanditConfig, SyntheticBandit
-from scb.environments.zoo import bandit_metadata, open_bandit, zoo_names
+from scb.environments.zoo import bandit_metadata, load_bandit, zoo_names
 from scb.errors import UserError, at_least
 from scb.importer import PUBLISHED_BANDITS, published_bandit
 from scb.judgement import BRAX_EPISODES, EPISODES, check_fits, judge
@@ -110,7 +110,7 @@ def candidates(
         if name in homes and name not in zoo_names():  # published alone
             wanted.add(homes[name])
             continue
-        bandit, digest = open_bandit(name), bandit_metadata(name)["sha256"]
+        bandit, digest = load_bandit(name), bandit_metadata(name)["sha256"]
         environment = environment_spec(name).evaluation_environment
         wanted.add(environment)
         found.append(Candidate(environment, "ours", bandit, digest))

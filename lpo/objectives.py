@@ -3,8 +3,8 @@
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from importlib import resources
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import jax
@@ -14,12 +14,13 @@ from lpo.certificate import Certificate, certify
 from lpo.drifts import ClipDrift, DPODrift, Drift, NoDrift, drift_from_config
 from scb import artefacts
 from scb.environments.registry import environment_spec
-from scb.errors import UserError, unknown_name
+from scb.errors import UserError
 from scb.keys import root_key
 
 KIND = "drift"
 KNOWN: dict[str, Drift] = {"ppo": ClipDrift(), "dpo": DPODrift(), "none": NoDrift()}
 CLIPS = ("ppo-0.1", "ppo", "ppo-0.3", "ppo-0.5", "ppo-1")  # among which a tuned one is looked for
+_ZOO = Path(__file__).parent / "zoo"
 _CLIP_NAME = re.compile(r"ppo-(\d*\.?\d+)$")
 
 
@@ -58,8 +59,7 @@ class Objective:
 
 def zoo_names() -> list[str]:
     """Names of the learned objectives that ship with the library."""
-    folder = resources.files("lpo") / "zoo"
-    return sorted(p.name.removesuffix(".npz") for p in folder.iterdir() if p.name.endswith(".npz"))
+    return artefacts.names_in(_ZOO)
 
 
 def objective_names() -> list[str]:
@@ -79,16 +79,7 @@ def load_objective(name: str | Path) -> Objective:
         return closed_form(text, KNOWN[text])
     if clip:
         return closed_form(text, ClipDrift(float(clip.group(1))))
-    if text in zoo_names():
-        with resources.as_file(resources.files("lpo") / "zoo") as folder:
-            return _from_file(folder / f"{text}.npz")
-    if text.endswith(".npz"):
-        return _from_file(Path(text))
-    if Path(text).is_dir():
-        raise UserError(
-            f"{text} is a folder: give the objective's file in it, such as {Path(text) / 'objective.npz'}."
-        )
-    raise unknown_name("objective", text, [*objective_names(), "path/to/objective.npz"])
+    return _from_file(artefacts.named(text, _ZOO, "objective", tuple(KNOWN)))
 
 
 def check_names(objectives: Sequence[Objective]) -> None:
@@ -150,7 +141,10 @@ def _from_file(path: Path) -> Objective:
 
 
 def save_objective(
-    path: str | Path, drift: Drift, parameters: Any, metadata: Mapping[str, Any]
+    path: str | Path,
+    drift: Drift,
+    parameters: Any,
+    metadata: Mapping[str, Any] = MappingProxyType({}),
 ) -> tuple[Path, Certificate]:
     """Writes a learned objective, or a formula, with its certificate.
 
@@ -158,7 +152,7 @@ def save_objective(
       path: NAME.npz; NAME.json is written beside it.
       drift: any member of the contract.
       parameters: its own.
-      metadata: config (of the meta-training), seeds, results, cost, command.
+      metadata: config (of the meta-training), seeds, results, cost, command, what of it there is to tell.
     """
     if not isinstance(parameters, Mapping):
         raise UserError(

@@ -8,6 +8,7 @@ at ±`MAX_LOG_RATIO`, and advantages that the caller has normalised over the min
     loss = policy_loss(new_log_prob - old_log_prob, advantage, progress)
 """
 
+import importlib
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -50,7 +51,7 @@ def drift_function(
       UserError: as `load_objective`.
     """
     objective = _loaded(objective)
-    return partial(_converted, jnp, objective.drift, objective.parameters)
+    return partial(_in_jax, objective.drift, objective.parameters)
 
 
 def numpy_drift(
@@ -64,7 +65,7 @@ def numpy_drift(
       UserError: as `load_objective`.
     """
     objective = _loaded(objective)
-    return partial(_converted, np, objective.drift, _host_parameters(objective))
+    return partial(_in_numpy, objective.drift, _host_parameters(objective))
 
 
 def torch_drift(objective: Objective | str | Path) -> "TorchFunction":
@@ -75,26 +76,7 @@ def torch_drift(objective: Objective | str | Path) -> "TorchFunction":
     Raises:
       UserError: as for `numpy_drift`, or PyTorch is not installed.
     """
-    try:
-        import torch
-    except ImportError as error:
-        raise UserError(
-            "a drift for PyTorch needs the package torch: install the extra `torch`."
-        ) from error
-    objective = _loaded(objective)
-    drift, parameters = objective.drift, _host_parameters(objective)
-
-    def penalty(
-        log_ratio: "torch.Tensor",
-        advantage: "torch.Tensor",
-        progress: "float | torch.Tensor | None" = None,
-    ) -> "torch.Tensor":
-        result: torch.Tensor = _evaluate(
-            torch, drift, parameters, log_ratio, advantage.to(log_ratio), progress
-        )
-        return result
-
-    return penalty
+    return _for_torch(_in_torch, objective)
 
 
 def torch_loss(objective: Objective | str | Path) -> "TorchFunction":
@@ -103,19 +85,7 @@ def torch_loss(objective: Objective | str | Path) -> "TorchFunction":
     Arguments and errors as for `torch_drift`; what is returned gives a scalar. The gradient of a
     log-ratio beyond ±MAX_LOG_RATIO is zero, as in training.
     """
-    drift = torch_drift(objective)
-    import torch
-
-    def loss(
-        log_ratio: "torch.Tensor",
-        advantage: "torch.Tensor",
-        progress: "float | torch.Tensor | None" = None,
-    ) -> "torch.Tensor":
-        penalty = drift(log_ratio, advantage, progress)
-        result: torch.Tensor = _policy_loss(torch, penalty, log_ratio, advantage)
-        return result
-
-    return loss
+    return _for_torch(_loss_in_torch, objective)
 
 
 def _policy_loss(xp: Any, penalty: Any, log_ratio: Any, advantage: Any) -> Any:
@@ -125,6 +95,59 @@ def _policy_loss(xp: Any, penalty: Any, log_ratio: Any, advantage: Any) -> Any:
 
 def _loaded(objective: Objective | str | Path) -> Objective:
     return objective if isinstance(objective, Objective) else load_objective(objective)
+
+
+def _for_torch(function: "TorchFunction", objective: Objective | str | Path) -> "TorchFunction":
+    try:
+        importlib.import_module("torch")
+    except ImportError as error:
+        raise UserError(
+            "a drift for PyTorch needs the package torch: install the extra `torch`."
+        ) from error
+    objective = _loaded(objective)
+    return partial(function, objective.drift, _host_parameters(objective))
+
+
+# What users hold are partials of these functions of a module, which can be pickled.
+
+
+def _in_jax(drift: Drift, parameters: Any, *arguments: Any, **keywords: Any) -> jax.Array:
+    result: jax.Array = _converted(jnp, drift, parameters, *arguments, **keywords)
+    return result
+
+
+def _in_numpy(drift: Drift, parameters: Any, *arguments: Any, **keywords: Any) -> np.ndarray:
+    result: np.ndarray = _converted(np, drift, parameters, *arguments, **keywords)
+    return result
+
+
+def _in_torch(
+    drift: Drift,
+    parameters: Any,
+    log_ratio: "torch.Tensor",
+    advantage: "torch.Tensor",
+    progress: "float | torch.Tensor | None" = None,
+) -> "torch.Tensor":
+    import torch
+
+    result: torch.Tensor = _evaluate(
+        torch, drift, parameters, log_ratio, advantage.to(log_ratio), progress
+    )
+    return result
+
+
+def _loss_in_torch(
+    drift: Drift,
+    parameters: Any,
+    log_ratio: "torch.Tensor",
+    advantage: "torch.Tensor",
+    progress: "float | torch.Tensor | None" = None,
+) -> "torch.Tensor":
+    import torch
+
+    penalty = _in_torch(drift, parameters, log_ratio, advantage, progress)
+    result: torch.Tensor = _policy_loss(torch, penalty, log_ratio, advantage)
+    return result
 
 
 def _converted(

@@ -26,7 +26,7 @@ import numpy as np
 from flax import traverse_util
 
 from scb import schema
-from scb.errors import UserError, first_line
+from scb.errors import UserError, first_line, unknown_name
 from scb.files import strict_json, write_bytes
 
 # numpy.ndarray leaves under any depth of dictionaries: {"reward": {"Dense_0": {"kernel": ...}}}.
@@ -55,7 +55,7 @@ def save(path: str | Path, arrays: Mapping[str, Any], metadata: Mapping[str, Any
       arrays: finite arrays of numbers, in dictionaries nested to any depth.
       metadata: `kind`, `config`, `seeds`, `results`, `cost` and `command`, and whatever else
         belongs; JSON types, NumPy numbers and arrays, and dataclasses. The schema version, the
-        name, the package versions and the checksum are filled in.
+        name, the package versions and the checksum are filled in; what else is left out, is empty.
 
     Returns:
       The path of NAME.npz.
@@ -72,6 +72,7 @@ def save(path: str | Path, arrays: Mapping[str, Any], metadata: Mapping[str, Any
     data = _npz_bytes(flat)
 
     written = {
+        **schema.UNTOLD,
         **metadata,
         "schema_version": schema.VERSION,
         "name": npz_path.name.removesuffix(".npz"),
@@ -94,6 +95,35 @@ def save(path: str | Path, arrays: Mapping[str, Any], metadata: Mapping[str, Any
     write_bytes(npz_path, data)
     write_bytes(json_path, (text + "\n").encode())
     return npz_path
+
+
+def names_in(folder: Path) -> list[str]:
+    """Names of the artefacts in a folder."""
+    return sorted(path.stem for path in folder.glob("*.npz"))
+
+
+def named(name: str | Path, folder: Path, what: str, others: Sequence[str] = ()) -> Path:
+    """The file of an artefact: by its name in a folder of those that ship, or itself, path.npz.
+
+    Args:
+      what: it is, for the message.
+      others: names that the caller knows besides.
+
+    Raises:
+      UserError: neither, with near matches, or with the folder's files where it is a folder.
+    """
+    text, names = str(name), names_in(folder)
+    if text in names:
+        return folder / f"{text}.npz"
+    if text.endswith(".npz"):
+        return Path(text)
+    if Path(text).is_dir():
+        there = names_in(Path(text))
+        raise UserError(
+            f"{text} is a folder: give the {what}'s file"
+            + (f" in it, such as {Path(text) / there[0]}.npz." if there else ", a path.npz.")
+        )
+    raise unknown_name(what, text, [*others, *names, f"path/to/{what}.npz"])
 
 
 def arrays_digest(arrays: Mapping[str, Any]) -> str:

@@ -15,7 +15,7 @@ from scb.command_line import GENERATIONS, LongRun, Measuring, Output, flags
 from scb.console import console
 from scb.discovery import BanditDiscovery, DiscoveryConfig
 from scb.environments.registry import environment_spec
-from scb.environments.zoo import bandit_metadata, open_synthetic, save_bandit
+from scb.environments.zoo import bandit_metadata, load_synthetic, save_bandit
 from scb.errors import at_least
 from scb.evolution import EvolutionConfig
 from scb.judgement import (
@@ -258,7 +258,7 @@ class Train(Measuring):
 
     def run(self) -> None:
         config: TrainConfig = self.config
-        bandit = open_synthetic(config.bandit)
+        bandit = load_synthetic(config.bandit)
         judge_in = evaluation_place(
             bandit, config.bandit, config.evaluation_environment, config.backend
         )

@@ -43,7 +43,7 @@ from scb.environments.synthetic import (
     Weights,
 )
 from scb.environments.synthetic_mdp import PARAMETERIZATIONS, synthetic_for
-from scb.environments.zoo import bandit_metadata, load_bandit, open_bandit, save_bandit
+from scb.environments.zoo import bandit_metadata, load_bandit, save_bandit
 from scb.errors import UserError, at_least, one_of, positive, unused
 from scb.evolution import EnvironmentSteps, EvolutionConfig, Outcome, evolve
 from scb.fitting import check_linear, standardize_reward
@@ -292,7 +292,7 @@ class BanditDiscovery:
         )
 
     def _weights_of(self, name: str) -> Weights:
-        start = open_bandit(name)
+        start = load_bandit(name)
         check_fits(start, self.place.env, self.place.params, self.config.environment)
         networks = () if start.linear else ("hidden_size", "activation", "latent_size")
         for what in ("form", "latent", *networks):

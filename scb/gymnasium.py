@@ -15,7 +15,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from scb.environments.in_numpy import InNumpy
-from scb.environments.zoo import open_synthetic, space_description, zoo_names
+from scb.environments.zoo import load_synthetic, space_description, zoo_names
 from scb.errors import UserError, at_least, one_of
 
 NAMESPACE = "scb"
@@ -37,7 +37,7 @@ def register() -> None:
 
 def _opened(file: str) -> tuple[InNumpy, spaces.Box, spaces.Space[Any]]:
     """(its functions, observation space, action space) of a bandit of the zoo or a file."""
-    synthetic = open_synthetic(str(file))
+    synthetic = load_synthetic(str(file))
     observations = spaces.Box(-np.inf, np.inf, (synthetic.observation_size,), np.float32)
     described = space_description(synthetic.action_space())
     actions: spaces.Space[Any]
@@ -92,11 +92,22 @@ class SyntheticEnv(gymnasium.Env[np.ndarray, Any]):
         if self._drawn_by is not rng or self._next == len(self._starts):
             self._starts = self._functions.start(rng, _BLOCK)
             self._drawn_by, self._next = rng, 0
-            if self._functions.one_step:
-                self._reward = self._functions.rewards_of(self._starts)
+            self._prepare()
         self._observation = self._starts[self._next : self._next + 1]
         self._next, self._time = self._next + 1, 0
         return self._observation[0].copy(), {}
+
+    def _prepare(self) -> None:
+        """Computes what rewards need of the first observations that are there."""
+        if self._functions.one_step and len(self._starts):
+            self._reward = self._functions.rewards_of(self._starts)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in vars(self).items() if name != "_reward"}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        self._prepare()
 
     def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         if self._observation is None:

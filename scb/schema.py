@@ -27,6 +27,8 @@ FIELDS: dict[str, tuple[type, ...]] = {
     "command": (str,),
     "sha256": (str,),
 }
+# What is written of whatever nobody has told.
+UNTOLD: Mapping[str, Any] = {"seeds": {}, "results": {}, "cost": {}, "command": ""}
 
 
 def _named_families(metadata: dict[str, Any]) -> dict[str, Any]:

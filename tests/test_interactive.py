@@ -15,7 +15,7 @@ from lpo import cli as lpo_cli
 from lpo.objectives import load_objective
 from lpo.update_regions import analyze
 from scb import cli as scb_cli
-from scb.environments.zoo import open_bandit
+from scb.environments.zoo import load_bandit
 from tests.site import BROWSERS
 
 
@@ -59,7 +59,7 @@ def test_the_surface_is_the_bandits_reward_of_each_action(bandit_page):
     assert [step["label"] for step in slider["steps"]] == ["the best", "0", "1", "2"]
     x, y = (array(traces[0][axis]) for axis in "xy")
     states = np.stack([a.ravel() for a in np.meshgrid(x, y)], axis=1).astype(np.float32)
-    bandit = open_bandit("Synthetic-MountainCar-v0")
+    bandit = load_bandit("Synthetic-MountainCar-v0")
     reward = jax.jit(jax.vmap(bandit.mean_reward, (0, None, None)))
     expected = np.stack([reward(states, a, bandit.default_params) for a in range(3)])
     drawn = [array(step["args"][0]["z"][0]).ravel() for step in slider["steps"]]

@@ -51,7 +51,8 @@ SLOW = ("discover", "SAC", "meta_train")
         for number, block in enumerate(BLOCKS)
     ],
 )
-def test_a_block_of_the_readme_runs(block):
+def test_a_block_of_the_readme_runs(block, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # some of them save what they make
     exec(compile(shortened(block), "README.md", "exec"), {})
 
 

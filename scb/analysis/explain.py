@@ -16,7 +16,7 @@ from scb.analysis.planes import observation_names, plane_for
 from scb.analysis.states import bandit_states, follow, thinned
 from scb.console import console
 from scb.environments.synthetic import SyntheticBandit
-from scb.environments.zoo import open_bandit
+from scb.environments.zoo import load_bandit
 from scb.errors import at_least
 from scb.files import make_folder, write_json
 from scb.judgement import evaluation_place
@@ -132,7 +132,7 @@ def explain_command(
     check_seeds([seed])
     if html:
         interactive.plotly()  # before the work, not after it
-    loaded = open_bandit(bandit)
+    loaded = load_bandit(bandit)
     place = evaluation_place(loaded, bandit, evaluation_environment, backend)
     folder = Path("runs") / "explain" / loaded.name if out is None else out
     make_folder(folder)

@@ -8,10 +8,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from gymnax.environments import environment
+import jax
+from gymnax.environments import environment, spaces
 
 from scb.environments.spec import Family, Made
 from scb.errors import UserError
+from scb.keys import root_key
 
 _NAME = re.compile(r"[^\W\d][\w.]*:[^\W\d]\w*")
 
@@ -55,4 +57,42 @@ class CustomFamily(Family):
                 f"{name!r} returned a {type(env).__name__}: it must return a gymnax 1.x environment, or one and its "
                 "parameters."
             )
-        return env, env.default_params if params is None else params
+        params = env.default_params if params is None else params
+        _check(name, env, params)
+        return env, params
+
+
+def _check(name: str, env: environment.Environment[Any, Any], params: Any) -> None:
+    """A UserError where it keeps another contract than gymnax 1.x's; what its own functions raise is theirs to say."""
+
+    def wrong(what: str) -> UserError:
+        return UserError(f"environment {name!r} {what}.")
+
+    if not hasattr(params, "max_steps_in_episode"):
+        raise wrong("has parameters without max_steps_in_episode, after which an episode ends")
+    observations, actions = env.observation_space(params), env.action_space(params)
+    for kind, space in {"observations": observations, "actions": actions}.items():
+        if not isinstance(space, spaces.Box | spaces.Discrete):
+            raise wrong(
+                f"has a {type(space).__name__} of {kind}: one Box or Discrete is understood"
+            )
+
+    def first_step(key: jax.Array) -> Any:
+        observation, state = env.reset(key, params)
+        return observation, env.step(key, state, actions.sample(key), params)
+
+    first, step = jax.eval_shape(first_step, root_key(0))
+    if len(step) != 6:
+        raise wrong(
+            f"returns {len(step)} values of a step, where gymnax 1.x returns observation, state, reward, terminated, "
+            "truncated and info"
+        )
+    for when, observation in {"reset": first, "step": step[0]}.items():
+        shape = getattr(observation, "shape", type(observation).__name__)
+        if shape != observations.shape:
+            raise wrong(
+                f"returns observations of shape {shape} from {when}, where its observation_space says "
+                f"{observations.shape}"
+            )
+    if step[2].shape != ():
+        raise wrong(f"returns rewards of shape {step[2].shape}, where one number is expected")

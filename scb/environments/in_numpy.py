@@ -76,6 +76,7 @@ class InNumpy:
     """
 
     def __init__(self, synthetic: SyntheticBandit | SyntheticMDP) -> None:
+        self._synthetic = synthetic
         params: Any = synthetic.default_params
         self.one_step, self.max_steps = synthetic.one_step, int(params.max_steps_in_episode)
         space = synthetic.action_space()
@@ -101,6 +102,13 @@ class InNumpy:
         if isinstance(synthetic, SyntheticMDP) and synthetic.env is not None:
             reset = jax.vmap(synthetic.reset, (0, None))
             self._starts = jax.jit(lambda keys: reset(keys, params)[0])
+
+    # It holds functions that cannot be pickled, and has no state.
+    def __reduce__(self) -> tuple[Any, ...]:
+        return InNumpy, (self._synthetic,)
+
+    def __deepcopy__(self, memo: Any) -> "InNumpy":
+        return self
 
     def start(self, rng: Generator, number: int) -> Array:
         """[number, O] first observations of episodes."""

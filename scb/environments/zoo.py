@@ -9,6 +9,7 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import gymnax
@@ -22,7 +23,7 @@ from scb.environments.registry import environment_names, environment_spec, make
 from scb.environments.spec import BANDIT, SYNTHETIC_MDP, Family, Made
 from scb.environments.synthetic import BanditConfig, SyntheticBandit, Weights
 from scb.environments.synthetic_mdp import MDPConfig, SyntheticMDP
-from scb.errors import UserError, unknown_name
+from scb.errors import UserError
 from scb.spaces import flat_bounds
 
 PREFIX = "Synthetic-"
@@ -32,7 +33,7 @@ _KINDS = {BANDIT: "bandit", SYNTHETIC_MDP: "synthetic MDP"}
 
 def zoo_names() -> list[str]:
     """Names of the bandits that ship with the library, as registered with gymnax."""
-    return sorted(path.stem for path in _ZOO.glob("*.npz"))
+    return artefacts.names_in(_ZOO)
 
 
 class SyntheticFamily(Family):
@@ -47,7 +48,7 @@ class SyntheticFamily(Family):
         return name.endswith(".npz") or super().owns(name)
 
     def make(self, name: str, **arguments: Any) -> Made:
-        synthetic = open_synthetic(name, **arguments)  # which takes none, and says so
+        synthetic = load_synthetic(name, **arguments)  # which takes none, and says so
         return synthetic, synthetic.default_params
 
     def facts(self, name: str) -> Mapping[str, Any]:
@@ -72,32 +73,36 @@ def register_zoo() -> None:
     """Registers every bandit of the zoo, so that `gymnax.make("Synthetic-Pendulum-v1")` works."""
     for name in zoo_names():
         if name not in gymnax.registered_envs:
-            gymnax.register(name, partial(open_bandit, name))
+            gymnax.register(name, partial(load_bandit, name))
 
 
-def bandit_metadata(name: str) -> Mapping[str, Any]:
+def bandit_metadata(name: str | Path) -> Mapping[str, Any]:
     """What the .json of a bandit or synthetic MDP (a zoo name, or path.npz) says: config, seeds, results, cost."""
-    path = name if name.endswith(".npz") else _ZOO / f"{name}.npz"
-    return artefacts.load(path, BANDIT, SYNTHETIC_MDP).metadata
+    return _read(name, BANDIT, SYNTHETIC_MDP)[1].metadata
 
 
-def load_bandit(path: str | Path) -> SyntheticBandit:
-    """A bandit from its file; a UserError says what is wrong with it."""
-    bandit = _load(path, BANDIT)
+def load_bandit(name: str | Path) -> SyntheticBandit:
+    """A bandit by the zoo's name, or from its file path.npz; a UserError says what is wrong with it."""
+    bandit = _load(name, BANDIT)
     assert isinstance(bandit, SyntheticBandit)
     return bandit
 
 
-def load(path: str | Path) -> SyntheticBandit | SyntheticMDP:
-    """A bandit or a synthetic MDP from its file; a UserError says what is wrong with it.
+def load_synthetic(name: str | Path) -> SyntheticBandit | SyntheticMDP:
+    """A bandit by the zoo's name, or a bandit or synthetic MDP from its file; a UserError says what is wrong with it.
 
     An MDP that starts in its evaluation environment's start states makes that environment by name.
     """
-    return _load(path, BANDIT, SYNTHETIC_MDP)
+    return _load(name, BANDIT, SYNTHETIC_MDP)
 
 
-def _load(path: str | Path, *kinds: str) -> SyntheticBandit | SyntheticMDP:
-    artefact = artefacts.load(path, *kinds)
+def _read(name: str | Path, *kinds: str) -> tuple[Path, artefacts.Artefact]:
+    path = artefacts.named(name, _ZOO, "bandit")
+    return path, artefacts.load(path, *kinds)
+
+
+def _load(name: str | Path, *kinds: str) -> SyntheticBandit | SyntheticMDP:
+    path, artefact = _read(name, *kinds)
     config, kind = artefact.metadata["config"], artefact.metadata["kind"]
     weights = jax.tree.map(jnp.asarray, dict(artefact.arrays))
     made: SyntheticBandit | SyntheticMDP
@@ -118,25 +123,11 @@ def _start(description: Mapping[str, Any]) -> Made:
     return make(description["environment"], **description["arguments"])
 
 
-def open_bandit(name: str) -> SyntheticBandit:
-    """A bandit by zoo name or file."""
-    if name.endswith(".npz"):
-        return load_bandit(name)
-    if name not in zoo_names():
-        raise unknown_name("bandit", name, [*zoo_names(), "path/to/bandit.npz"])
-    return load_bandit(_ZOO / f"{name}.npz")
-
-
-def open_synthetic(name: str) -> SyntheticBandit | SyntheticMDP:
-    """A bandit by zoo name, or a bandit or synthetic MDP by file."""
-    return load(name) if name.endswith(".npz") else open_bandit(name)
-
-
 def save_bandit(
     path: str | Path,
     synthetic: SyntheticBandit | SyntheticMDP,
     weights: Weights,
-    metadata: Mapping[str, Any],
+    metadata: Mapping[str, Any] = MappingProxyType({}),
 ) -> Path:
     """Writes a bandit or a synthetic MDP.
 
@@ -144,7 +135,8 @@ def save_bandit(
       path: NAME.npz; NAME.json is written beside it, and NAME is the bandit's name.
       synthetic: whose shapes are stored, and of an MDP parameterisation and maximum episode length.
       weights: as in its parameters.
-      metadata: config (of the discovery), seeds, results, cost, command. Of a "T",
+      metadata: config (of the discovery), seeds, results, cost, command, what of it there is to tell; a config's
+        "evaluation_environment" is the name of what the bandit stands for. Of a "T",
         `config["evaluation_environment"]` is the name by which to make the environment in whose start
         states it starts, where it isn't the environment's own.
 

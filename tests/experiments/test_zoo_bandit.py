@@ -5,7 +5,7 @@ import json
 import pytest
 
 from experiments import zoo_bandit
-from scb.environments.zoo import bandit_metadata, open_bandit, zoo_names
+from scb.environments.zoo import bandit_metadata, load_bandit, zoo_names
 
 IQM = {"value": -1.0, "low": -2.0, "high": -0.5, "n": 20}
 
@@ -44,7 +44,7 @@ def test_a_bandit_enters_with_its_weights_unchanged(tmp_path, capsys):
     written = bandit_metadata(str(tmp_path / "zoo" / "Synthetic-CartPole-v1.npz"))
     assert written["sha256"] == sha256
     assert written["results"]["PPO"]["sampled_actions"] == IQM
-    assert open_bandit(str(tmp_path / "zoo" / "Synthetic-CartPole-v1.npz")).observation_size == 4
+    assert load_bandit(str(tmp_path / "zoo" / "Synthetic-CartPole-v1.npz")).observation_size == 4
 
 
 @pytest.mark.parametrize("name", zoo_names())

@@ -11,7 +11,7 @@ from lpo.inner_loop import MetaTrainingConfig
 from lpo.meta_training import MetaTraining, learn_objective
 from lpo.pipeline import RunAll
 from scb.commands import Discover
-from scb.environments.zoo import bandit_metadata, open_bandit, save_bandit
+from scb.environments.zoo import bandit_metadata, load_bandit, save_bandit
 from scb.errors import UserError
 from scb.evolution import EvolutionConfig, Outcome
 from scb.runs import Run, config_dict
@@ -73,7 +73,7 @@ def test_where_no_mean_could_be_judged_nothing_is_saved(learned, tmp_path):
 )
 def test_a_search_does_not_go_on_in_another_bandit(tmp_path, command, flags):
     path, zoo = tmp_path / "mine.npz", "Synthetic-CartPole-v1"
-    bandit, metadata = open_bandit(zoo), bandit_metadata(zoo)
+    bandit, metadata = load_bandit(zoo), bandit_metadata(zoo)
     weights = bandit.default_params.weights
     save_bandit(path, bandit, weights, metadata)
     command.parse([*flags, str(path), f"--out={tmp_path / 'run'}"]).open().close()

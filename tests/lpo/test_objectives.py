@@ -45,6 +45,8 @@ def refusal(path: Path) -> str:
 
 
 def test_of_a_run_folder_the_file_is_asked_for(tmp_path):
+    assert refusal(tmp_path).endswith("give the objective's file, a path.npz.")
+    (tmp_path / "objective.npz").touch()
     assert refusal(tmp_path).endswith(f"such as {tmp_path / 'objective.npz'}.")
 
 

@@ -1,6 +1,7 @@
 """Drifts in NumPy and PyTorch are those of the contract, and the example trains with them."""
 
 import os
+import pickle
 import re
 import subprocess
 import sys
@@ -186,6 +187,14 @@ def test_an_unknown_name_is_refused_as_everywhere(make):
         make("dppo")
 
 
+@pytest.mark.parametrize("made", [drift_function, numpy_drift])
+def test_what_a_user_holds_can_be_pickled(made):
+    function = made("lpo-pendulum")
+    again = pickle.loads(pickle.dumps(function))
+    arguments = np.float32([0.1, -0.2]), np.float32([1.0, -1.0])
+    np.testing.assert_array_equal(function(*arguments), again(*arguments))
+
+
 def test_without_torch_one_sentence_says_what_to_install(monkeypatch, one_sentence):
     monkeypatch.setitem(sys.modules, "torch", None)
     for make in (torch_drift, torch_loss):
@@ -265,7 +274,8 @@ class TestTorch:
             return torch.max(-advantage * ratio, -advantage * ratio.clamp(0.8, 1.2)).mean()
 
         log_ratio, advantage, _ = points(1.0)
-        loss, slope = in_torch(torch_loss("ppo"), log_ratio, advantage, 0.0)
+        function = pickle.loads(pickle.dumps(torch_loss("ppo")))
+        loss, slope = in_torch(function, log_ratio, advantage, 0.0)
         expected_loss, expected_slope = in_torch(clipped_loss, log_ratio, advantage, 0.0)
         np.testing.assert_allclose(loss, expected_loss, rtol=1e-6)
         np.testing.assert_allclose(slope, expected_slope, rtol=1e-6, atol=1e-9)

@@ -14,7 +14,7 @@ from scb.analysis.planes import observation_names, plane_for
 from scb.analysis.states import bandit_states, follow
 from scb.cli import main
 from scb.environments.synthetic import BanditConfig, SyntheticBandit
-from scb.environments.zoo import open_bandit
+from scb.environments.zoo import load_bandit
 from scb.errors import UserError
 from scb.evaluation import evaluate
 
@@ -47,7 +47,7 @@ def test_optimal_action_of_a_known_reward(method, size):
 
 
 def test_gradient_is_no_worse_than_the_grid_in_a_discovered_bandit():
-    bandit = open_bandit("Synthetic-Pendulum-v1")
+    bandit = load_bandit("Synthetic-Pendulum-v1")
     contexts = jnp.asarray(bandit_states(bandit, jax.random.key(1), 200))
     rewards = {}
     for method in ("gradient", "grid"):
@@ -59,7 +59,7 @@ def test_gradient_is_no_worse_than_the_grid_in_a_discovered_bandit():
 
 
 def test_discrete_optimum_is_the_argmax_over_all_actions():
-    bandit = open_bandit("Synthetic-Acrobot-v1")
+    bandit = load_bandit("Synthetic-Acrobot-v1")
     contexts = jnp.asarray(bandit_states(bandit, jax.random.key(1), 50))
 
     @jax.jit
@@ -81,7 +81,7 @@ def test_a_grid_too_large_and_an_unknown_method_are_refused():
 
 def test_optimal_policy_of_a_shipped_bandit_balances_the_pole():
     env, env_params = scb.make("CartPole-v1")
-    policy = optimal_policy(open_bandit("Synthetic-CartPole-v1"))
+    policy = optimal_policy(load_bandit("Synthetic-CartPole-v1"))
     returns = jax.jit(lambda k: evaluate(env, env_params, policy, k, 8).returns)(jax.random.key(3))
     assert float(jnp.median(returns)) == 500.0
 

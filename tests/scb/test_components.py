@@ -13,7 +13,7 @@ from scb.agents.spec import AgentSpec
 from scb.analysis import components
 from scb.analysis.components import ReplacedBandit, SACExpert
 from scb.environments.synthetic import BanditConfig, bandit_for
-from scb.environments.zoo import open_bandit
+from scb.environments.zoo import load_bandit
 
 SMALL = SACConfig(
     num_envs=1, prefill=8, total_steps=12, batch_size=4, buffer_size=16, hidden_sizes=(8,)
@@ -38,7 +38,7 @@ def cart():
 
 
 def test_contexts_come_from_the_states_that_are_given():
-    bandit = open_bandit("Synthetic-Pendulum-v1")
+    bandit = load_bandit("Synthetic-Pendulum-v1")
     states = np.arange(12.0).reshape(4, 3)
     replaced = ReplacedBandit(bandit, states=states)
     params = replaced.default_params
@@ -55,7 +55,7 @@ def test_contexts_come_from_the_states_that_are_given():
 
 
 def test_the_reward_is_what_is_given_and_contexts_stay():
-    bandit = open_bandit("Synthetic-Pendulum-v1")
+    bandit = load_bandit("Synthetic-Pendulum-v1")
     replaced = ReplacedBandit(bandit, reward=lambda o, a: o[0] + 10 * a[0])
     key = jax.random.key(1)
     observation, state = replaced.reset_env(key, replaced.default_params)

@@ -11,7 +11,8 @@ from scb.errors import UserError
 from scb.measurement import Place
 
 MODULE = """
-import gymnax
+import gymnax, jax.numpy as jnp
+from gymnax.environments import spaces
 from gymnax.environments.classic_control.pendulum import Pendulum
 
 def alone():
@@ -27,6 +28,27 @@ def with_physics(backend="hard"):
 
 def pole():
     return gymnax.make("CartPole-v1")
+
+class OtherObservations(Pendulum):
+    def observation_space(self, params):
+        return spaces.Box(-1.0, 1.0, (4,))
+
+class OtherActions(Pendulum):
+    def action_space(self, params=None):
+        return spaces.Tuple([spaces.Discrete(2), spaces.Discrete(3)])
+
+class OlderStep(Pendulum):
+    def step(self, *arguments):
+        observation, state, reward, terminated, truncated, info = super().step(*arguments)
+        return observation, state, reward, terminated | truncated, info
+
+class ManyRewards(Pendulum):
+    def step_env(self, *arguments):
+        observation, state, reward, *others = super().step_env(*arguments)
+        return observation, state, jnp.full(2, reward), *others
+
+def endless():
+    return Pendulum(), {"g": 10.0}
 
 def wrong():
     return "a pendulum"
@@ -77,6 +99,14 @@ def test_the_physics_that_a_factory_takes_is_part_of_the_place(module):
         ("nowhere.at_all:make", "cannot be imported .No module named 'nowhere'"),
         ("{}:other", "cannot be imported .*has no attribute 'other'"),
         ("{}_broken:make", "cannot be imported .No module named 'nothing_of_this_name'"),
+        (
+            "{}:OtherObservations",
+            r"shape \(3,\) from reset, where its observation_space says \(4,\)",
+        ),
+        ("{}:OtherActions", "has a Tuple of actions: one Box or Discrete is understood"),
+        ("{}:OlderStep", "returns 5 values of a step, where gymnax 1.x returns"),
+        ("{}:ManyRewards", r"rewards of shape \(2,\)"),
+        ("{}:endless", "without max_steps_in_episode"),
         ("{}:wrong", "returned a str: it must return a gymnax"),
         ("{}:number", "does not take"),
     ],

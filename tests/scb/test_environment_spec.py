@@ -8,13 +8,13 @@ from scb.discovery import BanditDiscovery, DiscoveryConfig
 from scb.environments import returns
 from scb.environments.registry import environment_names, environment_spec, make
 from scb.environments.returns import random_return
-from scb.environments.zoo import bandit_metadata, open_bandit, save_bandit, zoo_names
+from scb.environments.zoo import bandit_metadata, load_bandit, save_bandit, zoo_names
 from scb.errors import UserError
 
 
 def saved(folder, config, name="mine", bandit="Synthetic-CartPole-v1"):
     """A bandit of the zoo under another name, with what its .json is to say of its environment."""
-    original = open_bandit(bandit)
+    original = load_bandit(bandit)
     metadata = dict(bandit_metadata(bandit)) | {"config": config}
     path = save_bandit(folder / f"{name}.npz", original, original.default_params.weights, metadata)
     return str(path)

@@ -1,5 +1,7 @@
 """Gymnasium's environments do what the JAX ones do, keep its contract, and reset as they say."""
 
+import copy
+import pickle
 import subprocess
 import sys
 import warnings
@@ -15,7 +17,7 @@ import scb
 from scb.environments.in_numpy import InNumpy
 from scb.environments.synthetic import LATENTS, BanditConfig, SyntheticBandit
 from scb.environments.synthetic_mdp import synthetic_for
-from scb.environments.zoo import open_bandit, zoo_names
+from scb.environments.zoo import load_bandit, zoo_names
 from scb.errors import UserError
 from scb.gymnasium import SyntheticEnv, SyntheticVectorEnv
 
@@ -59,7 +61,7 @@ def actions_of(space, number, seed=0):
 
 @pytest.mark.parametrize("name", zoo_names())
 def test_a_bandit_in_numpy_says_what_it_says_in_jax(name):
-    bandit = open_bandit(name)
+    bandit = load_bandit(name)
     functions, params = InNumpy(bandit), bandit.default_params
     latents = np.random.default_rng(1).normal(size=(50, bandit.latent_size)).astype(np.float32)
     contexts = jax.vmap(bandit.context, (0, None))(latents, params)
@@ -145,7 +147,7 @@ def test_a_module_in_the_name_is_all_that_has_to_be_imported():
 @pytest.mark.parametrize("name", zoo_names())
 def test_a_single_step_pays_what_many_together_pay(name):
     env = gymnasium.make(f"scb/{name}").unwrapped
-    functions = InNumpy(open_bandit(name))
+    functions = InNumpy(load_bandit(name))
     actions = actions_of(env.action_space, 300)  # more than are drawn together
     observations, rewards = [], []
     env.reset(seed=4)
@@ -252,6 +254,26 @@ def test_a_seed_decides_the_contexts_whatever_was_drawn_before():
         assert len({tuple(x) for x in drawn[0]}) == 301
 
 
+@pytest.mark.parametrize(
+    "name", ["Synthetic-Pendulum-v1", "Synthetic-CartPole-v1", "Synthetic-hopper"]
+)
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
+def test_a_copy_goes_on_as_its_original_would(name, copied):
+    env = gymnasium.make(f"scb/{name}")
+    env.reset(seed=3)
+    env.action_space.seed(3)
+    for _ in range(2):
+        env.step(env.action_space.sample())
+        env.reset()
+    other = copied(env)
+    for _ in range(3):
+        action = env.action_space.sample()
+        (observation, *ours), (copy_, *theirs) = env.step(action), other.step(action)
+        np.testing.assert_array_equal(observation, copy_)
+        assert ours == theirs
+        np.testing.assert_array_equal(env.reset()[0], other.reset()[0])
+
+
 def test_what_a_caller_does_to_an_observation_is_his_own_matter():
     env = gymnasium.make(BANDIT).unwrapped
     first, _ = env.reset(seed=3)
@@ -341,7 +363,7 @@ def test_many_bandits_step_together():
     observations, _ = envs.reset(seed=0)
     actions = envs.action_space.sample()
     after, rewards, terminated, truncated, infos = envs.step(actions)
-    alone = InNumpy(open_bandit("Synthetic-Pendulum-v1")).step(observations, actions)
+    alone = InNumpy(load_bandit("Synthetic-Pendulum-v1")).step(observations, actions)
     np.testing.assert_allclose(rewards, alone[1], rtol=1e-5)
     assert terminated.all() and not truncated.any()
     np.testing.assert_array_equal(np.stack(infos["final_obs"]), observations)

@@ -21,7 +21,7 @@ from scb.environments.synthetic_mdp import (
     SyntheticMDP,
     synthetic_for,
 )
-from scb.environments.zoo import load, load_bandit, save_bandit
+from scb.environments.zoo import load_bandit, load_synthetic, save_bandit
 from scb.errors import UserError
 from scb.evaluation import evaluate
 from tests.scb.probes import Corridor
@@ -512,7 +512,7 @@ def test_a_saved_t_starts_in_the_same_physics_of_brax(tmp_path):
     config = MDPConfig(**SMALL, parameterization="T", max_steps=7)
     mdp = SyntheticMDP(4, env.action_space(), config, env=env)
     weights = mdp.init_weights(jax.random.key(1))
-    loaded = load(save_bandit(tmp_path / "a.npz", mdp, weights, METADATA))
+    loaded = load_synthetic(save_bandit(tmp_path / "a.npz", mdp, weights, METADATA))
     assert isinstance(loaded, SyntheticMDP) and loaded.env == env
 
 
@@ -523,7 +523,7 @@ def test_a_t_is_made_again_by_the_name_that_the_metadata_gives(tmp_path):
         saved(tmp_path, "T", name)
     metadata = {**METADATA, "config": {"evaluation_environment": name}}
     path, original, _ = saved(tmp_path, "T", name, metadata=metadata)
-    assert isinstance(load(path).env, type(original.env))
+    assert isinstance(load_synthetic(path).env, type(original.env))
 
 
 def test_a_t_whose_evaluation_environment_would_not_come_back_is_not_written(tmp_path):
@@ -539,7 +539,7 @@ def test_a_t_whose_evaluation_environment_would_not_come_back_is_not_written(tmp
 def test_a_bandits_file_opens_as_a_bandit_and_an_mdps_does_not(tmp_path):
     bandit = SyntheticBandit(3, BOX, BanditConfig(**SMALL))
     path = save_bandit(tmp_path / "b.npz", bandit, bandit.init_weights(jax.random.key(0)), METADATA)
-    assert isinstance(load(path), SyntheticBandit)
+    assert isinstance(load_synthetic(path), SyntheticBandit)
     assert isinstance(make(str(path))[0], SyntheticBandit)
     with pytest.raises(UserError, match="is a synthetic_mdp: give a bandit here"):
         load_bandit(saved(tmp_path)[0])
@@ -549,7 +549,7 @@ def test_an_artefact_that_is_no_environment_is_refused(tmp_path):
     metadata = {**METADATA, "kind": "drift", "config": {}}
     path = artefacts.save(tmp_path / "a.npz", {"x": np.zeros(2)}, metadata)
     with pytest.raises(UserError, match="is a drift: give a bandit or synthetic_mdp here"):
-        load(path)
+        load_synthetic(path)
 
 
 @pytest.mark.parametrize(
@@ -569,15 +569,15 @@ def test_a_description_that_is_no_mdps_is_refused(tmp_path, change):
     path, *_ = saved(tmp_path, "T")
     edit(path, change)
     with pytest.raises(UserError, match=r"Synthetic-Test\.npz does not describe a synthetic MDP"):
-        load(path)
+        load_synthetic(path)
 
 
 def test_weights_of_another_parameterization_or_architecture_are_refused(tmp_path):
     path, *_ = saved(tmp_path, "T")
     edit(path, lambda config: config["mdp"].update(parameterization="TI"))
     with pytest.raises(UserError, match="has no array 'initial_state/"):
-        load(path)
+        load_synthetic(path)
     path, *_ = saved(tmp_path, "TI")
     edit(path, lambda config: config["mdp"].update(hidden_size=5))
     with pytest.raises(UserError, match=r"has shape \(4,\) where \(5,\) is expected"):
-        load(path)
+        load_synthetic(path)

@@ -16,7 +16,6 @@ from scb.environments.zoo import (
     PREFIX,
     bandit_metadata,
     load_bandit,
-    open_bandit,
     save_bandit,
     zoo_names,
 )
@@ -130,10 +129,23 @@ def test_a_foreign_file_is_refused(tmp_path):
 
 def test_a_bandit_opens_by_file_or_by_name(tmp_path):
     path, _ = saved(tmp_path, BANDITS["box"])
-    assert open_bandit(str(path)).name == "Synthetic-Test"
+    assert load_bandit(str(path)).name == "Synthetic-Test"
+    assert load_bandit(zoo_names()[0]).name == zoo_names()[0]
     assert scb.make(path)[0].name == "Synthetic-Test"
     with pytest.raises(UserError, match="unknown bandit 'Pendulum': did you mean Synthetic-P"):
-        open_bandit("Pendulum")
+        load_bandit("Pendulum")
+    with pytest.raises(UserError, match=rf"is a folder: give .* such as {path}"):
+        load_bandit(tmp_path)
+
+
+def test_a_bandit_is_saved_with_what_there_is_to_tell(tmp_path):
+    bandit = BANDITS["box"]
+    path = save_bandit(
+        tmp_path / "Synthetic-Test.npz", bandit, bandit.init_weights(jax.random.key(0))
+    )
+    metadata = bandit_metadata(path)
+    assert metadata["results"] == metadata["cost"] == metadata["seeds"] == {}
+    assert load_bandit(path).observation_size == bandit.observation_size
 
 
 # -- what ships
