@@ -171,7 +171,7 @@ def distill_command(
     print(f"objective: {path}")
 
 
-def certify_command(objective: str) -> None:
+def certify_command(objective: tyro.conf.Positional[str]) -> None:
     """Check that an objective is a drift, and lets policies move: its conditions and its slope on a dense grid.
 
     Learned drifts and formulas meet the conditions of mirror learning by construction; of those look at

@@ -29,7 +29,7 @@ pytestmark = pytest.mark.usefixtures("working_folder", "no_training")
         ("evaluate --objectives ppo dop", "unknown objective 'dop': did you mean dpo?"),
         ("meta-train --drift netwrok", "unknown learned drift 'netwrok': did you mean network?"),
         ("meta-train --drift dpo", "unknown learned drift 'dpo': "),
-        ("certify --objective dop", "unknown objective 'dop': did you mean dpo?"),
+        ("certify dop", "unknown objective 'dop': did you mean dpo?"),
         ("run --objective dop", "unknown objective 'dop': did you mean dpo?"),
         ("meta-train --strategy Open_SE", "unknown evolution strategy 'Open_SE': did you mean Op"),
         ("run --preset quik", "unknown preset 'quik': did you mean quick"),
@@ -110,7 +110,7 @@ def test_a_number_out_of_range_is_told_its_range(refused, arguments, message):
         ("evaluate --objectives", "no objectives: give at least one"),
         ("evaluate --objectives ppo ppo", "objective 'ppo' is there twice"),
         ("run --objective ppo", "objective 'ppo' is there twice"),
-        ("certify --objective missing.npz", "missing.npz does not exist"),
+        ("certify missing.npz", "missing.npz does not exist"),
     ],
 )
 def test_what_does_not_go_together_is_refused(refused, arguments, message):
@@ -144,14 +144,14 @@ def test_bandits_and_objectives_do_not_stand_in_for_each_other(
     assert "is a drift: give a bandit or synthetic_mdp here" in message
 
 
-@pytest.mark.parametrize("command", ["certify", "train", "run"])
+@pytest.mark.parametrize("command", [["certify"], ["train", "--objective"], ["run", "--objective"]])
 def test_weights_of_another_shape_are_refused(refused, working_folder, objective_file, command):
     path = working_folder / "other.npz"
     path.write_bytes(objective_file.read_bytes())
     metadata = json.loads(objective_file.with_suffix(".json").read_text())
     metadata["config"]["drift"]["hidden_size"] = 8
     path.with_suffix(".json").write_text(json.dumps(metadata))
-    message = refused(command, "--objective", path)
+    message = refused(*command, path)
     assert "has shape (8, 4) where (8, 8) is expected" in message
 
 
@@ -301,7 +301,7 @@ def test_what_cannot_be_parsed_is_a_mistake_too(arguments, capsys):
         ),
         ("lpo", "train", ["--environment", "--objective", "--steps", "--seeds", "--out"]),
         ("lpo", "evaluate", ["--environment", "--objectives", "--seeds", "--backend"]),
-        ("lpo", "certify", ["--objective"]),
+        ("lpo", "certify", ["path.npz"]),
         ("scb", "", ["discover", "train", "list", "import-published"]),
         ("scb", "discover", ["--environment", "--init", "--strategy", "--resume"]),
         ("scb", "discover", ["--algorithms", "--mode", "--parameterization", "--curriculum"]),

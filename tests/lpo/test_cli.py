@@ -111,7 +111,7 @@ def test_a_bug_is_not_dressed_up_as_a_mistake(monkeypatch):
 
     monkeypatch.setattr(commands, "load_objective", broken)
     with pytest.raises(ValueError, match="a bug") as error:
-        cli.main(["certify", "--objective", "ppo"])
+        cli.main(["certify", "ppo"])
     assert not isinstance(error.value, UserError)
 
 
@@ -119,7 +119,7 @@ def test_a_bug_is_not_dressed_up_as_a_mistake(monkeypatch):
 
 
 def test_certify_says_what_it_found(capsys):
-    assert cli.main(["certify", "--objective", "ppo-0.3"]) == 0
+    assert cli.main(["certify", "ppo-0.3"]) == 0
     assert capsys.readouterr().out.startswith("ppo-0.3 is a drift: min f 0,")
 
 
@@ -130,7 +130,7 @@ def test_certify_exits_with_one_where_the_conditions_fail(monkeypatch, capsys):
 
     monkeypatch.setattr(commands, "load_objective", lambda name: Objective(name, Bias(), ()))
     with pytest.raises(SystemExit) as stop:
-        cli.main(["certify", "--objective", "mine"])
+        cli.main(["certify", "mine"])
     assert stop.value.code == 1
     assert capsys.readouterr().out.startswith("mine is NOT a drift: min f 1, at ratio 1 |f| 1")
 
@@ -139,7 +139,7 @@ def test_certify_exits_with_one_where_a_drift_holds_policies_still(monkeypatch, 
     barrier = closed_form("mine", ClosedFormDrift("0.2*abs(log_r)"))
     monkeypatch.setattr(commands, "load_objective", lambda name: barrier)
     with pytest.raises(SystemExit) as stop:
-        cli.main(["certify", "--objective", "mine"])
+        cli.main(["certify", "mine"])
     assert stop.value.code == 1
     assert "is a drift whatever its weights, but one that MAY HOLD" in capsys.readouterr().out
 
