@@ -27,7 +27,7 @@ from scb.agents.spec import AgentSpec, bandit_agent, environment_agent
 from scb.environments.registry import environment_spec
 from scb.rows import Rows, pivot
 from scb.seeds import REPORTING
-from scb.statistics import estimate
+from scb.statistics import DECIDING, estimate
 
 OURS, PUBLISHED = "ours", "published"
 LOOKS: dict[str, dict[str, Any]] = {
@@ -244,10 +244,12 @@ def facts(report: Report) -> dict[str, Any]:
     for of_all in (report["bandits"], report["environments"]):
         lost += sum(x.get("failed", 0) for by in of_all.values() for x in by.values())
     found = matches(report)
+    told = [row for row in found if row["agents"] >= DECIDING]
     return {
         "finals": rows,
         "matches": found,
-        "ordered": sorted(found, key=lambda row: _ratio(row, row["steps"])),
+        "deciding": DECIDING,
+        "ordered": sorted(told, key=lambda row: _ratio(row, row["steps"])),
         "times": _times,
         "least_times": LEAST_TIMES,
         "short": [f"{x['bandit']}, {x['algorithm'].upper()}" for x in found if x["steps"] is None],

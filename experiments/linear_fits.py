@@ -129,14 +129,10 @@ def claims(report: Report) -> list[Claim]:
     found = []
     for environment, entry in report["environments"].items():
         for (expert, contexts), (other, others), text in (
-            (NOW, BEFORE, "errors and jitter earn PPO's agents more than noise"),
-            (NOW, (BEFORE[0], NOW[1]), "errors earn them more than noise in jittered contexts"),
-            (NOW, (NOW[0], BEFORE[1]), "under errors jitter earns them more"),
-            (
-                NOW,
-                ("no errors", NOW[1]),
-                "errors earn them more than no errors in jittered contexts",
-            ),
+            (NOW, BEFORE, "with errors and jitter than with noise"),
+            (NOW, (BEFORE[0], NOW[1]), "with errors than with noise, both with jitter"),
+            (NOW, (NOW[0], BEFORE[1]), "with jitter than without, both with errors"),
+            (NOW, ("no errors", NOW[1]), "with errors than without, both with jitter"),
         ):
             seeds = sorted(entry[expert].keys() & entry[other].keys())
             evidence = None
@@ -144,7 +140,7 @@ def claims(report: Report) -> list[Claim]:
                 ours = earned(entry, expert, contexts, "ppo", seeds)
                 theirs = earned(entry, other, others, "ppo", seeds)
                 evidence = of_searches(ours, theirs, paired=True)
-            found.append(Claim(f"{environment}: {text}", evidence, places=0))
+            found.append(Claim(f"{environment}: PPO's agents earn more {text}", evidence, places=0))
     return found
 
 

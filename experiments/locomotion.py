@@ -203,6 +203,25 @@ def confirmed(report: Report) -> list[tuple[Confirmation, int, Judged | None]]:
     return found
 
 
+def _since(report: Report, asked: Confirmation) -> tuple[list[int], Estimate] | None:
+    """(seeds, difference) of the pairs that were trained after those of a confirmation; None where they are few."""
+    entry = looked_at(report)[asked.environment]
+    last = max(asked.seeds)
+    later = {
+        name: {
+            seed: agent for seed, agent in entry["agents"].get(name, {}).items() if int(seed) > last
+        }
+        for name in (REFERENCE, asked.objective)
+    }
+    shared = sorted(set.intersection(*map(set, later.values())), key=int)
+    if len(shared) < DECIDING:
+        return None
+    reference, curves = as_comparison(asked.environment, {**entry, "agents": later}).curves
+    found = paired(curves, reference, asked.of)
+    assert callable(found)
+    return [int(seed) for seed in shared], found()
+
+
 def facts(report: Report) -> dict[str, Any]:
     """The curves by environment."""
     comparisons = {name: as_comparison(name, entry) for name, entry in looked_at(report).items()}
@@ -210,7 +229,11 @@ def facts(report: Report) -> dict[str, Any]:
         "comparisons": comparisons,
         "deciding": DECIDING,
         "learned_here": _learned_here(comparisons),
-        "confirmations": [(asked, ASKED[asked.of], *rest) for asked, *rest in confirmed(report)],
+        "confirmations": [
+            (asked, ASKED[asked.of], pairs, judged, judged and _since(report, asked))
+            for asked, pairs, judged in confirmed(report)
+        ],
+        "asked": ASKED,
         "sweeps": {
             name: (sweep, len(entry["sweep"][REFERENCE]), tuned(sweep))
             for name, entry in report["environments"].items()

@@ -8,7 +8,7 @@ import jinja2
 import numpy as np
 from numpy.typing import NDArray
 
-from experiments.claims import UNDECIDED, UNTESTED
+from experiments.claims import FAILS, HOLDS, OUTCOMES, UNDECIDED, UNTESTED, Judged
 from scb.plotting import thousands
 from scb.statistics import Estimate, estimate
 
@@ -82,6 +82,21 @@ def said(outcome: str) -> str:
     return f"{'is ' if outcome in (UNDECIDED, UNTESTED) else ''}*{outcome}*"
 
 
+def told(judged: Sequence[Judged]) -> str:
+    """What becomes of the parts of a claim, as in "of its 6 parts 1 is undecided; 5 hold: A; B; ..."."""
+    words = {HOLDS: ("holds", "hold"), FAILS: ("does not hold", "do not hold")}
+    found = []
+    for outcome in OUTCOMES[::-1]:
+        texts = [x.claim.text for x in judged if x.outcome == outcome]
+        if texts:
+            word = words.get(outcome, (f"is {outcome}", f"are {outcome}"))[len(texts) > 1]
+            which = f": {'; '.join(texts)}" if outcome in words else ""
+            found.append(f"{len(texts)} {word}{which}")
+    if len(found) == 1:
+        return f"of its parts all {found[0]}."
+    return f"of its {len(judged)} parts {'; '.join(found)}."
+
+
 def algorithms(names: Sequence[str], otherwise: str = "all of the paper's algorithms") -> str:
     """Such as "PPO, SAC"; a plan's empty list stands for all."""
     return ", ".join(name.upper() for name in names) or otherwise
@@ -108,6 +123,7 @@ ENVIRONMENT.filters |= {
     "spaced": lambda x: f"{x:,}".replace(",", " "),
     "span": span,
     "text": text,
+    "told": told,
 }
 
 

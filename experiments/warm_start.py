@@ -40,7 +40,10 @@ ARMS: dict[str, dict[str, Any]] = {
 
 
 def markdown(report: Mapping[str, Any]) -> str:
-    """A table, one row an environment and algorithm, one column a construction; the best in bold."""
+    """A table, one row an environment and algorithm, one column a construction; the best in bold, where it is apart.
+
+    That is, where its interval is above those of all other rewards; that of stretched states is none.
+    """
     lines = [
         "| environment (expert) | algorithm | " + " | ".join(ARMS) + " |",
         "| --- | --- |" + " --- |" * len(ARMS),
@@ -52,6 +55,13 @@ def markdown(report: Mapping[str, Any]) -> str:
                 continue
             iqms = {arm: arms[arm][algorithm]["mode_actions"]["iqm"] for arm in ARMS}
             best = max(iqms, key=lambda arm: iqms[arm]["value"])
+            others = [
+                x
+                for arm, x in iqms.items()
+                if ARMS[arm]["construction"] != ARMS[best]["construction"]
+            ]
+            if iqms[best]["low"] <= max(x["high"] for x in others):
+                best = ""
             cells = [f"**{text(x)}**" if arm == best else text(x) for arm, x in iqms.items()]
             environment = f"{name} ({number(result['expert_return'])})"
             lines.append(f"| {environment} | {algorithm.upper()} | {' | '.join(cells)} |")

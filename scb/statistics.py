@@ -17,6 +17,7 @@ from scb.errors import UserError
 
 # A group's resamples are drawn in batches of about this many numbers (80 MB), however many runs it has.
 _NUMBERS_PER_BATCH = 10_000_000
+PERCENTILES = 0.95  # confidence beyond which they are not the resamples'
 DECIDING = 10  # agents; of fewer a bootstrap's interval is too narrow to decide anything
 
 Statistic = Callable[..., NDArray[np.floating]]
@@ -279,13 +280,19 @@ def _bootstrapped(
     num_resamples: int = 10_000,
     seed: int = 0,
 ) -> Estimate:
-    """A statistic with its interval by the percentile bootstrap.
+    """A statistic with its interval: the percentile bootstrap's up to 95 %, beyond it Student's t.
 
     The percentile method and not BCa: the literature that reports IQMs uses it, it stays defined
     where BCa divides by zero (constant runs get an interval of width zero), and for the IQM of 5,
     10 or 20 normal, log-normal or bimodal runs it covered the true value at least as often
     (0.83 to 0.94 for a nominal 0.95; 600 simulations each). Both are too narrow for few runs: with
     5 runs read "95 %" as about 90 %.
+
+    Of higher confidence, as many comparisons ask for, percentiles are no matter of taste: no resample lies beyond the
+    worst of few runs. For a difference of two IQMs of 5 runs without any they left it out in 6 to 7 % where 0.17 %
+    were asked for, of 10 runs in 1 %. With the resamples' deviation (times sqrt(n / (n - 1)), which they lack) and
+    Student's t of n - 1 degrees, n being the smallest group, it was 0 to 0.3 % of 5 to 50 normal, log-normal or
+    bimodal runs, and below 1.2 % for 1 % (1500 simulations each).
 
     Args:
       statistic: rows -> [R] values, where rows(size) are [R, size] indices of runs.
@@ -302,8 +309,14 @@ def _bootstrapped(
         statistic(partial(_drawn, generator, min(batch, num_resamples - done)))
         for done in range(0, num_resamples, batch)
     ]
+    resampled = np.concatenate(found)
+    if confidence > PERCENTILES:
+        fewest = min(sizes)
+        deviation = resampled.std() * math.sqrt(fewest / (fewest - 1))
+        half = float(deviation * scipy.stats.t.ppf((1.0 + confidence) / 2.0, fewest - 1))
+        return Estimate(value, value - half, value + half, n)
     tail = 50.0 * (1.0 - confidence)
-    low, high = np.percentile(np.concatenate(found), [tail, 100.0 - tail])
+    low, high = np.percentile(resampled, [tail, 100.0 - tail])
     return Estimate(value, float(low), float(high), n)
 
 

@@ -23,6 +23,8 @@ def test_the_best_construction_is_in_bold():
         "**−125 [−135, −115]**",
         "−166 [−176, −156]",
     ]
+    assert "**" not in warm_start.markdown(report([-140.0, -146.0, -125.0, -166.0]))
+    assert "**" in warm_start.markdown(report([-146.0, -146.0, -125.0, -126.0]))  # stretched alone
 
 
 def test_the_committed_table_is_that_of_the_committed_report():

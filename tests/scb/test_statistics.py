@@ -289,6 +289,18 @@ def test_few_groups_leave_the_truth_out_no_more_often_than_they_say(confidence, 
     assert outside <= scipy.stats.binom.ppf(0.999, number, 1 - confidence)
 
 
+@pytest.mark.parametrize("paired", [True, False])
+def test_few_runs_leave_the_truth_out_no_more_often_than_a_high_confidence_says(paired):
+    generator, number, confidence = np.random.default_rng(0), 300, 0.99
+    outside = 0
+    for _ in range(number):
+        ours, theirs = generator.normal(size=(2, 1, 10 if paired else 5))
+        found = stratified_estimate(ours, theirs, confidence, paired=paired)
+        outside += not found.low <= 0.0 <= found.high
+    # Of percentiles it would be about 8 and 21.
+    assert outside <= scipy.stats.binom.ppf(0.95, number, 1 - confidence)
+
+
 def test_a_group_that_fails_counts_in_full():
     groups = [[0.0, 0.0]] * 4 + [[-100.0, -100.0]]
     found = few_groups_difference(groups, [[0.0, 0.0]])
