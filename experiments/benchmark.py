@@ -39,7 +39,7 @@ from experiments.harness import Experiment, Save, bandit_of
 from scb.agents.spec import bandit_agent
 from scb.artefacts import flatten
 from scb.environments.zoo import space_description
-from scb.errors import unknown_name
+from scb.errors import one_of
 from scb.evolution import map_population
 from scb.keys import named_key, root_key, split_key
 from scb.statistics import Estimate, estimate
@@ -255,8 +255,7 @@ def measure(options: Options, report: dict[str, Any], save: Save) -> None:
     """An algorithm at a time, here and there."""
     names = options.algorithms.split(",")
     for name in names:
-        if name not in TASKS:
-            raise unknown_name("algorithm", name, list(TASKS))
+        one_of("algorithm", name, TASKS)
     print(f"Training for {options.steps} steps in the bandit; median seconds an agent.")
     print(f"Return in the real environment: IQM [95 %] of agents, {EPISODES} episodes each.\n")
     print(line("algorithm", THIS, PEER, "ratio", f"return, {THIS}", f"return, {PEER}"), flush=True)

@@ -14,6 +14,7 @@ import sys
 import time
 import tomllib
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass, field, make_dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -34,7 +35,7 @@ from scb.environments.synthetic import SyntheticBandit
 from scb.environments.zoo import bandit_metadata, load_bandit, zoo_names
 from scb.errors import UserError
 from scb.files import make_folder, write_json
-from scb.runs import grown
+from scb.runs import grown, held
 
 CLASSIC_CONTROL = tuple(sorted(families()["classic"].suite))
 DATA = Path("docs/data")
@@ -193,12 +194,15 @@ class Experiment:
         # What is measured elsewhere leaves the documentation's page as it is.
         docs = files.docs or (DOCS if files.out is None else out.parent)
         make_folder(docs, "--docs")
-        report = read(out, missing_is_new=not files.only_render, keys=self.keys)
-        if report and report.get("experiment") != self.name:
-            raise UserError(f"{out} is no report of {self.name}: choose another --out.")
         if not files.only_render:
             make_folder(out.parent)
-            self._measure(options, report, out, jobs)
+        # Two that measure would each save what they have, and not what the other has.
+        with nullcontext() if files.only_render else held(out):
+            report = read(out, missing_is_new=not files.only_render, keys=self.keys)
+            if report and report.get("experiment") != self.name:
+                raise UserError(f"{out} is no report of {self.name}: choose another --out.")
+            if not files.only_render:
+                self._measure(options, report, out, jobs)
         self.render(report, docs)
         return 0
 

@@ -125,7 +125,7 @@ def tuned(sweep: Mapping[str, float]) -> str | None:
 def _trained(
     environment: str, objective: str, seeds: list[int], runs: Path, place: str
 ) -> dict[str, Any]:
-    rows = Rows(runs / environment / f"{objective}-{seeds[0]}.rows.jsonl")
+    rows = Rows(runs / environment / f"{Path(objective).name}-{seeds[0]}.rows.jsonl")
     (found,) = compare(
         environment,
         [load_objective(objective)],
@@ -183,7 +183,7 @@ def _claim(curves: LearningCurves, reference: LearningCurves, of: str) -> Claim:
     text = f"{curves.environment}: {curves.objective} {ASKED[of]}"
     if of == "area":
         return Claim(text, paired(curves, reference, of), places=0)
-    margin = round(MARGIN * abs(float(getattr(reference, of).mean())), 1)
+    margin = float(f"{MARGIN * abs(float(getattr(reference, of).mean())):.4g}")
     reason = "a twentieth of what PPO's clip earns"
     return Claim(text, paired(curves, reference, of), 0.0, margin, reason, places=0)
 

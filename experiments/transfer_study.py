@@ -28,7 +28,7 @@ from lpo.comparison import compare, ppo_spec
 from lpo.objectives import Objective, load_objective
 from lpo.suite import suite
 from scb.environments.registry import environment_spec
-from scb.errors import unknown_name
+from scb.errors import one_of
 from scb.plotting import BLUE, GREY, VERMILLION, estimate_row
 from scb.rows import Rows
 from scb.seeds import REPORTING
@@ -198,8 +198,7 @@ class Options:
 def parts(options: Options, report: dict[str, Any]) -> Iterator[Part]:
     """Objectives: each is learned, then judged where it is not yet; all have as many searches wherever it ends."""
     for name in options.variations:
-        if name not in VARIATIONS:
-            raise unknown_name("variation", name, list(VARIATIONS))
+        one_of("variation", name, VARIATIONS)
     searches = {"generations": options.generations, "population_size": options.population_size}
     settled(report, searches=searches)
     report["evaluations"] = [asdict(e) for e in EVALUATIONS]

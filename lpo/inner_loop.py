@@ -19,7 +19,7 @@ from scb.agents.spec import AgentSpec, check_lists, environment_agent
 from scb.command_line import listed, numbers, text
 from scb.environments.registry import check_backend, environment_spec
 from scb.environments.zoo import bandit_metadata
-from scb.errors import UserError, at_least, unknown_name
+from scb.errors import UserError, at_least, one_of
 from scb.evolution import EnvironmentSteps, EvolutionConfig
 from scb.keys import named_key, root_key, split_key
 from scb.lists import read_values, write_values
@@ -100,8 +100,7 @@ class MetaTrainingConfig:
     )
 
     def __post_init__(self) -> None:
-        if self.fitness not in FITNESSES:
-            raise unknown_name("fitness", self.fitness, FITNESSES)
+        one_of("fitness", self.fitness, FITNESSES)
         at_least(1, self.evolution, "num_generations")
         tasks: Any = self.tasks
         if isinstance(tasks, str):
@@ -178,7 +177,7 @@ def task_agent(task: str, contexts: int) -> AgentSpec:
     """PPO as the evaluation environment has it, or on a bandit its image (`AgentSpec.on_bandit`)."""
     place = environment_spec(task)
     spec = environment_agent("ppo", place.evaluation_environment)
-    return spec.on_bandit(contexts) if place.synthetic else spec
+    return spec.on_bandit(contexts) if place.is_bandit else spec
 
 
 class TaskTraining:

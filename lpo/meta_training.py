@@ -128,7 +128,7 @@ def learn_objective(
     mean = None
     if not processes.told(_learned(path, config)):
         outcome = evolve(problem, config.evolution, run)
-        run.close()
+        run.end_log()
         outcome.check(best=bool(config.validation))
         mean = outcome.best_mean if config.validation else outcome.mean
         story = _story(problem, outcome, mean, command)

@@ -93,14 +93,19 @@ def check_names(objectives: Sequence[Objective]) -> None:
 
 
 def load_apart(names: Sequence[str]) -> list[Objective]:
-    """Objectives by what `load_objective` takes, with names of their own: files of one name go by what was typed.
+    """Objectives by what `load_objective` takes, with names of their own.
 
-    Every `lpo meta-train` writes an objective.npz.
+    Every `lpo meta-train` writes an objective.npz, which goes by its folder's name (`run_name`). Other files of one
+    name go by what was typed.
 
     Raises:
       UserError: as for `load_objective`, or one stands there twice.
     """
     loaded = [load_objective(name) for name in names]
+    loaded = [
+        replace(x, name=run_name(Path(typed).resolve())) if typed.endswith(".npz") else x
+        for x, typed in zip(loaded, names, strict=True)
+    ]
     known = [objective.name for objective in loaded]
     loaded = [
         replace(objective, name=typed) if known.count(objective.name) > 1 else objective

@@ -130,9 +130,8 @@ def _in_torch(
 ) -> "torch.Tensor":
     import torch
 
-    result: torch.Tensor = _evaluate(
-        torch, drift, parameters, log_ratio, advantage.to(log_ratio), progress
-    )
+    advantage = advantage.to(log_ratio)
+    result: torch.Tensor = _evaluate(torch, drift, parameters, log_ratio, advantage, progress)
     return result
 
 
@@ -145,6 +144,7 @@ def _loss_in_torch(
 ) -> "torch.Tensor":
     import torch
 
+    advantage = advantage.to(log_ratio)
     penalty = _in_torch(drift, parameters, log_ratio, advantage, progress)
     result: torch.Tensor = _policy_loss(torch, penalty, log_ratio, advantage)
     return result

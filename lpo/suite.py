@@ -14,7 +14,7 @@ import numpy as np
 from lpo.comparison import Comparison, compare, ppo_spec
 from lpo.objectives import Objective, check_names
 from scb.environments.registry import environment_spec, families
-from scb.errors import UserError, unknown_name
+from scb.errors import UserError, one_of
 from scb.rows import Rows
 from scb.statistics import Estimate, iqm, normalized_score
 
@@ -32,8 +32,7 @@ def suites() -> dict[str, tuple[str, ...]]:
 
 def suite(name: str) -> tuple[str, ...]:
     """The environments of a suite: classic, minatar, brax or all."""
-    if name not in suites():
-        raise unknown_name("suite", name, suites())
+    one_of("suite", name, suites())
     return suites()[name]
 
 

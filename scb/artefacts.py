@@ -47,8 +47,8 @@ class Artefact:
 def save(path: str | Path, arrays: Mapping[str, Any], metadata: Mapping[str, Any]) -> Path:
     """Writes NAME.npz, then NAME.json, each all at once.
 
-    A reader never sees half a file. If the process dies between the two, the pair does not match
-    and `load` says so.
+    A reader never sees half a file, nor one of two with another's. If the process dies between the two, there is
+    no .json, and `load` says so.
 
     Args:
       path: NAME or NAME.npz in any folder, which is made if it is missing.
@@ -92,6 +92,7 @@ def save(path: str | Path, arrays: Mapping[str, Any], metadata: Mapping[str, Any
     schema.check(json_path, json.loads(text))
 
     npz_path.parent.mkdir(parents=True, exist_ok=True)
+    json_path.unlink(missing_ok=True)
     write_bytes(npz_path, data)
     write_bytes(json_path, (text + "\n").encode())
     return npz_path

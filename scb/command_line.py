@@ -8,7 +8,7 @@ import argparse
 import shlex
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, fields, is_dataclass
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar, Self, TypeVar, get_type_hints
 
@@ -19,7 +19,7 @@ from scb import processes
 from scb.artefacts import package_versions
 from scb.errors import UserError, one_of
 from scb.rows import Rows
-from scb.runs import Run, config_dict, read_config
+from scb.runs import Run, config_dict, read_config, released
 
 T = TypeVar("T")
 GENERATIONS = ("evolution.num_generations",)
@@ -154,7 +154,17 @@ class LongRun(ABC):
                 raise UserError(
                     f"--out is {out} and --resume {folder}: a resumed run goes on in its own folder; leave out --out."
                 )
-            arguments = [*cls._stored(folder), *arguments]
+            # Of several processes the first has the folder.
+            stored, refused = [], ""
+            if processes.first():
+                try:
+                    stored = cls._stored(folder)
+                except UserError as error:
+                    refused = str(error)
+            stored, refused = processes.told([stored, refused])
+            if refused:
+                raise UserError(refused)
+            arguments = [*stored, *arguments]
         given = flags_given(arguments, "preset", *cls.deciding)
         preset = given.get("preset", "quick")
         one_of("preset", preset, cls.presets)
@@ -193,8 +203,9 @@ class LongRun(ABC):
         return shlex.join([*self.program.split(), *words])
 
     def further(self) -> Iterator[str]:
-        """Flags of what a resumed run does after it, which is no part of what it finds."""
-        yield from ()
+        """Flags of what a resumed run does besides, or after it, which is no part of what it finds."""
+        if wandb := getattr(self.output, "wandb", None):
+            yield f"--wandb={wandb}"
 
     def open(self) -> Run:
         """The run folder, new or resumed."""
@@ -242,6 +253,13 @@ class Measuring(LongRun):
     output: Kept = field(default_factory=Kept)
     preset: tyro.conf.Suppress[str] = "quick"
 
+    @classmethod
+    def parse(cls, arguments: Sequence[str]) -> Self:
+        command = super().parse(arguments)
+        if command.output.resume is None:
+            return command
+        return replace(command, output=replace(command.output, out=None))  # which is the same
+
     def opened(self) -> tuple[Path | None, Rows]:
         """The folder of the results, and the rows in it; without a folder in memory."""
         if self.output == Kept():
@@ -277,7 +295,8 @@ def call(
             )
         if command.together and "--help" not in arguments:
             processes.start(others)
-        command.parse(arguments[1:]).run()
+        with released():
+            command.parse(arguments[1:]).run()
     else:
         tyro.cli(command, prog=f"{program} {name}", args=arguments[1:], config=_STYLE)
 

@@ -137,6 +137,7 @@ class Discover(LongRun):
         return {} if start is None else {start: bandit_metadata(start)["sha256"]}
 
     def further(self) -> Iterator[str]:
+        yield from super().further()
         yield from flags(self.judgement, Judgement())
 
     def run(self) -> None:
@@ -146,7 +147,7 @@ class Discover(LongRun):
         spec = environment_spec(config.environment)
         folder = self.open()
         outcome = problem.search(folder)
-        folder.close()
+        folder.end_log()
         outcome.check(best)
         weights = outcome.best_mean if best else outcome.mean
         results = {}

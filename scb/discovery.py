@@ -184,7 +184,7 @@ class DiscoveryConfig:
                 unused(
                     self.warm_start,
                     "the form linear is fitted in closed form, to the expert's actions alone",
-                    ("fit_steps", "num_actions", "near_actions"),
+                    ("fit_steps", "num_actions"),
                     networks,
                 )
         if self.refinement.rounds and self.bandit.form != "linear":

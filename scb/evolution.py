@@ -181,8 +181,8 @@ class Outcome:
             )
         if best and self.best_mean_generation < 0:
             raise UserError(
-                "all agents of every judgement diverged, so no mean is best: take the final one, or lower the "
-                "learning rates."
+                "more than a quarter of the agents of every judgement diverged, so no mean is best: take the final "
+                "one, or lower the learning rates."
             )
 
     def cost(self, problem: Problem, config: EvolutionConfig, best: bool) -> dict[str, Any]:
@@ -354,12 +354,12 @@ def evolve(
         # pairs.
         returns = judged(mean, key_mean)
         outcome = {name: float(np.mean(v)) for name, v in returns.items()}
-        # The interquartile mean too: of agents with random hyperparameters a few fail far below the rest, and
-        # those that diverged count as below the worst of the others.
+        # The interquartile mean too: of agents with random hyperparameters a few fail far below the rest. Those that
+        # diverged are the lowest, and where they are more than the quarter that it drops there is none.
         middles = {
             f"{name}_iqm": float(iqm(rank_failed_last(v)))
             for name, v in returns.items()
-            if np.isfinite(v).any()
+            if np.sum(~np.isfinite(v)) <= v.size // 4
         }
         score = middles.get("fitness_iqm", -np.inf)
         if score > float(state["best_mean_fitness"]):

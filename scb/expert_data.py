@@ -49,8 +49,6 @@ class DatasetConfig:
       discount: of the Q-function.
       num_states: states that the dataset holds.
       num_actions: actions that are tried in each of them, uniform but for the expert's.
-      near_actions: of those, how many lie about the expert's, with a standard deviation of 0.15 of
-        their range.
       horizon: steps after which a Monte-Carlo return is cut off.
     """
 
@@ -63,12 +61,11 @@ class DatasetConfig:
     discount: float = 0.95
     num_states: int = 4096
     num_actions: int = 16
-    near_actions: int = 0
     horizon: int = 100
 
     def __post_init__(self) -> None:
         one_of("warm-start construction", self.construction, CONSTRUCTIONS)
-        at_least(0, self, "min_spread", "jitter", "expert_noise", "expert_errors", "near_actions")
+        at_least(0, self, "min_spread", "jitter", "expert_noise", "expert_errors")
         at_least(1, self, "num_states", "horizon")
         # Of the expert's alone there would be no reward to tell from another.
         at_least(2, self, "num_actions")
@@ -82,11 +79,6 @@ class DatasetConfig:
             ("discount", "horizon") if distance else ("min_spread", "stretch", "jitter"),
             "take advantage or q" if distance else "take action_distance",
         )
-        if self.near_actions >= self.num_actions:
-            raise UserError(
-                f"near_actions is {self.near_actions} of {self.num_actions} actions, one of them the expert's: take "
-                f"at most {self.num_actions - 1}."
-            )
 
     @property
     def erring(self) -> bool:
@@ -182,18 +174,11 @@ def labelled(
     @jax.vmap
     def label(env_state: Any, observation: jax.Array, key: jax.Array) -> Any:
         key_random, key_follow = split_key(key)
-        key_near = named_key(key, "near")
         best = jnp.reshape(expert_policy(observation), space.shape)
         if isinstance(space, spaces.Discrete):
             actions = jnp.arange(space.n)
         else:
-            others = config.num_actions - 1
-            random = jax.vmap(space.sample)(split_key(key_random, others))
-            if config.near_actions:
-                about = noisy(expert.policy, space, 0.3)
-                near = jax.vmap(about, in_axes=(None, 0))(observation, split_key(key_near, others))
-                which = jnp.arange(others) < config.near_actions
-                random = jnp.where(jnp.expand_dims(which, range(1, random.ndim)), near, random)
+            random = jax.vmap(space.sample)(split_key(key_random, config.num_actions - 1))
             actions = jnp.concatenate([best[None], random])
         if config.construction == "action_distance":
             q = jnp.zeros(actions.shape[0])  # it only asks what the expert does

@@ -214,6 +214,8 @@ def measure(
 ) -> list[Row]:
     """Trains agents and judges them; what the rows hold already is not measured again.
 
+    Where some of those that train side by side lack, all of these are trained, and the others' rows stay.
+
     Args:
       spec: the agents' algorithm, configuration and hyperparameters.
       train_in, judge_in: where; judged where they train if left out.

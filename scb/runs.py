@@ -8,12 +8,13 @@ runs/NAME/checkpoints/      of `scb.checkpoints`
 runs/NAME/.lock             held by the process that writes here
 """
 
+import contextlib
 import json
 import os
 import secrets
 import socket
 import time
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import IO, Any
@@ -88,7 +89,7 @@ class Run:
                     "started with, or start a new folder."
                 )
             make_folder(folder, "--resume")
-            _lock(folder)
+            _lock(folder / _LOCK, folder)
             if stored != asked:
                 write_json(folder / "config.json", config)
             return cls(folder, resumed=True, wandb_project=wandb_project)
@@ -97,7 +98,7 @@ class Run:
                 f"{folder} already exists and is not empty: choose another --out, or continue it with --resume."
             )
         make_folder(folder)
-        _lock(folder)
+        _lock(folder / _LOCK, folder)
         try:
             write_json(folder / "config.json", config)
         except OSError as error:
@@ -162,14 +163,19 @@ class Run:
         lines = path.read_text().splitlines() if path.exists() else []
         return float(sum(json.loads(line)["seconds"] for line in lines))
 
-    def close(self) -> None:
+    def end_log(self) -> None:
+        """Closes what generations are logged to; the folder stays this process's."""
         if self._events is not None:
             self._events.close()
             self._events = None
         if self._wandb is not None:
             self._wandb.finish()
-        if held := _held.pop(self.folder.resolve(), None):
-            held.close()
+            self._wandb = None
+
+    def close(self) -> None:
+        """Ends the log, and lets go of the folder."""
+        self.end_log()
+        _release(self.folder / _LOCK)
 
 
 def _has_room(folder: Path) -> bool:
@@ -186,11 +192,43 @@ def _has_room(folder: Path) -> bool:
         return False
 
 
-def _lock(folder: Path) -> None:
-    """Holds a run folder for this process; the system lets go of it, however the process ends."""
-    if fcntl is None or folder.resolve() in _held:
+@contextlib.contextmanager
+def released() -> Iterator[None]:
+    """Lets go afterwards of the run folders that were opened within it, and not closed."""
+    before = {*_held}
+    try:
+        yield
+    finally:
+        for path in {*_held} - before:
+            _release(path)
+
+
+@contextlib.contextmanager
+def held(path: Path) -> Iterator[None]:
+    """Within it a file is this process's; a UserError where it is another's. A lock stands beside it meanwhile."""
+    lock = path.with_name(f".{path.name}{_LOCK}")
+    _lock(lock, path)
+    try:
+        yield
+    finally:
+        lock.unlink(missing_ok=True)
+        _release(lock)
+
+
+def _release(path: Path) -> None:
+    if file := _held.pop(path.resolve(), None):
+        file.close()
+
+
+def _lock(path: Path, of: Path) -> None:
+    """Holds a lock for this process; the system lets go of it, however the process ends.
+
+    Args:
+      of: what it is of, for the message.
+    """
+    if fcntl is None or path.resolve() in _held:
         return
-    file = (folder / _LOCK).open("a+")
+    file = path.open("a+")
     try:
         fcntl.lockf(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except (BlockingIOError, PermissionError) as error:
@@ -198,14 +236,14 @@ def _lock(folder: Path) -> None:
         holder = file.read().strip() or "which has just begun"
         file.close()
         raise UserError(
-            f"{folder} is in use by another command ({holder}): wait until it has ended, or choose another folder."
+            f"{of} is in use by another command ({holder}): wait until it has ended, or choose another."
         ) from error
     except OSError:
         pass  # a file system without locks
     file.truncate(0)
     file.write(f"process {os.getpid()} on {socket.gethostname()}\n")
     file.flush()
-    _held[folder.resolve()] = file
+    _held[path.resolve()] = file
 
 
 def read_config(folder: str | Path) -> dict[str, Any]:

@@ -193,10 +193,9 @@ def expert_agent(
     Raises:
       UserError: an expert that doesn't fit the action space, or steps that it can't be trained for.
     """
-    if isinstance(space, spaces.Discrete) and (config.erring or config.near_actions):
+    if isinstance(space, spaces.Discrete) and config.erring:
         raise UserError(
-            "expert_noise, expert_errors and near_actions are of continuous actions, and "
-            f"{name} has discrete ones: leave them out."
+            f"expert_noise and expert_errors are of continuous actions, and {name} has discrete ones: leave them out."
         )
     algorithm = _chosen(name, config)
     linear = algorithm in SEARCHES and SEARCHES[algorithm].linear

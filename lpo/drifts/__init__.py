@@ -17,7 +17,7 @@ from lpo.drifts.formula import ClosedFormDrift
 from lpo.drifts.known import ClipDrift, DPODrift, NoDrift
 from lpo.drifts.mirror import MirrorDrift
 from lpo.drifts.network import LearnedDrift
-from scb.errors import UserError, unknown_name
+from scb.errors import UserError, one_of
 
 DRIFTS: dict[str, type[Drift]] = {
     drift.name: drift
@@ -43,8 +43,7 @@ def learned_drift(name: str, **settings: Any) -> Drift:
       UserError: the family is unknown, does not learn, or has no such setting.
     """
     learned = {family: drift for family, drift in DRIFTS.items() if drift.learned}
-    if name not in learned:
-        raise unknown_name("learned drift", name, learned)
+    one_of("learned drift", name, learned)
     for setting in settings:
         if setting not in learned[name].settings():
             having = [family for family, drift in learned.items() if setting in drift.settings()]
@@ -62,6 +61,5 @@ def drift_from_config(config: Mapping[str, Any]) -> Drift:
       UserError: an unknown family, or numbers that make no drift.
     """
     name = config["family"]
-    if name not in DRIFTS:
-        raise unknown_name("drift", str(name), DRIFTS)
+    one_of("drift", name, DRIFTS)
     return DRIFTS[name].from_config(config)

@@ -12,7 +12,7 @@ import numpy as np
 
 from lpo.drifts.bases import BASES
 from scb.agents.ppo import relu
-from scb.errors import UserError, at_least, unknown_name
+from scb.errors import at_least, one_of, positive
 from scb.keys import root_key
 
 # Any: an array of JAX, NumPy or PyTorch; `xp` below is its library.
@@ -117,10 +117,8 @@ class CorrectedDrift(Drift):
 
     def __post_init__(self) -> None:
         at_least(0, self, "gate")
-        if self.base not in BASES:
-            raise unknown_name("drift base", self.base, BASES)
-        if not (self.clip > 0 and self.xi > 0):
-            raise UserError(f"clip and xi are {self.clip} and {self.xi}: both must be positive.")
+        one_of("drift base", self.base, BASES)
+        positive(clip=+self.clip, xi=+self.xi)  # + takes numbers alone
 
     @abstractmethod
     def correction(

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from lpo.drifts.bases import DPO_ALPHA, DPO_BETA, discovered_drift
 from lpo.drifts.contract import Array, Drift
 from scb.agents.ppo import clipped_surrogate_drift
-from scb.errors import UserError
+from scb.errors import positive
 from scb.keys import root_key
 
 
@@ -23,8 +23,7 @@ class ClipDrift(Drift):
     clip: float = 0.2
 
     def __post_init__(self) -> None:
-        if not self.clip > 0:
-            raise UserError(f"the clip epsilon is {self.clip}: it must be positive.")
+        positive(clip=+self.clip)  # + takes numbers alone
 
     def init(self, key: jax.Array, scale: float = 1.0) -> jax.Array:
         return jnp.float32(self.clip)
@@ -45,10 +44,7 @@ class DPODrift(Drift):
     beta: float = DPO_BETA
 
     def __post_init__(self) -> None:
-        if not (self.alpha > 0 and self.beta > 0):
-            raise UserError(
-                f"DPO's alpha and beta are {self.alpha} and {self.beta}: both must be positive."
-            )
+        positive(alpha=+self.alpha, beta=+self.beta)  # + takes numbers alone
 
     def init(self, key: jax.Array, scale: float = 1.0) -> dict[str, jax.Array]:
         return {"alpha": jnp.float32(self.alpha), "beta": jnp.float32(self.beta)}

@@ -25,7 +25,7 @@ import jax.numpy as jnp
 
 from lpo.drifts.contract import Array, Drift
 from scb.agents.ppo import relu
-from scb.errors import UserError, at_least
+from scb.errors import at_least, positive
 from scb.keys import split_key
 
 # Units bend within a fifth of the ratio or so, which is PPO's clip, and at ratios from 1/2 to 2.
@@ -57,10 +57,7 @@ class MirrorDrift(Drift):
 
     def __post_init__(self) -> None:
         at_least(1, self, "hidden_size")
-        if not (self.strength > 0 and self.xi > 0):
-            raise UserError(
-                f"strength and xi are {self.strength} and {self.xi}: both must be positive."
-            )
+        positive(strength=+self.strength, xi=+self.xi)  # + takes numbers alone
 
     def init(self, key: jax.Array, scale: float = 1.0) -> dict[str, jax.Array]:
         """KL times `strength`, and units of random places and slopes whose weights are normal times `scale`."""

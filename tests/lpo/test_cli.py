@@ -201,7 +201,7 @@ def test_a_resumed_evaluation_may_have_more_seeds_and_objectives(
     told: list[str] = []
     monkeypatch.setattr(training_commands, "_tell", told.append)
     more = ["--seeds=3", "--objectives", "none", "dpo", "ppo"]
-    assert cli.main(["evaluate", *more, "--resume=o"]) == 0
+    assert cli.main(["evaluate", *more, "--resume=o", "--out=o"]) == 0
     assert (folder / "rows.jsonl").read_bytes().startswith(interrupted_evaluation[0])
     curves = json.loads((folder / "comparison.json").read_text())["curves"]
     assert [(c["objective"], c["seeds"]) for c in curves] == [

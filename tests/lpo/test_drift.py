@@ -315,12 +315,13 @@ def test_a_column_beside_rows_is_an_error(name, position):
 @pytest.mark.parametrize(
     ("make_drift", "message"),
     [
-        (lambda: ClipDrift(0.0), "the clip epsilon is 0.0: it must be positive."),
-        (lambda: ClipDrift(float("nan")), "the clip epsilon is nan"),
-        (lambda: DPODrift(alpha=-1.0), "alpha and beta are -1.0 and 0.6"),
+        (lambda: ClipDrift(0.0), "clip is 0.0: it must be positive, and finite."),
+        (lambda: ClipDrift(float("nan")), "clip is nan"),
+        (lambda: DPODrift(alpha=-1.0), "alpha is -1.0: it must be positive"),
         (lambda: LearnedDrift(base="ppo2"), "unknown drift base 'ppo2': did you mean ppo"),
         (lambda: LearnedDrift(hidden_size=0), "hidden_size is 0: it must be at least 1."),
-        (lambda: LearnedDrift(xi=0.0), "clip and xi are 0.2 and 0.0: both must be positive."),
+        (lambda: LearnedDrift(xi=0.0), "xi is 0.0: it must be positive, and finite."),
+        (lambda: LearnedDrift(xi=float("inf")), "xi is inf: it must be positive, and finite."),
         (lambda: LearnedDrift(gate=-0.1), "gate is -0.1: it must be 0 or larger, and finite."),
     ],
 )

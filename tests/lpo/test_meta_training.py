@@ -17,8 +17,11 @@ from lpo.inner_loop import MetaTrainingConfig, TaskTraining, task_agent
 from lpo.meta_training import MetaTraining, meta_train
 from scb.agents.ppo import PPOConfig
 from scb.agents.spec import environment_agent
+from scb.environments.registry import make
 from scb.environments.spec import EnvironmentSpec
 from scb.environments.synthetic import BanditConfig, SyntheticBandit
+from scb.environments.synthetic_mdp import synthetic_for
+from scb.environments.zoo import save_bandit
 from scb.errors import UserError
 from scb.evaluation import Episodes
 from scb.evolution import EvolutionConfig, Outcome
@@ -173,6 +176,16 @@ def test_the_inner_loop_on_a_bandit_keeps_the_number_of_updates():
     assert (here.num_iterations, here.batch_size) == (15, 200)
     for name in ("num_epochs", "num_minibatches", "hidden_sizes", "activation"):
         assert getattr(here, name) == getattr(there, name)
+
+
+def test_the_inner_loop_on_a_synthetic_mdp_is_the_environments_own(tmp_path):
+    env, params = make("Pendulum-v1")
+    mdp = synthetic_for(env, params, "TI", BanditConfig(hidden_size=2), "mdp", None)
+    path = tmp_path / "mdp.npz"
+    told = {"config": {"evaluation_environment": "Pendulum-v1"}}
+    save_bandit(path, mdp, mdp.init_weights(jax.random.key(0)), told)
+    # Its episodes have many steps, of which batches of one would see the first few.
+    assert task_agent(str(path), 200) == task_agent("Pendulum-v1", 200)
 
 
 def test_a_renamed_bandit_is_trained_in_as_before(tmp_path):

@@ -65,7 +65,7 @@ def test_a_saved_one_charges_the_same(tmp_path):
     ("make", "message"),
     [
         (lambda: MirrorDrift(hidden_size=0), "hidden_size is 0: it must be at least 1."),
-        (lambda: MirrorDrift(strength=0.0), "strength and xi are 0.0 and 1e-06: both must be"),
+        (lambda: MirrorDrift(strength=0.0), "strength is 0.0: it must be positive"),
         (
             lambda: learned_drift("mirror", gate=0.1),
             "mirror has no gate, which is a setting of net",

@@ -18,6 +18,7 @@ from lpo.drifts.network import FEATURES
 from lpo.objectives import (
     Objective,
     learned_in,
+    load_apart,
     load_objective,
     objective_names,
     save_objective,
@@ -90,7 +91,7 @@ def test_every_listed_name_loads():
         ("dop", "unknown objective 'dop': did you mean dpo?"),
         ("PPO", "unknown objective 'PPO': did you mean ppo"),
         ("nothing-like-it", "unknown objective 'nothing-like-it': known are dpo, "),
-        ("ppo-0", "the clip epsilon is 0.0: it must be positive."),
+        ("ppo-0", "clip is 0.0: it must be positive, and finite."),
     ],
 )
 def test_an_unknown_name_is_told_what_is_known(name, message, one_sentence):
@@ -153,6 +154,18 @@ def test_a_copy_goes_by_the_name_of_its_own_file(file):
     for suffix in (".npz", ".json"):
         file.with_suffix(suffix).rename(file.with_name(f"another{suffix}"))
     assert load_objective(file.with_name("another.npz")).name == "another"
+
+
+def test_what_a_run_learned_has_its_name_whatever_it_is_compared_with(file, tmp_path):
+    paths = []
+    for name in ("first", "second"):
+        (tmp_path / name).mkdir()
+        for suffix in (".npz", ".json"):
+            kept = tmp_path / name / f"objective{suffix}"
+            kept.write_bytes(file.with_suffix(suffix).read_bytes())
+        paths.append(str(kept.with_suffix(".npz")))
+    assert [x.name for x in load_apart(paths[:1])] == ["first"]
+    assert [x.name for x in load_apart(["ppo", *paths])] == ["ppo", "first", "second"]
 
 
 def test_metadata_of_the_meta_training_is_kept(tmp_path, tiny_drift):

@@ -219,7 +219,7 @@ def test_the_command_that_a_configuration_is_written_as_asks_for_it_again():
     contradicting = {"fixed_hyperparameters", "start", "parameterization", "construction"}
     contradicting |= {"min_spread", "stretch", "jitter", "discount", "horizon"}
     contradicting |= {"latent", "latent_size", "hidden_size", "activation"}
-    contradicting |= {"fit_steps", "num_actions", "near_actions"}
+    contradicting |= {"fit_steps", "num_actions"}
     assert same == contradicting
     for text in (
         "--environment=CartPole-v1",
@@ -229,7 +229,7 @@ def test_the_command_that_a_configuration_is_written_as_asks_for_it_again():
         "--jitter=1.0",
         "--latent=uniform",
         "--construction=q --discount=0.5 --horizon=4",
-        "--num-actions=6 --near-actions=2 --fit-steps=3",
+        "--num-actions=6 --fit-steps=3",
         "--hidden-size=3 --activation=relu",
         "--from-bandit=b.npz",
         "--latent-size=2",

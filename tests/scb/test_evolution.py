@@ -274,14 +274,21 @@ def test_means_are_judged_by_agents_of_the_same_seeds():
 
 
 def test_a_mean_whose_agents_diverge_is_judged_by_these_too(monkeypatch):
-    monkeypatch.setattr(Luck, "least", 0.5)
     config = replace(CONFIG, mean_evaluations=16, num_generations=1)
-    (line,) = evolve(Luck(), config, quiet=True).metrics
     *_, key_mean = split_key(root_key(config.seed), 4)
     earned = np.asarray(jax.vmap(jax.random.uniform)(split_key(key_mean, 16)))
-    counted = rank_failed_last(np.where(earned < 0.5, np.nan, earned))
-    assert line["mean/fitness_iqm"] == pytest.approx(float(iqm(counted)), rel=1e-5)
-    assert line["mean/fitness_iqm"] < float(iqm(earned[earned >= 0.5])) - 0.02
+    fifth, fourth = np.sort(earned)[[4, 3]]
+
+    monkeypatch.setattr(Luck, "least", (fifth + fourth) / 2)  # four of 16 diverge
+    outcome = evolve(Luck(), config, quiet=True)
+    assert outcome.metrics[0]["mean/fitness_iqm"] == pytest.approx(float(iqm(earned)), rel=1e-5)
+    outcome.check(best=True)
+
+    monkeypatch.setattr(Luck, "least", fifth + 1e-6)  # more than the mean leaves out
+    outcome = evolve(Luck(), config, quiet=True)
+    assert "mean/fitness_iqm" not in outcome.metrics[0]
+    with pytest.raises(UserError, match="more than a quarter of the agents of every judgement"):
+        outcome.check(best=True)
 
 
 def test_the_best_mean_may_be_the_last():
@@ -392,17 +399,15 @@ def test_failed_candidates_are_counted_and_never_poison_the_search(strategy, bro
     assert outcome.best_mean_generation == -1
     np.testing.assert_array_equal(outcome.best_mean["x"], [0.0, 0.0])
     outcome.check()
-    with pytest.raises(
-        UserError, match="all agents of every judgement diverged, so no mean is best"
-    ):
+    with pytest.raises(UserError, match="judgement diverged, so no mean is best"):
         outcome.check(best=True)
 
 
-def test_one_agent_that_diverged_does_not_void_a_judgement():
+def test_a_few_agents_that_diverged_do_not_void_a_judgement():
     class Diverging(Parabola):
         def evaluate_mean(self, candidate, key):
             fitness = super().evaluate_mean(candidate, key)["fitness"]
-            return {"fitness": jnp.where(jax.random.uniform(key) < 0.3, jnp.nan, fitness)}
+            return {"fitness": jnp.where(jax.random.uniform(key) < 0.1, jnp.nan, fitness)}
 
     outcome = evolve(Diverging(), replace(CONFIG, mean_evaluations=16), quiet=True)
     judged = [line["mean/fitness_iqm"] for line in outcome.metrics if "mean/fitness" in line]

@@ -1,4 +1,5 @@
 import json
+import subprocess
 import sys
 from types import SimpleNamespace
 
@@ -9,7 +10,7 @@ import pytest
 from scb.checkpoints import Checkpoints
 from scb.errors import UserError
 from scb.files import write_json
-from scb.runs import Run, Stopwatch, read_config
+from scb.runs import Run, Stopwatch, held, read_config, released
 
 CONFIG = {"seed": 0, "evolution": {"sigma": 0.05, "strategy": "SNES"}, "hidden_sizes": (8, 8)}
 
@@ -48,6 +49,28 @@ def test_a_run_may_start_where_another_left_nothing_but_its_settings(tmp_path):
     found.close()
     with pytest.raises(UserError, match="already exists and is not empty"):
         Run.open(tmp_path / "run", {**CONFIG, "command": "scb discover"})
+
+
+def test_a_folder_is_held_until_its_command_has_ended(tmp_path):
+    with released():
+        run = Run.open(tmp_path / "run", CONFIG)
+        run.end_log()
+        assert is_locked(run.folder / ".lock")
+    assert not is_locked(run.folder / ".lock")
+
+
+def test_a_file_is_held_by_one_command(tmp_path):
+    path = tmp_path / "report.json"
+    with held(path):
+        lock = tmp_path / ".report.json.lock"
+        assert is_locked(lock)
+    assert not lock.exists() and not path.exists()
+
+
+def is_locked(path):
+    """Whether another process could not lock it; one's own never stands in one's way."""
+    code = f"import fcntl; fcntl.lockf(open({str(path)!r}, 'a+'), fcntl.LOCK_EX | fcntl.LOCK_NB)"
+    return subprocess.run([sys.executable, "-c", code], capture_output=True).returncode != 0
 
 
 @pytest.mark.parametrize("settings", ['{"theirs": 1}', "no json"])

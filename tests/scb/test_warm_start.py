@@ -168,35 +168,15 @@ def noisy_dataset():
     """Of the pendulum, whose torques lie in [-2, 2] and whose expert holds 0.5."""
     env, params = make("Pendulum-v1")
     half = Expert(lambda observation: jnp.full(1, 0.5), mean_return=0.0, environment_steps=0)
-    config = WarmStartConfig(expert_noise=0.1, num_states=512, num_actions=11, near_actions=6)
+    config = WarmStartConfig(expert_noise=0.1, num_states=512, num_actions=11)
     return expert_dataset(half, Place(env.name, env, params), jax.random.key(4), config)[0]
 
 
-def test_tried_actions_lie_about_the_experts_and_everywhere(noisy_dataset):
+def test_tried_actions_are_the_experts_and_uniform_ones(noisy_dataset):
     tried = np.asarray(noisy_dataset.action)[..., 0]
     np.testing.assert_array_equal(tried[:, 0], 0.5)
-    near, uniform = tried[:, 1:7], tried[:, 7:]
-    # 0.15 of a range of 4; the bound at 2, 2.5 deviations away, takes little of that. Uniform: 4 / sqrt(12).
-    assert near.mean() == pytest.approx(0.5, abs=0.05) and near.std() == pytest.approx(
-        0.6, rel=0.05
-    )
-    assert uniform.std() == pytest.approx(4 / np.sqrt(12), rel=0.05)
+    assert tried[:, 1:].std() == pytest.approx(4 / np.sqrt(12), rel=0.05)
     assert len(np.unique(tried[:, 1:])) > 512 * 9
-
-
-def test_actions_near_the_experts_are_near_what_it_does_in_the_stretched_state():
-    env, params = make("Pendulum-v1")
-    # In a state of its own a torque in proportion to the velocity, which stretching multiplies.
-    slope = Expert(lambda observation: observation[2:] / 8, mean_return=0.0, environment_steps=0)
-    config = WarmStartConfig(
-        num_states=512, num_actions=11, near_actions=6, stretch=4.0, jitter=1.0
-    )
-    dataset, _ = expert_dataset(slope, Place(env.name, env, params), jax.random.key(4), config)
-    best, tried = np.asarray(dataset.expert_action), np.asarray(dataset.action)[..., 0]
-    inside = np.abs(best[:, 0]) < 0.2  # where the bounds of 2 take nothing
-    assert inside.sum() > 20
-    apart = (tried[:, 1:7] - best)[inside]
-    assert apart.std() == pytest.approx(0.6, rel=0.15)
 
 
 def test_what_the_expert_does_there_is_without_noise(noisy_dataset):
@@ -619,10 +599,6 @@ def test_evolution_gets_the_papers_curriculum_at_its_own_length(monkeypatch):
         ({"num_states": 0}, "num_states is 0"),
         ({"num_actions": 1}, "num_actions is 1: it must be at least 2"),
         ({"aggregation_agents": 4}, "aggregation_agents is 4, and there are no aggregation rounds"),
-        (
-            {"near_actions": 16},
-            "near_actions is 16 of 16 actions, one of them the expert's: take at most 15",
-        ),
         ({"expert_noise": -0.1}, "expert_noise is -0.1: it must be 0 or larger"),
         ({"expert_errors": -0.1}, "expert_errors is -0.1: it must be 0 or larger"),
         ({"jitter": -1.0}, "jitter is -1.0: it must be 0 or larger"),
