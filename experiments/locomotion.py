@@ -9,6 +9,7 @@ that report nothing, and compared like the others. (As jobs, the same command on
 """
 
 import math
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -125,7 +126,8 @@ def tuned(sweep: Mapping[str, float]) -> str | None:
 def _trained(
     environment: str, objective: str, seeds: list[int], runs: Path, place: str
 ) -> dict[str, Any]:
-    rows = Rows(runs / environment / f"{Path(objective).name}-{seeds[0]}.rows.jsonl")
+    name = re.sub(r"[^\w.-]", "_", objective)  # a file's path is no name of another
+    rows = Rows(runs / environment / f"{name}-{seeds[0]}.rows.jsonl")
     (found,) = compare(
         environment,
         [load_objective(objective)],

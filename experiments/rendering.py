@@ -92,8 +92,6 @@ def told(judged: Sequence[Judged]) -> str:
             word = words.get(outcome, (f"is {outcome}", f"are {outcome}"))[len(texts) > 1]
             which = f": {'; '.join(texts)}" if outcome in words else ""
             found.append(f"{len(texts)} {word}{which}")
-    if len(found) == 1:
-        return f"of its parts all {found[0]}."
     return f"of its {len(judged)} parts {'; '.join(found)}."
 
 

@@ -19,7 +19,7 @@ from scb.curriculum import CurriculumConfig, paper_curriculum
 from scb.discovery import BanditDiscovery, DiscoveryConfig, discover
 from scb.errors import UserError
 from scb.evolution import EvolutionConfig, Outcome
-from scb.runs import Run, config_dict
+from scb.runs import Run, config_dict, released
 from scb.statistics import Estimate, Statistic, estimate, stratified_estimate
 
 NONE = "none"  # the curriculum that is none
@@ -84,7 +84,8 @@ def meta_training(settings: Mapping[str, Any]) -> MetaTrain:
 def objective_of_run(settings: Mapping[str, Any], folder: Path) -> Objective:
     """The objective of a run folder of that command, and of no other: read, or learned first, or its run resumed."""
     resume = folder if (folder / "config.json").exists() else None
-    return replace(meta_training(settings), output=Output(folder, resume)).objective()
+    with released():
+        return replace(meta_training(settings), output=Output(folder, resume)).objective()
 
 
 def search(config: DiscoveryConfig, folder: str | Path) -> tuple[BanditDiscovery, Outcome]:

@@ -25,7 +25,7 @@ from scb.agents.spec import AgentSpec
 from scb.artefacts import machine_description, package_versions
 from scb.environments.registry import environment_spec
 from scb.environments.zoo import bandit_metadata
-from scb.errors import UserError, at_least
+from scb.errors import UserError, at_least, unused
 from scb.evolution import map_population, rank_failed_last
 from scb.keys import root_key, split_key
 from scb.measurement import Judge, check_seeds, train_and_judge
@@ -71,12 +71,17 @@ class Regime:
                 f"reward_noise is {self.reward_noise:g}, and {self.bandit!r} is a synthetic MDP, whose reward has "
                 "none: take 0."
             )
+        if not environment_spec(self.bandit).is_bandit:
+            because = f"the batches of {self.bandit!r}, a synthetic MDP, are its environment's"
+            unused(self, because, ("contexts",), "take a bandit")
         self.spec()  # which refuses what does not fit, before anything is trained
 
     def spec(self) -> AgentSpec:
         """Of its agents: the setting's own but for what is given here."""
-        return task_agent(self.bandit, self.contexts).with_values(
-            total_steps=None if self.iterations is None else self.contexts * self.iterations,
+        own = task_agent(self.bandit, self.contexts)
+        iterations = self.iterations
+        return own.with_values(
+            total_steps=None if iterations is None else own.config.steps_after(iterations),
             num_epochs=self.epochs,
             num_minibatches=self.minibatches,
             learning_rate=self.learning_rate,

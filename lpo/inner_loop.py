@@ -61,9 +61,9 @@ class MetaTrainingConfig:
       agents_per_candidate: inner agents whose mean is a candidate's fitness.
       evaluation_episodes: of each inner agent; None takes 50 where they are of one step, else 20.
       validation: judge the mean of the search distribution by agents trained with it in the tasks'
-        evaluation environments, on the settings of those, and keep the mean that was judged best,
-        rather than the final one. The longer a search on a bandit, the more it learns about the bandit
-        alone. Takes environment steps, of which the search itself sees none.
+        evaluation environments, on the settings of those, and keep the mean that was judged best (of whose
+        agents no more than a quarter diverged), rather than the final one. The longer a search on a bandit,
+        the more it learns about the bandit alone. Takes environment steps, of which the search itself sees none.
       backend: Brax physics, where the environment is Brax's (with transfer: the evaluation
         environment).
       initial_scale: of the drift's random start, so that the search begins near what it corrects.

@@ -29,7 +29,7 @@ class Objective:
     """A drift with its parameters: what `scb.PPO` and its hyperparameters take.
 
     Attributes:
-      name: as on the command line; a file's is the objective's.
+      name: as on the command line; a file's is its own, or of the objective.npz of a run its folder's.
       drift: the family, passed to `PPO(env, config, drift)`.
       parameters: traced, passed as `PPOHyperparameters.drift`.
       metadata: of a learned objective, what its artefact says.
@@ -95,17 +95,12 @@ def check_names(objectives: Sequence[Objective]) -> None:
 def load_apart(names: Sequence[str]) -> list[Objective]:
     """Objectives by what `load_objective` takes, with names of their own.
 
-    Every `lpo meta-train` writes an objective.npz, which goes by its folder's name (`run_name`). Other files of one
-    name go by what was typed.
+    Files of one name go by what was typed.
 
     Raises:
       UserError: as for `load_objective`, or one stands there twice.
     """
     loaded = [load_objective(name) for name in names]
-    loaded = [
-        replace(x, name=run_name(Path(typed).resolve())) if typed.endswith(".npz") else x
-        for x, typed in zip(loaded, names, strict=True)
-    ]
     known = [objective.name for objective in loaded]
     loaded = [
         replace(objective, name=typed) if known.count(objective.name) > 1 else objective
@@ -142,7 +137,7 @@ def _from_file(path: Path) -> Objective:
         raise UserError(
             f"{path} holds other numbers than the expression in its .json: fetch or save both again."
         )
-    return Objective(path.stem, drift, parameters, artefact.metadata)
+    return Objective(run_name(path.resolve()), drift, parameters, artefact.metadata)
 
 
 def save_objective(

@@ -92,9 +92,17 @@ def save(path: str | Path, arrays: Mapping[str, Any], metadata: Mapping[str, Any
     schema.check(json_path, json.loads(text))
 
     npz_path.parent.mkdir(parents=True, exist_ok=True)
-    json_path.unlink(missing_ok=True)
-    write_bytes(npz_path, data)
-    write_bytes(json_path, (text + "\n").encode())
+    fresh = [path.with_name(f".{path.name}.new") for path in (npz_path, json_path)]
+    try:
+        # Before anything is replaced, that there is room for both.
+        write_bytes(fresh[0], data)
+        write_bytes(fresh[1], (text + "\n").encode())
+        json_path.unlink(missing_ok=True)
+        os.replace(fresh[0], npz_path)
+        os.replace(fresh[1], json_path)
+    finally:
+        for path in fresh:
+            path.unlink(missing_ok=True)
     return npz_path
 
 

@@ -105,8 +105,8 @@ class DiscoveryConfig:
         contexts and uniform actions, and shift it to mean zero. PPO, which normalises advantages, is
         nearly indifferent; SAC, whose temperature starts at 1 and whose critics start near 0, is not.
       select: what a search ends with: final (the mean of the last search distribution) or best (the
-        mean whose judgement during the search was best; where the search starts near its end, noise
-        can lead it away again).
+        mean whose judgement during the search was best, and of whose agents no more than a quarter diverged; where
+        the search starts near its end, noise can lead it away again).
       bandit: the networks and the latent.
       warm_start: how the expert is found and the bandit fitted to it.
       refinement: of the bandit that the search starts from.

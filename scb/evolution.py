@@ -354,14 +354,17 @@ def evolve(
         # pairs.
         returns = judged(mean, key_mean)
         outcome = {name: float(np.mean(v)) for name, v in returns.items()}
-        # The interquartile mean too: of agents with random hyperparameters a few fail far below the rest. Those that
-        # diverged are the lowest, and where they are more than the quarter that it drops there is none.
+        # The interquartile mean too: of agents with random hyperparameters a few fail far below the rest, and
+        # those that diverged count as below the worst of the others.
         middles = {
             f"{name}_iqm": float(iqm(rank_failed_last(v)))
             for name, v in returns.items()
-            if np.sum(~np.isfinite(v)) <= v.size // 4
+            if np.isfinite(v).any()
         }
         score = middles.get("fitness_iqm", -np.inf)
+        # Where those that diverged are more than the quarter that it drops, it is no measure beside others.
+        if np.sum(~np.isfinite(returns["fitness"])) > returns["fitness"].size // 4:
+            score = -np.inf
         if score > float(state["best_mean_fitness"]):
             state["best_mean"] = mean
             state["best_mean_fitness"] = jnp.float32(score)

@@ -69,30 +69,40 @@ def _check(name: str, env: environment.Environment[Any, Any], params: Any) -> No
         return UserError(f"environment {name!r} {what}.")
 
     if not hasattr(params, "max_steps_in_episode"):
-        raise wrong("has parameters without max_steps_in_episode, after which an episode ends")
+        raise wrong(
+            "has parameters without max_steps_in_episode, after which an episode ends: give them that field"
+        )
     observations, actions = env.observation_space(params), env.action_space(params)
     for kind, space in {"observations": observations, "actions": actions}.items():
         if not isinstance(space, spaces.Box | spaces.Discrete):
             raise wrong(
-                f"has a {type(space).__name__} of {kind}: one Box or Discrete is understood"
+                f"has a {type(space).__name__} of {kind}: one Box or Discrete is understood: put all into one"
+            )
+
+    def check_values(of: str, found: Any, values: str) -> None:
+        number = len(found) if isinstance(found, tuple) else 1
+        if number != values.count(",") + 1:
+            raise wrong(
+                f"returns {number} of {of}, where gymnax 1.x returns {values}: return these"
             )
 
     def first_step(key: jax.Array) -> Any:
-        observation, state = env.reset(key, params)
-        return observation, env.step(key, state, actions.sample(key), params)
+        found = env.reset(key, params)
+        check_values("reset", found, "observation, state")
+        observation, state = found
+        step = env.step(key, state, actions.sample(key), params)
+        check_values("step", step, "observation, state, reward, terminated, truncated, info")
+        return observation, step
 
     first, step = jax.eval_shape(first_step, root_key(0))
-    if len(step) != 6:
-        raise wrong(
-            f"returns {len(step)} values of a step, where gymnax 1.x returns observation, state, reward, terminated, "
-            "truncated and info"
-        )
     for when, observation in {"reset": first, "step": step[0]}.items():
         shape = getattr(observation, "shape", type(observation).__name__)
         if shape != observations.shape:
             raise wrong(
                 f"returns observations of shape {shape} from {when}, where its observation_space says "
-                f"{observations.shape}"
+                f"{observations.shape}: let them agree"
             )
     if step[2].shape != ():
-        raise wrong(f"returns rewards of shape {step[2].shape}, where one number is expected")
+        raise wrong(
+            f"returns rewards of shape {step[2].shape}, where one number is expected: sum or average them"
+        )

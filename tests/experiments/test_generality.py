@@ -43,7 +43,7 @@ def report(**returns):
     entry = {}
     for source in SOURCES:
         earned = {kind: [float(returns.get(source.split()[-1], 400.0))] * 4 for kind in kinds}
-        earned[EVOLVED] = [380.0, 420.0, 400.0, 400.0]
+        earned[EVOLVED] = [395.0, 405.0, 400.0, 400.0]
         if source != ENVIRONMENT:
             earned[OPTIMAL] = [500.0] * 4
         entry[source] = {"returns": earned, "failed": {}}

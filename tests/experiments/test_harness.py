@@ -16,6 +16,7 @@ from experiments.parts import Part
 from experiments.rendering import text
 from scb.environments.zoo import bandit_metadata
 from scb.statistics import Estimate
+from tests.locking import is_locked
 
 PAGE = """{% extends "page.md.j2" %}
 {% block verdict %}{{ measured }} measured.{% endblock %}
@@ -54,6 +55,18 @@ def counting(parts=("a", "b"), fail_at=None) -> Experiment:
         claims=lambda report: [Claim("every part is there", len(report["parts"]) == 2)],
         draw=lambda report: Figure(figsize=(2, 2)),
     )
+
+
+def test_a_report_is_one_commands_while_it_measures(tmp_path):
+    report, seen = tmp_path / "c.json", []
+
+    def measure(plan, found, save):
+        seen.append(is_locked(tmp_path / ".c.json.lock"))
+        counting().measure(plan, found, save)
+
+    flags = ["--out", str(report), "--docs", str(tmp_path / "docs")]
+    assert replace(counting(), measure=measure).main(flags) == 0
+    assert seen == [True] and not (tmp_path / ".c.json.lock").exists()
 
 
 def test_an_interrupted_experiment_measures_only_what_is_missing(tmp_path):

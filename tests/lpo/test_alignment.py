@@ -121,7 +121,12 @@ def test_a_regime_on_a_synthetic_mdp_has_no_reward_noise(one_sentence, tmp_path)
         Regime(bandit=str(path))
     message = f"reward_noise is 5, and '{path}' is a synthetic MDP, whose reward has none: take 0."
     assert message in one_sentence(str(error.value))
-    assert Regime(bandit=str(path), reward_noise=0.0).reward_noise == 0.0
+    regime = Regime(bandit=str(path), reward_noise=0.0, iterations=7)
+    assert regime.spec().config.num_iterations == 7
+    with pytest.raises(
+        UserError, match=r"contexts is 50, and the batches of .* are its environment's"
+    ):
+        replace(regime, contexts=50)
 
 
 def test_a_regime_changes_what_it_names_and_keeps_the_settings_own():

@@ -15,6 +15,7 @@ import pytest
 
 import lpo
 import scb.cli
+import scb.commands
 from lpo import cli, commands, training_commands
 from lpo.commands import MetaTrain
 from lpo.comparison import Comparison, LearningCurves
@@ -30,6 +31,7 @@ from scb.errors import UserError
 from scb.evolution import evolve
 from scb.runs import config_dict
 from scb.seeds import SEARCHING
+from tests.locking import is_locked
 from tests.recording import recorded_seeds
 
 pytestmark = pytest.mark.usefixtures("working_folder", "no_training")
@@ -304,8 +306,17 @@ def test_meta_train_writes_an_objective_that_loads(
         "out": "learned",
     }
     arguments = [f"--{name}={value}" for name, value in flags.items()]
+    locked = []
+
+    def certified(*given, own=commands.certify):
+        locked.append(is_locked(working_folder / "learned" / ".lock"))
+        return own(*given)
+
+    monkeypatch.setattr(commands, "certify", certified)
     with recorded_seeds() as seeds:
         assert cli.main(["meta-train", *arguments]) == 0
+    # The folder is the command's beyond the search, and no longer than the command.
+    assert locked == [True] and not is_locked(working_folder / "learned" / ".lock")
     # Constants, the search, and the judges of its end: none that reports.
     assert seeds == {0, 4, 30_000}
     output = capsys.readouterr().out
@@ -334,6 +345,14 @@ def test_meta_train_writes_an_objective_that_loads(
     longer_config = longer["config"]["meta_training"]
     sums = longer["config"]["bandit_sha256"]
     assert stored == {"command": longer["command"], "config": longer_config, "inputs": sums}
+
+
+def test_a_resumed_run_logs_where_it_did():
+    assert list(MetaTrain.parse(["--wandb=mine"]).further()) == ["--wandb=mine"]
+    assert list(scb.commands.Discover.parse(["--wandb=mine", "--judge-agents=3"]).further()) == [
+        "--wandb=mine",
+        "--judge-agents=3",
+    ]
 
 
 def asked_for(words=""):

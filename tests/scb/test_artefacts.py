@@ -1,4 +1,5 @@
 import dataclasses
+import errno
 import io
 import json
 import os
@@ -15,6 +16,7 @@ from hypothesis import strategies as st
 
 from scb import artefacts, schema
 from scb.errors import UserError
+from scb.files import write_bytes
 
 WEIGHTS = {
     "reward": {
@@ -131,6 +133,20 @@ def test_a_save_that_dies_between_the_two_files_is_noticed(saved, monkeypatch):
     # Not a pair that does not match, at which a resumed run would stop.
     assert os.listdir(saved.parent) == ["pendulum.npz"]
     assert "pendulum.json does not exist" in load_error(saved)
+
+
+def test_where_there_is_no_room_what_was_there_stays(saved, monkeypatch):
+    before = {path: path.read_bytes() for path in saved.parent.iterdir()}
+
+    def full(path, content):
+        if ".json" in path.name:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        write_bytes(path, content)
+
+    monkeypatch.setattr(artefacts, "write_bytes", full)
+    with pytest.raises(OSError, match="No space left"):
+        artefacts.save(saved, {"other": np.ones(2)}, METADATA)
+    assert {path: path.read_bytes() for path in saved.parent.iterdir()} == before
 
 
 def test_any_numpy_reader_can_open_the_weights(saved):

@@ -42,6 +42,14 @@ class OlderStep(Pendulum):
         observation, state, reward, terminated, truncated, info = super().step(*arguments)
         return observation, state, reward, terminated | truncated, info
 
+class OlderReset(Pendulum):
+    def reset(self, *arguments):
+        return *super().reset(*arguments), {}
+
+class NoStep(Pendulum):
+    def step(self, *arguments):
+        pass
+
 class ManyRewards(Pendulum):
     def step_env(self, *arguments):
         observation, state, reward, *others = super().step_env(*arguments)
@@ -104,7 +112,9 @@ def test_the_physics_that_a_factory_takes_is_part_of_the_place(module):
             r"shape \(3,\) from reset, where its observation_space says \(4,\)",
         ),
         ("{}:OtherActions", "has a Tuple of actions: one Box or Discrete is understood"),
-        ("{}:OlderStep", "returns 5 values of a step, where gymnax 1.x returns"),
+        ("{}:OlderStep", "returns 5 of step, where gymnax 1.x returns observation, state, reward"),
+        ("{}:OlderReset", "returns 3 of reset, where gymnax 1.x returns observation, state: "),
+        ("{}:NoStep", "returns 1 of step, where gymnax 1.x returns"),
         ("{}:ManyRewards", r"rewards of shape \(2,\)"),
         ("{}:endless", "without max_steps_in_episode"),
         ("{}:wrong", "returned a str: it must return a gymnax"),

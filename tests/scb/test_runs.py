@@ -1,5 +1,4 @@
 import json
-import subprocess
 import sys
 from types import SimpleNamespace
 
@@ -11,6 +10,7 @@ from scb.checkpoints import Checkpoints
 from scb.errors import UserError
 from scb.files import write_json
 from scb.runs import Run, Stopwatch, held, read_config, released
+from tests.locking import is_locked
 
 CONFIG = {"seed": 0, "evolution": {"sigma": 0.05, "strategy": "SNES"}, "hidden_sizes": (8, 8)}
 
@@ -65,12 +65,6 @@ def test_a_file_is_held_by_one_command(tmp_path):
         lock = tmp_path / ".report.json.lock"
         assert is_locked(lock)
     assert not lock.exists() and not path.exists()
-
-
-def is_locked(path):
-    """Whether another process could not lock it; one's own never stands in one's way."""
-    code = f"import fcntl; fcntl.lockf(open({str(path)!r}, 'a+'), fcntl.LOCK_EX | fcntl.LOCK_NB)"
-    return subprocess.run([sys.executable, "-c", code], capture_output=True).returncode != 0
 
 
 @pytest.mark.parametrize("settings", ['{"theirs": 1}', "no json"])
