@@ -101,7 +101,7 @@ def parts(options: Options, report: dict[str, Any]) -> Iterator[Part]:
     settled(report, steps=steps, episodes=EPISODES, bandit=_checksum(options))
     if options.bandit is None:
         sums = {name: bandit_of(name)[1] for name in options.environments}
-        settled(report.setdefault("sha256", {}), **sums)
+        settled(report.setdefault("bandits", {}), **sums)  # of the zoo, by checksum
     python = str(options.python)
     yield Part(("peer_versions",), partial(_said, python, "versions"))
     for seed in reporting(options.seeds):

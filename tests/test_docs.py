@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 from experiments import rendering
-from experiments.harness import forget_replaced
+from experiments.harness import bandit_of, forget_replaced
 from scb.environments.zoo import bandit_metadata, zoo_names
 from tests.site import public_names
 
@@ -85,6 +85,11 @@ def test_every_report_that_names_its_bandits_by_checksum_can_forget_them(monkeyp
         if report != read(path.stem):
             forgetting.add(path.stem)
     assert len(naming) > 5 and naming == forgetting | {"zoo_table"}
+
+
+def test_what_agents_of_another_library_trained_in_ships():
+    digests = read("sb3")["bandits"]
+    assert digests and digests == {name: bandit_of(name)[1] for name in digests}
 
 
 def test_what_the_table_has_of_our_bandits_is_of_those_that_ship():
