@@ -111,43 +111,27 @@ def _for_torch(function: "TorchFunction", objective: Objective | str | Path) -> 
 # What users hold are partials of these functions of a module, which can be pickled.
 
 
-def _in_jax(drift: Drift, parameters: Any, *arguments: Any, **keywords: Any) -> jax.Array:
-    result: jax.Array = _converted(jnp, drift, parameters, *arguments, **keywords)
-    return result
+def _in_jax(drift: Drift, parameters: Any, *arguments: Any, **named: Any) -> Any:
+    return _converted(jnp, drift, parameters, *arguments, **named)
 
 
-def _in_numpy(drift: Drift, parameters: Any, *arguments: Any, **keywords: Any) -> np.ndarray:
-    result: np.ndarray = _converted(np, drift, parameters, *arguments, **keywords)
-    return result
+def _in_numpy(drift: Drift, parameters: Any, *arguments: Any, **named: Any) -> Any:
+    return _converted(np, drift, parameters, *arguments, **named)
 
 
 def _in_torch(
-    drift: Drift,
-    parameters: Any,
-    log_ratio: "torch.Tensor",
-    advantage: "torch.Tensor",
-    progress: "float | torch.Tensor | None" = None,
-) -> "torch.Tensor":
-    import torch
-
-    advantage = advantage.to(log_ratio)
-    result: torch.Tensor = _evaluate(torch, drift, parameters, log_ratio, advantage, progress)
-    return result
+    drift: Drift, parameters: Any, log_ratio: Any, advantage: Any, progress: Any = None
+) -> Any:
+    torch = importlib.import_module("torch")
+    return _evaluate(torch, drift, parameters, log_ratio, advantage.to(log_ratio), progress)
 
 
 def _loss_in_torch(
-    drift: Drift,
-    parameters: Any,
-    log_ratio: "torch.Tensor",
-    advantage: "torch.Tensor",
-    progress: "float | torch.Tensor | None" = None,
-) -> "torch.Tensor":
-    import torch
-
-    advantage = advantage.to(log_ratio)
+    drift: Drift, parameters: Any, log_ratio: Any, advantage: Any, progress: Any = None
+) -> Any:
     penalty = _in_torch(drift, parameters, log_ratio, advantage, progress)
-    result: torch.Tensor = _policy_loss(torch, penalty, log_ratio, advantage)
-    return result
+    torch = importlib.import_module("torch")
+    return _policy_loss(torch, penalty, log_ratio, advantage.to(log_ratio))
 
 
 def _converted(
