@@ -347,6 +347,16 @@ def test_meta_train_writes_an_objective_that_loads(
     assert stored == {"command": longer["command"], "config": longer_config, "inputs": sums}
 
 
+def test_a_process_that_is_not_the_first_is_told_what_it_resumes(monkeypatch):
+    monkeypatch.setattr("scb.processes.first", lambda: False)
+    monkeypatch.setattr("scb.processes.told", lambda said: [["--seed=7"], ""])
+    # It need not see the folder.
+    assert MetaTrain.parse(["--resume=nowhere"]).config.evolution.seed == 7
+    monkeypatch.setattr("scb.processes.told", lambda said: [[], "nowhere is not a run."])
+    with pytest.raises(UserError, match="nowhere is not a run"):
+        MetaTrain.parse(["--resume=nowhere"])
+
+
 def test_a_resumed_run_logs_where_it_did():
     assert list(MetaTrain.parse(["--wandb=mine"]).further()) == ["--wandb=mine"]
     assert list(scb.commands.Discover.parse(["--wandb=mine", "--judge-agents=3"]).further()) == [
