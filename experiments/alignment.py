@@ -32,7 +32,7 @@ from lpo.alignment import (
     other_drifts,
 )
 from lpo.fitness import LABELS
-from lpo.objectives import Objective, load_objective, run_name
+from lpo.objectives import Objective, load_objective
 from scb.environments.registry import environment_spec
 from scb.errors import UserError
 
@@ -136,11 +136,8 @@ class Options:
 def measure(options: Options, report: dict[str, Any], save: Save) -> None:
     """A stage at a time."""
 
-    def named(path: Path) -> Objective:
-        return replace(load_objective(path), name=run_name(path))
-
-    family = [*known_drifts(), *map(load_objective, OF_THE_ZOO), *map(named, options.adversaries)]
-    held_out = [*other_drifts(), *map(named, options.held_out)]
+    family = [*known_drifts(), *map(load_objective, (*OF_THE_ZOO, *options.adversaries))]
+    held_out = [*other_drifts(), *map(load_objective, options.held_out)]
     for objective in held_out:
         twins = [member.name for member in family if same_drift(objective, member)]
         if twins:

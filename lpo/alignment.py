@@ -66,12 +66,12 @@ class Regime:
             )
         at_least(1, self, "iterations", "epochs", "minibatches", "contexts")
         at_least(0, self, "reward_noise")
-        if self.reward_noise and not environment_spec(self.bandit).is_bandit:
-            raise UserError(
-                f"reward_noise is {self.reward_noise:g}, and {self.bandit!r} is a synthetic MDP, whose reward has "
-                "none: take 0."
-            )
         if not environment_spec(self.bandit).is_bandit:
+            if self.reward_noise:
+                raise UserError(
+                    f"reward_noise is {self.reward_noise:g}, and {self.bandit!r} is a synthetic MDP, whose reward has "
+                    "none: take 0."
+                )
             because = f"the batches of {self.bandit!r}, a synthetic MDP, are its environment's"
             unused(self, because, ("contexts",), "take a bandit")
         self.spec()  # which refuses what does not fit, before anything is trained

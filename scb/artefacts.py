@@ -27,7 +27,7 @@ from flax import traverse_util
 
 from scb import schema
 from scb.errors import UserError, first_line, unknown_name
-from scb.files import strict_json, write_bytes
+from scb.files import strict_json, write_together
 
 # numpy.ndarray leaves under any depth of dictionaries: {"reward": {"Dense_0": {"kernel": ...}}}.
 ArrayTree: TypeAlias = "dict[str, np.ndarray | ArrayTree]"
@@ -92,17 +92,7 @@ def save(path: str | Path, arrays: Mapping[str, Any], metadata: Mapping[str, Any
     schema.check(json_path, json.loads(text))
 
     npz_path.parent.mkdir(parents=True, exist_ok=True)
-    fresh = [path.with_name(f".{path.name}.new") for path in (npz_path, json_path)]
-    try:
-        # Before anything is replaced, that there is room for both.
-        write_bytes(fresh[0], data)
-        write_bytes(fresh[1], (text + "\n").encode())
-        json_path.unlink(missing_ok=True)
-        os.replace(fresh[0], npz_path)
-        os.replace(fresh[1], json_path)
-    finally:
-        for path in fresh:
-            path.unlink(missing_ok=True)
+    write_together({npz_path: data, json_path: (text + "\n").encode()})
     return npz_path
 
 

@@ -9,6 +9,7 @@ import shlex
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, Self, TypeVar, get_type_hints
 
@@ -155,15 +156,7 @@ class LongRun(ABC):
                     f"--out is {out} and --resume {folder}: a resumed run goes on in its own folder; leave out --out."
                 )
             # Of several processes the first has the folder.
-            stored, refused = [], ""
-            if processes.first():
-                try:
-                    stored = cls._stored(folder)
-                except UserError as error:
-                    refused = str(error)
-            stored, refused = processes.told([stored, refused])
-            if refused:
-                raise UserError(refused)
+            stored = processes.told(processes.by_first(partial(cls._stored, folder)))
             arguments = [*stored, *arguments]
         given = flags_given(arguments, "preset", *cls.deciding)
         preset = given.get("preset", "quick")
@@ -214,22 +207,10 @@ class LongRun(ABC):
         stored: dict[str, Any] = {"command": command, "config": config_dict(self.config)}
         if inputs := self.inputs():
             stored["inputs"] = inputs
-        folder, resumed, refused, run = (
-            output.resume or output.out,
-            output.resume is not None,
-            "",
-            None,
-        )
-        # Of several processes the first has the folder, and what it is refused the others are told.
-        if processes.first():
-            try:
-                growing = [f"config.{name}" for name in self.growing()]
-                run = Run.open(folder, stored, resumed, wandb, growing)
-            except UserError as error:
-                refused = str(error)
-        if refused := processes.told(refused):
-            raise UserError(refused)
-        return run or Run(folder, resumed)
+        folder, resumed = output.resume or output.out, output.resume is not None
+        growing = [f"config.{name}" for name in self.growing()]
+        opened = partial(Run.open, folder, stored, resumed, wandb, growing)
+        return processes.by_first(opened) or Run(folder, resumed)
 
 
 @dataclass(frozen=True)

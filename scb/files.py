@@ -51,16 +51,31 @@ def plain(number: Any) -> float | int | None:
 
 def write_bytes(path: Path, content: bytes) -> None:
     """Writes a file so that a kill leaves the old one or the new one, never half of one."""
+    write_together({path: content})
+
+
+def write_together(contents: Mapping[Path, bytes]) -> None:
+    """Writes files as `write_bytes` writes one; of several the last, which vouches for the others, is there last.
+
+    It goes before the others are replaced, so that a kill leaves none that vouches for what it was not written with.
+    Where there is no room for all, nothing is replaced.
+    """
     # In the same folder, since a rename is atomic within one file system only.
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    fresh = {path: path.with_name(f".{path.name}.{os.getpid()}.tmp") for path in contents}
+    *others, last = contents
     try:
-        with temporary.open("wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
+        for path, content in contents.items():
+            with fresh[path].open("wb") as file:
+                file.write(content)
+                file.flush()
+                os.fsync(file.fileno())
+        if others:
+            last.unlink(missing_ok=True)
+        for path in contents:
+            os.replace(fresh[path], path)
     finally:
-        temporary.unlink(missing_ok=True)
+        for temporary in fresh.values():
+            temporary.unlink(missing_ok=True)
 
 
 def write_text(path: Path, content: str) -> None:

@@ -8,8 +8,8 @@ import contextlib
 import json
 import os
 import sys
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, TypeVar
 
 import jax
 import numpy as np
@@ -18,6 +18,8 @@ from jax.experimental import multihost_utils
 
 from scb import termination
 from scb.errors import UserError, first_line
+
+T = TypeVar("T")
 
 # What a launcher tells the processes that it starts; with all of a line, JAX finds the others by itself.
 _LAUNCHERS = {
@@ -161,6 +163,23 @@ def told(said: Any) -> Any:
     if first():
         padded[:] = text
     return json.loads(np.asarray(agreed(padded)).tobytes())
+
+
+def by_first(act: Callable[[], T]) -> T | None:
+    """What the first process does, such as with a folder that it alone has: its value there, None elsewhere.
+
+    Raises:
+      UserError: it was refused; what it is refused, all are.
+    """
+    found, refused = None, ""
+    if first():
+        try:
+            found = act()
+        except UserError as error:
+            refused = str(error)
+    if refused := told(refused):
+        raise UserError(refused)
+    return found
 
 
 def _all(tree: Any, tiled: bool) -> Any:

@@ -349,10 +349,10 @@ def test_meta_train_writes_an_objective_that_loads(
 
 def test_a_process_that_is_not_the_first_is_told_what_it_resumes(monkeypatch):
     monkeypatch.setattr("scb.processes.first", lambda: False)
-    monkeypatch.setattr("scb.processes.told", lambda said: [["--seed=7"], ""])
+    monkeypatch.setattr("scb.processes.told", lambda said: ["--seed=7"] if said is None else said)
     # It need not see the folder.
     assert MetaTrain.parse(["--resume=nowhere"]).config.evolution.seed == 7
-    monkeypatch.setattr("scb.processes.told", lambda said: [[], "nowhere is not a run."])
+    monkeypatch.setattr("scb.processes.told", lambda said: "nowhere is not a run.")
     with pytest.raises(UserError, match="nowhere is not a run"):
         MetaTrain.parse(["--resume=nowhere"])
 

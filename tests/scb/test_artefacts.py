@@ -16,7 +16,6 @@ from hypothesis import strategies as st
 
 from scb import artefacts, schema
 from scb.errors import UserError
-from scb.files import write_bytes
 
 WEIGHTS = {
     "reward": {
@@ -138,12 +137,14 @@ def test_a_save_that_dies_between_the_two_files_is_noticed(saved, monkeypatch):
 def test_where_there_is_no_room_what_was_there_stays(saved, monkeypatch):
     before = {path: path.read_bytes() for path in saved.parent.iterdir()}
 
-    def full(path, content):
-        if ".json" in path.name:
-            raise OSError(errno.ENOSPC, "No space left on device")
-        write_bytes(path, content)
+    written = []
 
-    monkeypatch.setattr(artefacts, "write_bytes", full)
+    def full(descriptor):
+        written.append(descriptor)
+        if len(written) == 2:
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("os.fsync", full)
     with pytest.raises(OSError, match="No space left"):
         artefacts.save(saved, {"other": np.ones(2)}, METADATA)
     assert {path: path.read_bytes() for path in saved.parent.iterdir()} == before
