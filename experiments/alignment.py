@@ -136,7 +136,8 @@ class Options:
 def measure(options: Options, report: dict[str, Any], save: Save) -> None:
     """A stage at a time."""
 
-    family = [*known_drifts(), *map(load_objective, (*OF_THE_ZOO, *options.adversaries))]
+    learned = [*OF_THE_ZOO, *map(str, options.adversaries)]
+    family = [*known_drifts(), *map(load_objective, learned)]
     held_out = [*other_drifts(), *map(load_objective, options.held_out)]
     for objective in held_out:
         twins = [member.name for member in family if same_drift(objective, member)]
