@@ -22,7 +22,7 @@ from matplotlib.ticker import EngFormatter, MaxNLocator
 
 from experiments.harness import Experiment, Save
 from experiments.rendering import plain
-from experiments.searches import judgements, read_log
+from experiments.searches import judgements, machines, read_log
 from experiments.zoo_table_page import TARGETS, label, rank
 from scb import listing, plotting
 from scb.environments.registry import environment_spec
@@ -35,6 +35,7 @@ STARTS: dict[str, dict[str, Any]] = {
     "warm": {"color": plotting.VERMILLION, "linestyle": "-", "marker": "o", "markersize": 3.5},
     "random": {"color": plotting.BLUE, "linestyle": "--", "marker": "s", "markersize": 3.5},
 }
+_ON_GPU = {"markerfacecolor": "white"}
 _TARGET: dict[str, Any] = {"color": plotting.BLACK, "linewidth": 1.4, "linestyle": ":"}
 # How a run's log names an algorithm's interquartile mean beside its mean.
 _IQM = "_iqm"
@@ -118,7 +119,7 @@ def _run(folder: Path) -> dict[str, Any] | str:
             "total": steps[-1],
         },
         "warm_start_minutes": warm["minutes"] if start == "warm" else 0.0,
-        "machine": warm["machine"],
+        "machines": machines(folder) or [x for x in [warm["machine"]] if x],
         "target": target,
         "reached": None
         if at_target is None
@@ -170,9 +171,10 @@ def facts(report: Mapping[str, Any]) -> dict[str, Any]:
             name: list(dict.fromkeys(_setting(x.get(name)) for x in settings)) for name in SETTINGS
         }
         differing[environment] = {name: x for name, x in of_each.items() if len(x) > 1}
-    machines = {json.dumps(run["machine"], sort_keys=True) for run in runs if run["machine"]}
+    known = {json.dumps(x, sort_keys=True) for run in runs for x in run["machines"]}
     return {
-        "machines": list(map(json.loads, sorted(machines))),
+        "machines": list(map(json.loads, sorted(known))),
+        "on": on,
         "differing": differing,
         "shipped": shipped(),
         "starts": starts(runs),
@@ -181,10 +183,11 @@ def facts(report: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def starts(runs: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Of every environment with runs of both starts, the first of each to reach the target, by total steps.
+    """Of every environment with a target and runs of both starts, the first of each to reach it, by total steps.
 
     Returns:
-      [{"environment", "warm", "random": the run or None, "tried": generations of the longest random search}].
+      [{"environment", "target", "warm", "random": the run or None, "longest": the random run of most steps, "times":
+      its steps to the target (where it gets there; else all that it took) over those of the warm one}].
     """
     found = []
     for environment in dict.fromkeys(run["environment"] for run in runs):
@@ -192,7 +195,7 @@ def starts(runs: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
             start: [r for r in runs if (r["environment"], r["start"]) == (environment, start)]
             for start in STARTS
         }
-        if not all(of_each.values()):
+        if not all(of_each.values()) or of_each["random"][0]["target"] is None:
             continue
         first = {
             start: min(
@@ -202,9 +205,33 @@ def starts(runs: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
             )
             for start, of_it in of_each.items()
         }
-        tried = max(run["generations"] for run in of_each["random"])
-        found.append({"environment": environment, "tried": tried, **first})
+        longest = max(of_each["random"], key=lambda r: r["steps"]["total"])
+        slow, fast = first["random"], first["warm"]
+        took = slow["reached"]["steps"] if slow else longest["steps"]["total"]
+        found.append(
+            {
+                "environment": environment,
+                "target": longest["target"],
+                "longest": longest,
+                "times": took / fast["reached"]["steps"] if fast else None,
+                **first,
+            }
+        )
     return found
+
+
+def on(run: Mapping[str, Any]) -> str:
+    """The machines that a run was computed on, in turn: an accelerator, or a number of cores."""
+    return ", ".join(
+        f"{x['cores']} core{'s' if x['cores'] != 1 else ''}"
+        if x["accelerator"] == "none"
+        else x["accelerator"].removeprefix("NVIDIA ").split()[0]
+        for x in run["machines"]
+    )
+
+
+def _on_gpu(run: Mapping[str, Any]) -> bool:
+    return any(x["accelerator"] != "none" for x in run["machines"])
 
 
 def shipped() -> list[dict[str, Any]]:
@@ -249,7 +276,8 @@ def figure(report: Mapping[str, Any]) -> Figure:
         for axes, column in zip(row, (1, 2), strict=True):
             for run in of_it:
                 x, y = ([point[i] for point in run["points"]] for i in (column, 3))
-                axes.plot(x, y, **STARTS[run["start"]], linewidth=1.1)
+                look = STARTS[run["start"]] | (_ON_GPU if _on_gpu(run) else {})
+                axes.plot(x, y, **look, linewidth=1.1)
             if of_it[0]["target"] is not None:
                 axes.axhline(of_it[0]["target"], **_TARGET)
             axes.margins(x=0.03, y=0.08)
@@ -262,12 +290,14 @@ def figure(report: Mapping[str, Any]) -> Figure:
         row[0].set(title=environment, ylabel=f"return ({statistics})")
     grid[-1][0].set_xlabel("minutes")
     grid[-1][1].set_xlabel("environment steps (training + evaluation)")
-    number = {start: sum(run["start"] == start for run in runs) for start in STARTS}
-    shown = {
-        f"{start} start ({number[start]} run{'s' if number[start] > 1 else ''})": look
-        for start, look in STARTS.items()
-        if number[start]
-    }
+    shown = {}
+    for start, look in STARTS.items():
+        for on_gpu in (False, True):
+            number = sum(run["start"] == start and _on_gpu(run) == on_gpu for run in runs)
+            where, more = (" on a GPU", _ON_GPU) if on_gpu else ("", {})
+            if number:
+                name = f"{start} start{where} ({number} run{'s' if number > 1 else ''})"
+                shown[name] = look | more
     if any(run["target"] is not None for run in runs):
         shown["target"] = _TARGET
     plotting.figure_title(

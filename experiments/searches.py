@@ -111,6 +111,12 @@ def read_log(folder: Path) -> tuple[list[dict[str, Any]], list[float]]:
     return metrics[:number], [line["seconds"] for line in timing[:number]]
 
 
+def machines(folder: Path) -> list[dict[str, Any]]:
+    """Where a run folder's generations were computed, in turn; empty where its log is older than that it says so."""
+    found = [line["machine"] for line in _lines(folder / "timing.jsonl") if "machine" in line]
+    return [x for i, x in enumerate(found) if x not in found[:i]]
+
+
 def _lines(path: Path) -> list[dict[str, Any]]:
     rows: list[dict[str, Any]] = []
     for line in path.read_text().splitlines() if path.exists() else []:

@@ -2,7 +2,7 @@
 
 runs/NAME/config.json       what was asked for, and the command that asks for it; --resume refuses another
 runs/NAME/metrics.jsonl     one line a generation, free of clocks: a resumed run ends with the same bytes
-runs/NAME/timing.jsonl      seconds per generation
+runs/NAME/timing.jsonl      seconds per generation; where a process takes the run up, on which machine
 runs/NAME/tensorboard/      the same numbers for TensorBoard
 runs/NAME/checkpoints/      of `scb.checkpoints`
 runs/NAME/.lock             held by the process that writes here
@@ -28,6 +28,7 @@ from tensorboardX.event_file_writer import EventsWriter
 from tensorboardX.proto.event_pb2 import Event, SessionLog
 from tensorboardX.summary import scalar
 
+from scb.artefacts import machine_description
 from scb.errors import UserError
 from scb.files import cannot_write, make_folder, plain, write_json, write_text
 
@@ -41,6 +42,7 @@ class Run:
     def __init__(self, folder: Path, resumed: bool, wandb_project: str | None = None) -> None:
         self.folder = folder
         self.resumed = resumed
+        self._on: dict[str, Any] = {"machine": machine_description()}  # until it has been logged
         self._events: EventsWriter | None = None
         self._wandb = _start_wandb(folder, wandb_project) if wandb_project else None
 
@@ -132,7 +134,9 @@ class Run:
         with (self.folder / "metrics.jsonl").open("a") as file:
             file.write(json.dumps(line) + "\n")
         with (self.folder / "timing.jsonl").open("a") as file:
-            file.write(json.dumps({"generation": generation, "seconds": round(seconds, 4)}) + "\n")
+            timing = {"generation": generation, "seconds": round(seconds, 4), **self._on}
+            file.write(json.dumps(timing) + "\n")
+        self._on = {}
         self._log_to_tensorboard(generation, metrics)
         if self._wandb is not None:
             self._wandb.log(dict(metrics), step=generation)

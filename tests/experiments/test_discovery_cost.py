@@ -232,15 +232,35 @@ def test_runs_that_were_read_before_stay_but_where_the_same_folder_is_read_again
     assert {run["name"]: run["generations"] for run in runs} == {"a": 4, "b": 4}
 
 
-def test_what_a_warm_start_saves_is_told_where_both_reach_the_target(tmp_path):
+def test_what_a_warm_start_saves_is_told(tmp_path):
     # The target is -170: the warm run is there before generation 2, after 220 steps, the random one after 440.
     warm = run_folder(tmp_path / "a")
     late = run_folder(tmp_path / "b", "random", judged={0: -400.0, 2: -300.0})
     never = run_folder(tmp_path / "c", "random", judged={0: -400.0}, final=-300.0)
-    report = discovery_cost.collect([warm, late, never])
-    page = discovery_cost.EXPERIMENT.page(report)
-    assert "**On Pendulum-v1 a random start took 2 times the steps of a warm one" in page
-    assert "Not reached from random weights" not in page
-    page = discovery_cost.EXPERIMENT.page(discovery_cost.collect([warm, never]))
-    assert "Not reached from random weights: Pendulum-v1 in 4 generations." in page
-    assert "Not reached" not in discovery_cost.EXPERIMENT.page(discovery_cost.collect([warm]))
+
+    def rows(*folders):
+        page = discovery_cost.EXPERIMENT.page(discovery_cost.collect(folders))
+        return page, [line for line in page.splitlines() if line.startswith("| Pendulum-v1 | −170")]
+
+    page, [row] = rows(warm, late, never)
+    assert "**From random weights 1 of 1 environments' targets are reached, from a warm" in page
+    assert row.startswith("| Pendulum-v1 | −170 | 220 | 440 | 2 | 1.5")
+    page, [row] = rows(warm, never)
+    assert "**From random weights 0 of 1" in page
+    assert "| 220 | not in 440: −300 after 4 generations of 32 | over 2 |" in row
+    assert not rows(warm)[1]
+
+
+def test_a_run_says_where_it_was_computed(tmp_path):
+    cpu = {"cores": 2, "processor": "AMD EPYC", "accelerator": "none"}
+    gpu = cpu | {"accelerator": "NVIDIA H100 80GB HBM3"}
+    folder = run_folder(tmp_path / "a", "random")
+    lines = (folder / "timing.jsonl").read_text().splitlines()
+    for i, machine in enumerate((gpu, gpu, cpu)):
+        lines[i] = json.dumps(json.loads(lines[i]) | {"machine": machine})
+    (folder / "timing.jsonl").write_text("\n".join(lines))
+    report = discovery_cost.collect([folder])
+    assert report["runs"][0]["machines"] == [gpu, cpu]
+    assert "4.0 on H100, 2 cores" in discovery_cost.EXPERIMENT.page(report)
+    shown = discovery_cost.figure(report).legends[0].get_texts()
+    assert "random start on a GPU (1 run)" in [text.get_text() for text in shown]

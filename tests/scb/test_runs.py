@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from scb.artefacts import machine_description
 from scb.checkpoints import Checkpoints
 from scb.errors import UserError
 from scb.files import write_json
@@ -197,7 +198,11 @@ def test_a_resumed_run_goes_on_in_its_own_run_of_wandb(tmp_path, monkeypatch):
 def test_a_logged_generation_is_one_line_of_json_without_clocks(run):
     run.log(0, {"fitness": np.float32(0.5), "failed": 2, "steps": np.int64(7)}, seconds=1.25)
     assert lines(run) == ['{"generation": 0, "fitness": 0.5, "failed": 2, "steps": 7}']
-    assert lines(run, "timing.jsonl") == ['{"generation": 0, "seconds": 1.25}']
+    run.log(1, {"fitness": 0.5}, seconds=1.5)
+    first, second = lines(run, "timing.jsonl")
+    machine = machine_description()
+    assert json.loads(first) == {"generation": 0, "seconds": 1.25, "machine": machine}
+    assert second == '{"generation": 1, "seconds": 1.5}'
 
 
 def test_a_number_that_json_does_not_know_is_null(run):
