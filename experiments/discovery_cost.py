@@ -16,6 +16,7 @@ from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import tyro
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, MaxNLocator
@@ -112,6 +113,7 @@ def _run(folder: Path) -> dict[str, Any] | str:
         "generations": len(rows),
         "planned_generations": evolution["num_generations"],
         "minutes": round(minutes[-1], 3),
+        "generation_seconds": round(float(np.median(seconds)), 3),
         "steps": {
             "warm_start": warm["steps"] if start == "warm" else 0,
             "training": rows[-1]["steps/training"],
@@ -178,6 +180,7 @@ def facts(report: Mapping[str, Any]) -> dict[str, Any]:
         "differing": differing,
         "shipped": shipped(),
         "starts": starts(runs),
+        "speeds": speeds(runs),
         "end": _end,
     }
 
@@ -228,6 +231,26 @@ def on(run: Mapping[str, Any]) -> str:
         else x["accelerator"].removeprefix("NVIDIA ").split()[0]
         for x in run["machines"]
     )
+
+
+# What a generation's time depends on, but for the machine.
+_SIZE = ("population_size", "agents_per_candidate", "evaluation_episodes", "algorithms", "mode")
+
+
+def speeds(runs: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Searches of one size, on one GPU and on CPUs: how long a generation takes.
+
+    Returns:
+      [{"environment", "settings", "gpu", "cpu": a run}], the first run of each that is as large as the other.
+    """
+    found: dict[str, dict[str, Any]] = {}
+    for run in runs:
+        if run.get("generation_seconds") is None or len(run["machines"]) != 1:
+            continue
+        size = [run["environment"], *(run["settings"][name] for name in _SIZE)]
+        nothing = {"environment": run["environment"], "settings": run["settings"]}
+        found.setdefault(json.dumps(size), nothing).setdefault("gpu" if _on_gpu(run) else "cpu", run)
+    return [pair for pair in found.values() if "gpu" in pair and "cpu" in pair]
 
 
 def _on_gpu(run: Mapping[str, Any]) -> bool:
