@@ -23,7 +23,7 @@ def drift_from(path: Path) -> Callable[[jax.Array, jax.Array], jax.Array]:
     """(log_ratio, advantage) -> penalty of a learned drift with a PPO base, as docs/elsewhere.md writes it down."""
     weights = {name: jnp.asarray(x) for name, x in np.load(path).items()}
     family = json.loads(path.with_suffix(".json").read_text())["config"]["drift"]
-    if (family["family"], family["base"], family["temporal"]) != ("network", "ppo", False):
+    if (family.get("base"), len(family.get("features", ()))) != ("ppo", 8):
         raise SystemExit(
             f"{path} is no network on PPO's clip without progress: docs/elsewhere.md says what differs."
         )

@@ -30,7 +30,8 @@ class LPO(PPO):
     def train(self) -> None:
         self.policy.set_training_mode(True)
         self._update_learning_rate(self.policy.optimizer)
-        progress = 1.0 - self._current_progress_remaining
+        # SB3 collects whole batches, the last of them past the number of steps that was asked for.
+        progress = min(1.0, 1.0 - self._current_progress_remaining)
         for _ in range(self.n_epochs):
             for batch in self.rollout_buffer.get(self.batch_size):
                 discrete = isinstance(self.action_space, spaces.Discrete)

@@ -8,7 +8,7 @@ the caller.
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -69,6 +69,25 @@ class AgentConfig(ABC):
     def num_environment_steps(self) -> int:
         """Steps that a training takes: `total_steps` rounded up."""
         return self.steps_after(self.num_iterations)
+
+
+class Step(NamedTuple):
+    """A step of N environments side by side.
+
+    Attributes:
+      observation: [N, O] of the states in which the actions were taken.
+      action: [N, ...] as they were taken, within the space's bounds.
+      reward: [N].
+      terminated, truncated: [N] whether the episode ended with it, and whether it was cut off.
+      final_observation: [N, O] of the states that it led to, before any reset.
+    """
+
+    observation: jax.Array
+    action: jax.Array
+    reward: jax.Array
+    terminated: jax.Array
+    truncated: jax.Array
+    final_observation: jax.Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -225,6 +244,43 @@ class Agent(ABC):
 
         return evaluate(env, env_params, policy, key, num_episodes, horizon)
 
+    def _reset(self, key: jax.Array, number: int, env_params: Any) -> tuple[Any, jax.Array]:
+        """Where `number` environments stand at the start of an episode: (their states, [N, O] observations)."""
+        reset = self.env.reset_env if self.one_step else self.env.reset
+        observation, env_state = jax.vmap(reset, in_axes=(0, None))(
+            split_key(key, number), env_params
+        )
+        return env_state, _flatten(observation)
+
+    def _step(
+        self, standing: tuple[Any, jax.Array], action: jax.Array, key: jax.Array, env_params: Any
+    ) -> tuple[tuple[Any, jax.Array] | None, Step]:
+        """Environments take a step from where they stand, and reset where it ends an episode.
+
+        Args:
+          action: [N, ...], not yet clipped to the action space.
+
+        Returns:
+          (where they stand then, or None where every episode is one step; the step).
+        """
+        env_state, observation = standing
+        number, space = observation.shape[0], self.env.action_space(env_params)
+        action = jax.vmap(lambda a: clip_to_space(a, space))(action)
+        inputs = (split_key(key, number), env_state, action, env_params)
+        after = None
+        if self.one_step:
+            step = jax.vmap(self.env.step_env, in_axes=(0, 0, 0, None))
+            _, _, reward, terminated, _ = step(*inputs)
+            truncated, final = jnp.zeros_like(terminated), observation
+        else:
+            step = jax.vmap(self.env.step, in_axes=(0, 0, 0, None))
+            following, env_state, reward, terminated, truncated, info = step(*inputs)
+            after = (env_state, _flatten(following))
+            final = _flatten(info["final_observation"])
+        reward = jnp.reshape(reward, (number,)).astype(jnp.float32)
+        terminated = jnp.reshape(terminated, (number,))
+        return after, Step(observation, action, reward, terminated, truncated, final)
+
     def _default_params(self) -> Any:
         """Of the agent's environment; None of a synthetic one without weights, whose spaces depend on none."""
         try:
@@ -268,3 +324,8 @@ class Algorithm:
     config: Callable[[], AgentConfig]
     hyperparameters: Callable[[], Any]
     actions: tuple[str, ...] = ("discrete", "continuous")
+
+
+def _flatten(observation: jax.Array) -> jax.Array:
+    """[N, ...] -> [N, O] floats: some grid worlds observe integers."""
+    return jnp.reshape(observation, (observation.shape[0], -1)).astype(jnp.float32)

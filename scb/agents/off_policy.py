@@ -21,7 +21,6 @@ from scb.agents.agent import Agent, AgentConfig, clipped_adam
 from scb.agents.normalization import RunningStatistics, update_statistics
 from scb.errors import UserError
 from scb.keys import key_at, split_key
-from scb.spaces import clip_to_space
 
 
 @dataclass(frozen=True)
@@ -192,7 +191,7 @@ class OffPolicyAgent(Agent):
 
         if self.one_step:
             # Contexts are independent: all of them at once.
-            _, transitions = self._step(
+            _, transitions = self._transition(
                 None, config.prefill, random_actions, key_prefill, env_params
             )
         else:
@@ -207,7 +206,7 @@ class OffPolicyAgent(Agent):
                     return random_actions(observation, key_at(keys[-1], choice))
 
                 actions = random_actions if config.prefill_hold == 1 else hold
-                return self._step(standing, config.num_envs, actions, key, env_params)
+                return self._transition(standing, config.num_envs, actions, key, env_params)
 
             standing, transitions = jax.lax.scan(step, standing, (keys[:-1], held))
             transitions = jax.tree.map(
@@ -226,7 +225,7 @@ class OffPolicyAgent(Agent):
             moment = Moment(hyperparameters, env_params, progress=progress)
             return self.explore(state.learner, self._inputs(state, observation), key, moment)
 
-        standing, transitions = self._step(
+        standing, transitions = self._transition(
             state.environment, config.num_envs, explore, key_step, env_params
         )
         state = self._remember(replace(state, key=key, environment=standing), transitions)
@@ -263,49 +262,25 @@ class OffPolicyAgent(Agent):
     ) -> jax.Array:
         return self.greedy(state.learner, self._inputs(state, observation), key, env_params, mode)
 
-    def _reset(self, key: jax.Array, number: int, env_params: Any) -> tuple[Any, jax.Array]:
-        reset = self.env.reset_env if self.one_step else self.env.reset
-        observation, env_state = jax.vmap(reset, in_axes=(0, None))(
-            split_key(key, number), env_params
-        )
-        return env_state, _flatten(observation)
-
-    def _step(
+    def _transition(
         self, standing: Any, number: int, policy: Any, key: jax.Array, env_params: Any
     ) -> tuple[Any, Transition]:
         """One step of `number` environments; one-step environments start afresh."""
         key_reset, key_act, key_step = split_key(key, 3)
-        space = self.env.action_space(env_params)
-        env_state, observation = (
-            self._reset(key_reset, number, env_params) if self.one_step else standing
-        )
-        action = jax.vmap(lambda a: clip_to_space(a, space))(policy(observation, key_act))
-        keys = split_key(key_step, number)
         if self.one_step:
-            _, _, reward, terminated, _ = jax.vmap(self.env.step_env, in_axes=(0, 0, 0, None))(
-                keys, env_state, action, env_params
-            )
-            standing, following = None, observation
-        else:
-            next_observation, env_state, reward, terminated, _, info = jax.vmap(
-                self.env.step, in_axes=(0, 0, 0, None)
-            )(keys, env_state, action, env_params)
-            standing = (env_state, _flatten(next_observation))
-            following = _flatten(info["final_observation"])
-        reward = jnp.reshape(reward, (number,)).astype(jnp.float32)
-        terminated = jnp.reshape(terminated, (number,)).astype(jnp.float32)
-        return standing, Transition(observation, action, reward, terminated, following)
+            standing = self._reset(key_reset, number, env_params)
+        action = policy(standing[1], key_act)
+        standing, step = self._step(standing, action, key_step, env_params)
+        terminated = step.terminated.astype(jnp.float32)
+        return standing, Transition(
+            step.observation, step.action, step.reward, terminated, step.final_observation
+        )
 
     def _remember(self, state: OffPolicyState, transitions: Transition) -> OffPolicyState:
         if self.config.normalize_observations:
             statistics = update_statistics(state.statistics, transitions.observation)
             state = replace(state, statistics=statistics)
         return replace(state, buffer=replay.add(state.buffer, transitions))
-
-
-def _flatten(observation: jax.Array) -> jax.Array:
-    """[N, ...] -> [N, O] floats: some grid worlds observe integers."""
-    return jnp.reshape(observation, (observation.shape[0], -1)).astype(jnp.float32)
 
 
 def target_values(batch: Transition, next_value: jax.Array, discount: ArrayLike) -> jax.Array:

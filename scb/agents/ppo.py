@@ -25,7 +25,7 @@ from scb.agents.agent import Agent, AgentConfig, Algorithm, clipped_adam
 from scb.agents.normalization import RunningStatistics, update_statistics
 from scb.errors import UserError
 from scb.keys import split_key
-from scb.spaces import action_size, clip_to_space
+from scb.spaces import action_size
 
 DriftFunction: TypeAlias = Callable[[Any, jax.Array, jax.Array, jax.Array], jax.Array]
 
@@ -242,10 +242,7 @@ class PPO(Agent):
         }
         standing = None
         if not self.one_step:
-            observation, env_state = jax.vmap(self.env.reset, in_axes=(0, None))(
-                split_key(key_reset, self.config.num_envs), env_params
-            )
-            standing = (env_state, observation)
+            standing = self._reset(key_reset, self.config.num_envs, env_params)
         return PPOState(
             params=params,
             optimizer={
@@ -329,23 +326,14 @@ class PPO(Agent):
 
     def _collect_contexts(self, state: PPOState, key: jax.Array, env_params: Any) -> Batch:
         """One batch of independent one-step episodes: nothing to bootstrap, A = r - V(s)."""
-        size = self.config.batch_size
-        space = self.env.action_space(env_params)
         key_reset, key_act, key_step = split_key(key, 3)
-        observation, env_state = jax.vmap(self.env.reset_env, in_axes=(0, None))(
-            split_key(key_reset, size), env_params
-        )
-        observation = jnp.reshape(observation, (size, -1))
+        standing = self._reset(key_reset, self.config.batch_size, env_params)
+        _, observation = standing
         distribution = self._policy(state, observation, env_params)
         action, log_prob = distribution.sample_and_log_prob(seed=key_act)
-        _, _, reward, _, _ = jax.vmap(self.env.step_env, in_axes=(0, 0, 0, None))(
-            split_key(key_step, size),
-            env_state,
-            jax.vmap(lambda a: clip_to_space(a, space))(action),
-            env_params,
-        )
-        advantage = reward - self._value(state, observation, env_params)
-        return Batch(observation, action, log_prob, advantage, reward)
+        _, step = self._step(standing, action, key_step, env_params)
+        advantage = step.reward - self._value(state, observation, env_params)
+        return Batch(observation, action, log_prob, advantage, step.reward)
 
     def _collect_steps(
         self,
@@ -354,50 +342,28 @@ class PPO(Agent):
         hyperparameters: PPOHyperparameters,
         env_params: Any,
     ) -> tuple[PPOState, Batch]:
-        num_envs, num_steps = self.config.num_envs, self.config.num_steps
-        space = self.env.action_space(env_params)
 
-        def flat(observation: jax.Array) -> jax.Array:
-            return jnp.reshape(observation, (num_envs, -1))
-
-        def step(carry: Any, key: jax.Array) -> Any:
-            env_state, observation = carry
+        def step(standing: Any, key: jax.Array) -> Any:
             key_act, key_step = split_key(key)
-            distribution = self._policy(state, flat(observation), env_params)
+            distribution = self._policy(state, standing[1], env_params)
             action, log_prob = distribution.sample_and_log_prob(seed=key_act)
-            next_observation, env_state, reward, terminated, truncated, info = jax.vmap(
-                self.env.step, in_axes=(0, 0, 0, None)
-            )(
-                split_key(key_step, num_envs),
-                env_state,
-                jax.vmap(lambda a: clip_to_space(a, space))(action),
-                env_params,
-            )
-            transition = {
-                "observation": flat(observation),
-                "action": action,
-                "log_prob": log_prob,
-                "reward": jnp.reshape(reward, (num_envs,)),
-                "terminated": terminated,
-                "truncated": truncated,
-                "final_observation": flat(info["final_observation"]),
-            }
-            return (env_state, next_observation), transition
+            standing, step = self._step(standing, action, key_step, env_params)
+            return standing, (step, action, log_prob)
 
-        standing, steps = jax.lax.scan(step, state.environment, split_key(key, num_steps))
-        value = self._value(state, steps["observation"], env_params)
+        standing, (steps, action, log_prob) = jax.lax.scan(
+            step, state.environment, split_key(key, self.config.num_steps)
+        )
+        value = self._value(state, steps.observation, env_params)
         advantage = generalized_advantages(
-            steps["reward"],
+            steps.reward,
             value,
-            self._value(state, steps["final_observation"], env_params),
-            steps["terminated"],
-            steps["truncated"],
+            self._value(state, steps.final_observation, env_params),
+            steps.terminated,
+            steps.truncated,
             hyperparameters.discount,
             hyperparameters.gae_lambda,
         )
-        batch = Batch(
-            steps["observation"], steps["action"], steps["log_prob"], advantage, advantage + value
-        )
+        batch = Batch(steps.observation, action, log_prob, advantage, advantage + value)
         batch = jax.tree.map(lambda x: jnp.reshape(x, (-1, *x.shape[2:])), batch)
         return replace(state, environment=standing), batch
 
