@@ -249,7 +249,9 @@ def speeds(runs: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
             continue
         size = [run["environment"], *(run["settings"][name] for name in _SIZE)]
         nothing = {"environment": run["environment"], "settings": run["settings"]}
-        found.setdefault(json.dumps(size), nothing).setdefault("gpu" if _on_gpu(run) else "cpu", run)
+        found.setdefault(json.dumps(size), nothing).setdefault(
+            "gpu" if _on_gpu(run) else "cpu", run
+        )
     return [pair for pair in found.values() if "gpu" in pair and "cpu" in pair]
 
 
