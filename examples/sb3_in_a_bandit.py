@@ -2,7 +2,8 @@
 
 python examples/sb3_in_a_bandit.py --algorithm sac --steps 10000
 
-It needs stable-baselines3 beside this library. Hyperparameters are the defaults of SB3.
+It needs stable-baselines3 beside this library. Hyperparameters are the defaults of SB3. The agent of this command
+earned −180 on Pendulum; docs/sb3.md has ten of every algorithm.
 """
 
 import gymnasium

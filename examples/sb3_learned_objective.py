@@ -3,7 +3,8 @@
 python examples/sb3_learned_objective.py --objective lpo-pendulum --seed 1
 
 It needs stable-baselines3 beside this library. What the objective changes is the line with `policy_loss`; the
-rest of `train` is SB3's own, but for clipped values, early stopping and most of the log.
+rest of `train` is SB3's own, but for clipped values, early stopping and most of the log. With the defaults, three
+agents earned −147 with lpo-pendulum (−158 to −130) and −195 with ppo (−206 to −175).
 """
 
 from typing import Any
