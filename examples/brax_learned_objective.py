@@ -3,7 +3,8 @@
 python examples/brax_learned_objective.py --objective lpo-pendulum --seed 1
 
 The trainer takes no loss from outside, but looks its own up when it starts: for as long as it trains, that one is
-replaced by the same with another policy loss.
+replaced by the same with another policy loss. With the defaults and seeds 1 to 3, agents earned 244, 150 and 418
+with lpo-pendulum, and 282, 151 and 513 with ppo.
 """
 
 from typing import Any
