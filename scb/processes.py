@@ -7,6 +7,7 @@ parts are worth is gathered. The first process alone writes.
 import contextlib
 import json
 import os
+import socket
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeVar
@@ -78,10 +79,18 @@ def start(given: Mapping[str, str], environment: Mapping[str, str] = os.environ)
             "as there are to be, with one coordinator, which process 0 listens at."
         ) from error
     termination.arm()  # JAX has its own use for the signal
-    if jax.device_count() != jax.process_count() * jax.local_device_count():
+    try:
+        devices, own = jax.device_count(), jax.local_device_count()
+    # Such as a machine that does not know the address of its own name, at which the others were to reach it.
+    except RuntimeError as error:
         raise UserError(
-            f"process {jax.process_index()} has {jax.local_device_count()} devices of {jax.device_count()} in "
-            f"{jax.process_count()} processes: give each as many, such as by JAX_NUM_CPU_DEVICES."
+            f"this process has no devices to share with the others ({first_line(error)}): see that "
+            f"{socket.gethostname()}, the name of its machine, has an address, such as in /etc/hosts."
+        ) from error
+    if devices != jax.process_count() * own:
+        raise UserError(
+            f"process {jax.process_index()} has {own} devices of {devices} in {jax.process_count()} processes: give "
+            "each as many, such as by JAX_NUM_CPU_DEVICES."
         )
 
 
@@ -92,15 +101,16 @@ def end(status: int) -> None:
     """
     if global_state.client is None:
         return
-    if first():
-        for i in range(1, jax.process_count()):
+    # Not asked of JAX, which may have been unable to start its devices.
+    if global_state.process_id == 0:
+        for i in range(1, global_state.num_processes):
             # One that doesn't end has lost its way, and says so itself.
             with contextlib.suppress(jax.errors.JaxRuntimeError):
                 global_state.client.blocking_key_value_get(f"ended/{i}", _GOODBYE * 1000)
         return
     sys.stdout.flush()
     sys.stderr.flush()
-    global_state.client.key_value_set(f"ended/{jax.process_index()}", "")
+    global_state.client.key_value_set(f"ended/{global_state.process_id}", "")
     os._exit(status)
 
 

@@ -24,8 +24,8 @@ try:
 except ImportError:  # Windows has none, and there nobody is kept out of a run
     fcntl = None  # type: ignore[assignment]
 
-from tensorboardX.event_file_writer import EventsWriter
 from tensorboardX.proto.event_pb2 import Event, SessionLog
+from tensorboardX.record_writer import RecordWriter
 from tensorboardX.summary import scalar
 
 from scb.artefacts import machine_description
@@ -43,7 +43,7 @@ class Run:
         self.folder = folder
         self.resumed = resumed
         self._on: dict[str, Any] = {"machine": machine_description()}  # until it has been logged
-        self._events: EventsWriter | None = None
+        self._events: RecordWriter | None = None
         self._wandb = _start_wandb(folder, wandb_project) if wandb_project else None
 
     @classmethod
@@ -143,18 +143,29 @@ class Run:
 
     def _log_to_tensorboard(self, generation: int, metrics: Mapping[str, float]) -> None:
         # Not by a SummaryWriter, whose thread dies of a full disk, upon which its queue waits for ever.
+        now, events = time.time(), []
         if self._events is None:
             folder = self.folder / "tensorboard"
             folder.mkdir(exist_ok=True)
-            self._events = EventsWriter(str(folder / "events"))
+            name = f"events.out.tfevents.{now:.0f}.{socket.gethostname()}"
+            self._events = RecordWriter(str(folder / name))
+            events.append(Event(wall_time=now, file_version="brain.Event:2"))
             if self.resumed:  # hides what a killed run wrote from here on
                 start = SessionLog(status=SessionLog.START)
-                self._events.write_event(Event(step=generation, session_log=start))
-        for name, value in metrics.items():
-            summary = scalar(name, float(value))
-            event = Event(wall_time=time.time(), step=generation, summary=summary)
-            self._events.write_event(event)
-        self._events.flush()
+                events.append(Event(wall_time=now, step=generation, session_log=start))
+        events += [
+            Event(wall_time=now, step=generation, summary=scalar(name, float(value)))
+            for name, value in metrics.items()
+        ]
+        try:
+            for event in events:
+                self._events.write(event.SerializeToString())
+            self._events.flush()
+        except OSError:
+            # Left open, Python 3.13 tries once more when it ends, and complains.
+            with contextlib.suppress(OSError):
+                self._events.close()
+            raise
 
     def metrics(self) -> list[dict[str, Any]]:
         """All logged generations, oldest first."""

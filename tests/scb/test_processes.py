@@ -206,6 +206,17 @@ def test_what_a_launcher_says_is_enough_where_it_says_all(monkeypatch, environme
     assert bool(asked) == joined
 
 
+def test_a_machine_whose_own_name_has_no_address_is_told_so(monkeypatch):
+    def unknown():
+        raise RuntimeError("Unable to initialize backend 'cpu': rv == 0. -2 vs 0")
+
+    monkeypatch.setattr(jax.distributed, "initialize", lambda **_: None)
+    monkeypatch.setattr(jax.config, "update", lambda *_: None)
+    monkeypatch.setattr(jax, "device_count", unknown)
+    with pytest.raises(UserError, match=f"-2 vs 0.*{socket.gethostname()}.* has an address"):
+        processes.start({}, SLURM)
+
+
 def test_members_are_dealt_out_in_order_and_all_of_them(monkeypatch):
     monkeypatch.setattr(jax, "process_count", lambda: 3)
     monkeypatch.setattr(jax, "local_devices", lambda: ["a", "b"])
