@@ -8,7 +8,7 @@ need to match the former. Published bandits are read from --published DIRECTORY;
 measured alone. PPO's agents in environments are those of experiments.locomotion, where it has them at this length.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -27,7 +27,7 @@ from scb.agents.spec import AgentSpec, bandit_agent, environment_agent
 from scb.environments.registry import environment_spec
 from scb.rows import Rows, pivot
 from scb.seeds import REPORTING
-from scb.statistics import DECIDING, estimate
+from scb.statistics import DECIDING, estimate, median
 
 OURS, PUBLISHED = "ours", "published"
 LOOKS: dict[str, dict[str, Any]] = {
@@ -159,6 +159,15 @@ def steps_to_match(curves: Mapping[str, Any], level: float) -> list[int | None]:
     return [int(curves["steps"][int(np.argmax(row))]) if row.any() else None for row in reached]
 
 
+def steps_without(curves: Mapping[str, Any], level: float) -> list[int]:
+    """For each agent the steps of its last evaluation before the one that reaches the level: it took more."""
+    reached = np.asarray(curves["returns"]) >= level
+    steps = curves["steps"]
+    return [
+        int(steps[max(int(np.argmax(row)) - 1, 0)] if row.any() else steps[-1]) for row in reached
+    ]
+
+
 def _environment_of(name: str) -> str:
     return name.rsplit(", ", 1)[0]
 
@@ -166,21 +175,23 @@ def _environment_of(name: str) -> str:
 def matches(report: Mapping[str, Any]) -> list[dict[str, Any]]:
     """For each bandit and algorithm that was trained in the environment too: who reaches the bandit's level, when.
 
-    The level is uncertain, so the median number of steps to the lower end of its interval is there too.
+    Medians of steps are (of the last evaluations without it, of the first that reach it). The level is uncertain, so
+    those to the lower end of its interval are there too.
     """
 
-    def median(steps: Sequence[int | None]) -> float | None:
-        middle = float(np.median([np.inf if x is None else x for x in steps]))
-        return middle if np.isfinite(middle) else None
+    def medians(curves: Mapping[str, Any], level: float) -> tuple[float, float | None]:
+        reached = [np.inf if x is None else x for x in steps_to_match(curves, level)]
+        middle = float(np.median(reached))
+        before = float(np.median(steps_without(curves, level)))
+        return before, middle if np.isfinite(middle) else None
 
     rows = []
     for name, algorithms in report["bandits"].items():
         environment, _, backend = _environment_of(name).partition(" (")
         for algorithm, curves in report["environments"][_environment_of(name)].items():
             level = estimate(finals(algorithms[algorithm]))
-            steps = steps_to_match(curves, level.value)
             low = level.value if level.low is None else level.low
-            each_low = steps_to_match(curves, low)
+            steps = steps_to_match(curves, level.value)
             rows.append(
                 {
                     "bandit": name,
@@ -192,11 +203,10 @@ def matches(report: Mapping[str, Any]) -> list[dict[str, Any]]:
                     "bandit_steps": algorithms[algorithm]["steps"][-1],
                     "reached": sum(x is not None for x in steps),
                     "agents": len(steps),
-                    "steps": median(steps),
-                    "each_low": each_low,
-                    "steps_low": median(each_low),
+                    "steps": medians(curves, level.value),
+                    "without_low": steps_without(curves, low),
+                    "steps_low": medians(curves, low),
                     "trained": curves["steps"][-1],
-                    "spacing": curves["steps"][1] - curves["steps"][0],
                 }
             )
     return rows
@@ -205,17 +215,20 @@ def matches(report: Mapping[str, Any]) -> list[dict[str, Any]]:
 def claims(report: Report) -> list[Claim]:
     """Row by row of `matches`: the environment takes 50 times the steps or more, for agents that locomote.
 
-    The steps are those to the lower end of the bandit's level, so that the luck of its agents does not decide. An agent
-    that never gets there counts with all steps of its training; where that was for less than 50 times, nothing is told.
+    The steps are those of an agent's last evaluation below the lower end of the bandit's level, after which it took
+    more: neither the luck of the bandit's agents decides, nor how far evaluations are apart. An agent that never gets
+    there counts with all steps of its training; where that was for less than 50 times, nothing is told.
     """
     found = []
     for row in matches(report):
-        times = np.array([_ratio(row, x) for x in row["each_low"]])
-        told = None not in row["each_low"] or _ratio(row, None) >= LEAST_TIMES
+        times = np.array(row["without_low"]) / row["bandit_steps"]
+        told = (
+            max(row["without_low"]) < row["trained"]
+            or row["trained"] >= LEAST_TIMES * row["bandit_steps"]
+        )
         name = f"{row['bandit']}, {row['algorithm'].upper()}"
         text = f"{name}: the environment takes {LEAST_TIMES} times the steps or more"
-        median = partial(estimate, times, statistic=np.median)
-        evidence = of_agents(median, len(times)) if told else None
+        evidence = of_agents(partial(median, times), len(times)) if told else None
         found.append(Claim(text, evidence, LEAST_TIMES, places=0))
         standing = environment_spec(row["environment"]).standing_still(row["backend"])
         if standing is not None:
@@ -249,21 +262,20 @@ def facts(report: Report) -> dict[str, Any]:
         "finals": rows,
         "matches": found,
         "deciding": DECIDING,
-        "ordered": sorted(told, key=lambda row: _ratio(row, row["steps"])),
+        "ordered": sorted(told, key=lambda row: row["steps"][0]),
         "times": _times,
         "least_times": LEAST_TIMES,
-        "short": [f"{x['bandit']}, {x['algorithm'].upper()}" for x in found if x["steps"] is None],
+        "short": [
+            f"{x['bandit']}, {x['algorithm'].upper()}" for x in found if x["steps"][1] is None
+        ],
         "lost": lost,
     }
 
 
-def _ratio(row: Mapping[str, Any], steps: float | None) -> float:
-    """The environment's steps as a multiple of the bandit's; where they were not enough, of those that were trained."""
-    return float((row["trained"] if steps is None else steps) / row["bandit_steps"])
-
-
-def _times(row: Mapping[str, Any], steps: float | None) -> str:
-    return f"{'more than ' if steps is None else ''}{_ratio(row, steps):.0f}"
+def _times(row: Mapping[str, Any], steps: tuple[float, float | None]) -> str:
+    """The environment's steps, without the level and then with it, as a multiple of the bandit's."""
+    without, reached = (x if x is None else round(x / row["bandit_steps"]) for x in steps)
+    return f"more than {without}" if reached is None else f"{without} to {reached}"
 
 
 def draw(report: Mapping[str, Any]) -> Figure:

@@ -7,8 +7,7 @@ reward, its Q-function as the reward) on two distributions of states (the bandit
 is learned depends on the expert, so there are several.
 """
 
-from collections.abc import Mapping
-from functools import partial
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax.numpy as jnp
@@ -16,7 +15,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import scb
-from experiments.claims import OF_THE_WAY, TENTH, Claim
+from experiments.claims import OF_THE_WAY, TENTH, Claim, of_searches
 from experiments.harness import Experiment, Report, Save, bandit_of, finite
 from scb import plotting
 from scb.agents.spec import bandit_agent
@@ -28,7 +27,6 @@ from scb.measurement import Place
 from scb.seeds import ILLUSTRATING, REPORTING
 from scb.statistics import (
     Estimate,
-    few_groups_difference,
     iqm,
     normalized_score,
     pooled_estimate,
@@ -156,9 +154,9 @@ def scores_of(report: Mapping[str, Any], reward: str, states: str) -> np.ndarray
 def claims(report: Report) -> list[Claim]:
     """Whether each way to learn needs the contexts, Q works badly, and the other two ways do as well."""
 
-    def more(one: tuple[str, str], than: tuple[str, str]) -> partial[Estimate]:
+    def more(one: tuple[str, str], than: tuple[str, str]) -> Callable[..., Estimate] | Estimate:
         scores, others = (scores_of(report, *x) for x in (one, than))
-        return partial(few_groups_difference, scores, others, paired_groups=True)
+        return of_searches(scores, others, paired=True)  # and of as few experts
 
     itself = (BANDIT, SYNTHETIC)
     return [

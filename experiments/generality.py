@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 
 import scb
 from experiments import searches
-from experiments.claims import OF_THE_WAY, TENTH, Claim
+from experiments.claims import OF_THE_WAY, TENTH, Claim, over_environments
 from experiments.harness import Experiment, Report, bandit_of, finite
 from experiments.parts import InParts, Part, lacking
 from scb import measurement, plotting
@@ -37,11 +37,8 @@ from scb.rows import Rows, pivot
 from scb.seeds import REPORTING
 from scb.statistics import (
     Estimate,
-    estimate,
     iqm,
     normalized_score,
-    paired_difference,
-    stratified_estimate,
     worst_decile,
 )
 
@@ -174,18 +171,26 @@ def in_environment(config: NeuroevolutionConfig, limit: int) -> NeuroevolutionCo
 
 
 def columns(entry: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """{column of the figure: [N] returns}: algorithms, all of them together, and agents that no search saw."""
-    trained = {name: np.asarray(x) for name, x in entry["returns"].items()}
+    """{column of the figure: [N, K] returns}: algorithms, all together, and agents that no search saw.
+
+    Of N draws of a seed and hyperparameters, which K algorithms share.
+    """
+    trained = {name: np.asarray(x)[:, None] for name, x in entry["returns"].items()}
     algorithms = [name for name in trained if "," not in name and name not in UNSEEN]
     found = {name: trained[name] for name in algorithms}
-    found[TOGETHER] = np.concatenate(list(found.values()))
+    found[TOGETHER] = np.hstack(list(found.values()))
     for network in (WIDE, SWISH):
-        found[network] = np.concatenate([trained[f"{name}, {network}"] for name in algorithms])
+        found[network] = np.hstack([trained[f"{name}, {network}"] for name in algorithms])
     return found | {name: trained[name] for name in (EVOLVED, OPTIMAL) if name in trained}
 
 
+def estimates(entry: Mapping[str, Any]) -> dict[str, Estimate]:
+    """{column of the figure: what its agents earn}."""
+    return {name: over_environments([x]) for name, x in columns(entry).items()}
+
+
 def normalized(report: Mapping[str, Any], source: str, column: str) -> list[np.ndarray]:
-    """Per environment the scores of one kind of agent: 0 a random policy, 1 the paper's expert."""
+    """Per environment the scores [N, K] of one kind of agent: 0 a random policy, 1 the paper's expert."""
     return [
         normalized_score(
             columns(entry[source])[column],
@@ -199,9 +204,9 @@ def normalized(report: Mapping[str, Any], source: str, column: str) -> list[np.n
 def claims(report: Report) -> list[Claim]:
     """Robustness, by all agents and by the worst; what drawing hyperparameters brings; agents that no search saw."""
     scores = {source: normalized(report, source, TOGETHER) for source in SOURCES}
-    robust = partial(stratified_estimate, scores[ZOO], scores[ENVIRONMENT], num_resamples=RESAMPLES)
+    robust = partial(over_environments, scores[ZOO], scores[ENVIRONMENT], num_resamples=RESAMPLES)
     # One search each: how far two others would be apart, agents can't tell.
-    brought = stratified_estimate(scores[DRAWN], scores[FIXED]).value
+    brought = over_environments(scores[DRAWN], scores[FIXED]).value
     found = [
         Claim(
             "drawn hyperparameters: the mean score is better in the zoo's bandits",
@@ -213,7 +218,7 @@ def claims(report: Report) -> list[Claim]:
     for name in UNSEEN:
         # Networks differ from the paper's agent by agent; other agents have nothing in common with them.
         evidence = partial(
-            stratified_estimate,
+            over_environments,
             normalized(report, ZOO, name),
             scores[ZOO],
             paired=name in (WIDE, SWISH),
@@ -229,13 +234,13 @@ def facts(report: Report) -> dict[str, Any]:
     scores = {source: normalized(report, source, TOGETHER) for source in SOURCES}
     return {
         "scores": {
-            source: [stratified_estimate(x, statistic=s) for s in (iqm, np.mean, worst_decile)]
+            source: [over_environments(x, statistic=s) for s in (iqm, np.mean, worst_decile)]
             for source, x in scores.items()
         },
-        "unseen": {name: stratified_estimate(normalized(report, ZOO, name)) for name in UNSEEN},
+        "unseen": {name: over_environments(normalized(report, ZOO, name)) for name in UNSEEN},
         "brought": {
-            name: paired_difference(
-                columns(entry[DRAWN])[TOGETHER], columns(entry[FIXED])[TOGETHER]
+            name: over_environments(
+                [columns(entry[DRAWN])[TOGETHER]], [columns(entry[FIXED])[TOGETHER]]
             )
             for name, entry in report["environments"].items()
         },
@@ -245,7 +250,7 @@ def facts(report: Report) -> dict[str, Any]:
         },
         "sources": SOURCES,
         "columns": {
-            name: {source: columns(entry[source]) for source in SOURCES}
+            name: {source: estimates(entry[source]) for source in SOURCES}
             for name, entry in report["environments"].items()
         },
         "names": {"together": TOGETHER, "wide": WIDE, "swish": SWISH},
@@ -275,7 +280,7 @@ def draw(report: Mapping[str, Any]) -> Figure:
         entry = report["environments"][name]
         shown = list(columns(entry[ZOO]))
         for i, (source, look) in enumerate(looks.items()):
-            found = {c: estimate(x) for c, x in columns(entry[source]).items()}
+            found = estimates(entry[source])
             axes.errorbar(
                 [shown.index(column) + 0.17 * (i - 1.5) for column in found],
                 [x.value for x in found.values()],

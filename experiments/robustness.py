@@ -20,7 +20,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from experiments.claims import TENTH, Claim
+from experiments.claims import TENTH, Claim, over_environments
 from experiments.harness import Experiment, Report, finite, packed, plan_of, settled, unpacked
 from experiments.parts import InParts, Part
 from lpo.comparison import ppo_spec
@@ -33,7 +33,7 @@ from scb.measurement import Agents, Place, measure
 from scb.plotting import BLUE, VERMILLION, estimate_row, figure_title
 from scb.rows import Rows
 from scb.seeds import REPORTING, VALIDATING
-from scb.statistics import Statistic, normalized_score, stratified_estimate, worst_decile
+from scb.statistics import Statistic, normalized_score, worst_decile
 
 _PLAN = plan_of("robustness")
 REFERENCE = "ppo"
@@ -172,7 +172,7 @@ def claims(report: Report) -> list[Claim]:
             if not ours:
                 continue
             for what, statistic in STATISTICS.items():
-                better = partial(stratified_estimate, ours, theirs, statistic=statistic)
+                better = partial(over_environments, ours, theirs, statistic=statistic)
                 found.append(Claim(f"{name}: a higher {what} than {other}", better))
     return found
 
@@ -193,13 +193,13 @@ def facts(report: Report) -> dict[str, Any]:
             {
                 "name": name,
                 **{
-                    what: stratified_estimate(ours, statistic=statistic)
+                    what: over_environments(ours, statistic=statistic)
                     for what, statistic in STATISTICS.items()
                 },
-                "fails": stratified_estimate(failing, statistic=np.mean),
+                "fails": over_environments(failing, statistic=np.mean),
                 "improves": None
                 if name == REFERENCE
-                else stratified_estimate(above, statistic=np.mean),
+                else over_environments(above, statistic=np.mean),
                 "in": {e: x[name].mean() for e, x in scored.items() if name in x},
                 "agents": sum(x.size for x in ours),
                 "broken": sum(

@@ -246,13 +246,15 @@ def _judged(
 
 def _earned(objective: Objective, environment: str, at: Evaluation, options: Options) -> np.ndarray:
     """[seeds] what agents earn at the end of their training: a score where there are other environments too."""
+    # What was found by an earlier version is another objective, whose rows are its own.
+    digest = f"-{found[:8]}" if (found := objective.metadata.get("sha256")) else ""
     (curves,) = compare(
         environment,
         [objective],
         list(range(at.first_seed, at.first_seed + at.seeds)),
         spec=ppo_spec(environment, None, at.policy_output_scale),
         points=1,
-        rows=Rows(options.runs / at.name / f"{objective.name}-{environment}.rows.jsonl"),
+        rows=Rows(options.runs / at.name / f"{objective.name}{digest}-{environment}.rows.jsonl"),
     ).curves
     if not at.normalized:
         return curves.final

@@ -7,7 +7,7 @@ rest: it is as robust as the median against a lucky or a failed seed, and wastes
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import partial
+from functools import cache, partial
 
 import numpy as np
 import scipy.stats
@@ -82,6 +82,22 @@ def estimate(x: ArrayLike, statistic: Statistic = iqm, confidence: float = 0.95)
     )
 
 
+def median(x: ArrayLike, confidence: float = 0.95) -> Estimate:
+    """The median of [N] runs, with an interval between two of them that no ties make too narrow.
+
+    By order statistics, whose confidence is at least what is asked for whatever the runs are distributed like
+    (`scipy.stats.quantile_test`); no interval where there are too few runs for one.
+
+    Raises:
+      UserError: x is not a vector, is empty, or holds NaN or infinity.
+    """
+    _check_confidence(confidence)
+    values = _runs("x", x)
+    ends = scipy.stats.quantile_test(values, p=0.5).confidence_interval(confidence)
+    found = Estimate(float(np.median(values)), float(ends.low), float(ends.high), values.size)
+    return found if np.isfinite(ends).all() else found.without_interval()
+
+
 def paired_difference(a: ArrayLike, b: ArrayLike, confidence: float = 0.95) -> Estimate:
     """IQM(a) - IQM(b) of two methods that ran on the same seeds.
 
@@ -108,6 +124,7 @@ def stratified_estimate(
     seed: int = 0,
     statistic: Statistic = iqm,
     paired: bool = True,
+    shared: bool = False,
 ) -> Estimate:
     """The mean over groups of their interquartile means, with an interval that resamples within every group.
 
@@ -115,37 +132,41 @@ def stratified_estimate(
     interval where a group has a single run, which cannot tell.
 
     Args:
-      groups: [N_g] one number per run, for each group.
+      groups: [N_g] one number per run, for each group; or [N_g, K_g], K_g runs of each of N_g draws, such as of
+        hyperparameters for several algorithms, where draws are resampled and not runs.
       minus: as many groups; the estimate is then that of the difference.
       statistic: of a group, in place of its interquartile mean.
       paired: whether `minus` has the same runs on the same seeds, which are then drawn together.
+      shared: whether groups of as many draws have the same ones, as where every environment is given the same
+        hyperparameters: they are then drawn together.
 
     Raises:
       UserError: no groups, or other sizes in `minus`.
     """
-    first = [_runs("a group", group) for group in groups]
-    second = [_runs("a group", group) for group in (() if minus is None else minus)]
+    first = [_draws("a group", group) for group in groups]
+    second = [_draws("a group", group) for group in (() if minus is None else minus)]
     if not first:
         raise UserError("there is no group: give at least one.")
     if minus is not None and (
-        len(first) != len(second)
-        or (paired and [x.size for x in first] != [x.size for x in second])
+        len(first) != len(second) or (paired and list(map(len, first)) != list(map(len, second)))
     ):
         raise UserError("the groups to subtract have other sizes: pair run by run.")
 
     def mean(rows: Rows) -> NDArray[np.floating]:
+        ours = cache(rows) if shared else rows
+        theirs = cache(rows) if shared else rows
         found = np.zeros(())
         for i, group in enumerate(first):
-            drawn = rows(group.size)
-            found = found + statistic(group[drawn], axis=1)
+            drawn = ours(len(group))
+            found = found + statistic(group[drawn].reshape(len(drawn), -1), axis=1)
             if second:
-                other = drawn if paired else rows(second[i].size)
-                found = found - statistic(second[i][other], axis=1)
+                other = drawn if paired else theirs(len(second[i]))
+                found = found - statistic(second[i][other].reshape(len(other), -1), axis=1)
         return found / len(first)
 
-    sizes = [group.size for group in (*first, *second)]
+    sizes = [len(group) for group in (*first, *second)]
     found = _bootstrapped(mean, sizes, confidence, num_resamples, seed)
-    return replace(found, n=sum(sizes[: len(first)]))
+    return replace(found, n=sum(group.size for group in first))
 
 
 def pooled_estimate(groups: ArrayLike) -> Estimate:
@@ -332,6 +353,12 @@ def _runs(name: str, x: ArrayLike) -> NDArray[np.floating]:
             "over episodes first."
         )
     return values
+
+
+def _draws(name: str, x: ArrayLike) -> NDArray[np.floating]:
+    """[N, K] runs of N draws, of each of which a vector has one."""
+    values = np.asarray(x)
+    return _groups(name, values) if values.ndim > 1 else _runs(name, x)[:, None]
 
 
 def _groups(name: str, x: ArrayLike) -> NDArray[np.floating]:

@@ -53,6 +53,13 @@ def test_scores_are_between_the_random_policy_and_each_expert():
     )
 
 
+def test_a_few_experts_decide_nothing(report):
+    whole = [x.outcome for x in experiment.EXPERIMENT.judged(report)]
+    assert "holds" in whole
+    few = report | {"experts": dict(list(report["experts"].items())[:3])}
+    assert {x.outcome for x in experiment.EXPERIMENT.judged(few)} == {"undecided"}
+
+
 @pytest.mark.slow
 def test_a_run_goes_on_with_the_expert_that_it_was_at(monkeypatch, small_agents):
     chosen = ((CLONING, SYNTHETIC), (BANDIT, EXPERT))

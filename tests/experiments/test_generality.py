@@ -68,8 +68,9 @@ def test_columns_pool_the_algorithms():
     }
     found = generality.columns({"returns": entry})
     assert list(found) == ["ppo", "sac", TOGETHER, WIDE, SWISH, EVOLVED]
-    np.testing.assert_array_equal(found[TOGETHER], [1.0, 2.0, 3.0, 4.0])
-    np.testing.assert_array_equal(found[WIDE], [5.0, 6.0])
+    # A row a draw, a column an algorithm.
+    np.testing.assert_array_equal(found[TOGETHER], [[1.0, 3.0], [2.0, 4.0]])
+    np.testing.assert_array_equal(found[WIDE], [[5.0, 6.0]])
 
 
 def test_the_two_searches_differ_in_drawn_hyperparameters_alone():

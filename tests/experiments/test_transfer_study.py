@@ -1,10 +1,13 @@
 """The transfer study's variations are commands that exist, and its page says what was measured."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from experiments import transfer_study as module
 from experiments.searches import meta_training
+from lpo.objectives import load_objective
 from scb.statistics import estimate
 
 
@@ -102,6 +105,26 @@ def test_what_an_earlier_search_found_is_measured_again(tmp_path, monkeypatch, r
     small = entry["returns"]["Pendulum, small last layer"]
     assert small["0"] == [0.0, 0.0] and small["1"][0] == -220.0
     assert entry["digests"] == {"0": "now", "1": "now"}
+
+
+def test_objectives_of_one_name_have_rows_of_their_own(tmp_path, monkeypatch):
+    kept = []
+
+    def compared(*arguments, rows, **named):
+        kept.append(rows.path.name)
+        return SimpleNamespace(curves=[SimpleNamespace(final=np.zeros(2))])
+
+    monkeypatch.setattr(module, "compare", compared)
+    at, options = module.EVALUATIONS[0], module.Options(runs=tmp_path)
+    for digest in ("a" * 64, "b" * 64):
+        found = SimpleNamespace(name="default-0", metadata={"sha256": digest})
+        module._earned(found, "Pendulum-v1", at, options)
+    module._earned(load_objective("ppo"), "Pendulum-v1", at, options)
+    assert kept == [
+        "default-0-aaaaaaaa-Pendulum-v1.rows.jsonl",
+        "default-0-bbbbbbbb-Pendulum-v1.rows.jsonl",
+        "ppo-Pendulum-v1.rows.jsonl",
+    ]
 
 
 def test_a_references_agents_are_one_set_however_many_searches_it_is_compared_with():

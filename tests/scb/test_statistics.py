@@ -10,6 +10,7 @@ from scb.statistics import (
     estimate,
     few_groups_difference,
     iqm,
+    median,
     normalized_score,
     paired_difference,
     pooled_estimate,
@@ -90,6 +91,21 @@ def test_the_interval_does_not_depend_on_how_resamples_are_batched(monkeypatch):
     whole = estimate(x)
     monkeypatch.setattr("scb.statistics._NUMBERS_PER_BATCH", 70)
     assert estimate(x) == whole
+
+
+def test_a_medians_interval_lies_between_two_runs():
+    # Of ten runs the second and the ninth: below either is a median with probability 11 / 1024.
+    assert median(np.arange(10.0)) == Estimate(4.5, 1.0, 8.0, 10)
+    # With three the whole range holds the median in three of four cases only.
+    assert median([1.0, 2.0, 3.0]) == Estimate(2.0, None, None, 3)
+
+
+def test_ties_make_no_medians_interval_too_narrow():
+    generator = np.random.default_rng(0)
+    # Half and a little more of all runs are 0; a bootstrap of the median is here often a single number.
+    runs = generator.choice([0.0, 1.0, 2.0], p=[0.52, 0.4, 0.08], size=(1000, 25))
+    found = [median(x) for x in runs]
+    assert np.mean([x.low <= 0.0 <= x.high for x in found]) > 0.95
 
 
 def test_paired_difference_is_the_difference_of_the_two_iqms():
@@ -222,6 +238,24 @@ def test_paired_differences_of_groups_cancel_what_is_common():
     found = stratified_estimate([x + 1.0 for x in common], common)
     np.testing.assert_allclose([found.value, found.low, found.high], 1.0, atol=1e-9)
     assert stratified_estimate(common).high - stratified_estimate(common).low > 30.0
+
+
+def test_draws_that_groups_share_are_drawn_together():
+    generator = np.random.default_rng(2)
+    draws = generator.normal(0.0, 10.0, 12)
+    own = [draws + generator.normal(size=12) for _ in range(4)]
+    # What all groups have in common does not average out over them.
+    apart, together = (stratified_estimate(own, shared=x) for x in (False, True))
+    assert apart.value == together.value
+    assert together.high - together.low > 1.7 * (apart.high - apart.low)
+    # Twelve draws of four agents each are no 48.
+    columns = stratified_estimate([np.transpose(own)])
+    assert columns.n == 48 and columns.value == pytest.approx(iqm(np.ravel(own)))
+    width = columns.high - columns.low
+    assert width > 1.7 * (estimate(np.ravel(own)).high - estimate(np.ravel(own)).low)
+    # Of two sides each has its own draws where they are not paired.
+    found = stratified_estimate(own, [x[:7] for x in own], paired=False, shared=True)
+    assert found.low < found.value < found.high
 
 
 @pytest.mark.parametrize(
