@@ -177,8 +177,8 @@ def _evaluate(
             f"progress has shape {np.shape(progress)} and log_ratio {tuple(log_ratio.shape)}: "
             "give one number, or one for each."
         )
-    # A traced JAX array is on no device yet.
-    device = getattr(log_ratio, "device", None)
+    # JAX brings numbers to where the arrays are, which may be several devices, or none yet.
+    device = None if xp is jnp else log_ratio.device
     like = partial(xp.asarray, dtype=log_ratio.dtype, device=device)
     log_ratio = xp.clip(log_ratio, -MAX_LOG_RATIO, MAX_LOG_RATIO)
     progress = xp.broadcast_to(like(progress), log_ratio.shape)

@@ -83,9 +83,10 @@ class MirrorDrift(Drift):
         # Each unit's own divergence; that of softplus, whose derivative is the logistic function.
         logistic = 0.5 * (1.0 + xp.tanh(0.5 * start))
         units = _softplus(start + move, xp) - _softplus(start, xp) - logistic * move
+        square, entropy = (parameters[x][0] ** 2 for x in ("square", "entropy"))  # one of each
         divergence = (
-            parameters["square"] ** 2 * 0.5 * away**2
-            + parameters["entropy"] ** 2 * ((1.0 + away) * log_ratio - away)
+            square * 0.5 * away**2
+            + entropy * ((1.0 + away) * log_ratio - away)
             + units @ parameters["weight"] ** 2
         )
         return relu(divergence - self.xi, xp)

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lpo.drifts import ClosedFormDrift, LearnedDrift
+from lpo.drifts import ClosedFormDrift, LearnedDrift, MirrorDrift
 from lpo.drifts.contract import BASES
 from lpo.objectives import Objective, load_objective, objective_names
 from lpo.portable import _policy_loss, drift_function, numpy_drift, torch_drift, torch_loss
@@ -30,6 +30,11 @@ def random_objective(base: str, temporal: bool) -> Objective:
     return Objective(f"learned-{base}{'-temporal' if temporal else ''}", drift, parameters)
 
 
+def mirror() -> Objective:
+    drift = MirrorDrift(hidden_size=8)
+    return Objective("mirror", drift, drift.init(jax.random.key(5)))
+
+
 def formula(base: str, expression: str) -> Objective:
     drift = ClosedFormDrift(expression, base=base, gate=0.3 if base == "ppo" else 0.0)
     return Objective(f"formula-{base}", drift, drift.init(jax.random.key(0)))
@@ -39,6 +44,7 @@ OBJECTIVES = [load_objective(name) for name in [*objective_names(), "ppo-0.3"]] 
     random_objective(base, temporal) for base in BASES for temporal in (False, True)
 ]
 OBJECTIVES += [
+    mirror(),
     formula("ppo", "0.3*A*tanh(d) - 0.2*relu(1.5*A*log_r)"),
     formula("none", "abs(d)*(0.7 - progress) + A*log_r*tanh(-2*A*d)"),
 ]
@@ -84,6 +90,29 @@ def test_numpy_and_jax_give_the_contracts_penalty(objective, largest_log_ratio):
         penalty = drift(*batch)
         assert penalty.dtype == np.float32
         np.testing.assert_allclose(penalty, expected, rtol=1e-5, atol=1e-5)
+
+
+@every_objective
+def test_a_single_ratio_has_a_penalty_and_a_slope(objective):
+    change, advantage, progress = (jnp.float32(x[0]) for x in points(0.5, size=1))
+    drift = drift_function(objective)
+    assert numpy_drift(objective)(change, advantage, progress).shape == ()
+    assert drift(change, advantage, progress).shape == ()
+    slope = jax.grad(drift)(change, advantage, progress)
+    each = jax.vmap(jax.grad(drift))(change[None], advantage[None], progress[None])
+    np.testing.assert_allclose(each, slope[None], rtol=1e-5)
+
+
+@every_objective
+def test_a_batch_may_lie_on_several_devices(objective):
+    batch = [x.astype(np.float32) for x in points(0.5, size=8 * jax.device_count())]
+    mesh = jax.make_mesh((jax.device_count(),), ("batch",))
+    spread = jax.device_put(batch, jax.NamedSharding(mesh, jax.P("batch")))
+    drift = drift_function(objective)
+    np.testing.assert_allclose(drift(*spread), drift(*batch), rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(
+        drift(*spread[:2], 0.5), drift(*batch[:2], 0.5), rtol=1e-5, atol=1e-6
+    )
 
 
 @every_objective
