@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from lpo.objectives import Objective, check_names
+from lpo.objectives import Objective, check_names, load_objective
 from scb.agents.ppo import DIAGNOSIS
 from scb.agents.spec import AgentSpec, environment_agent
 from scb.environments.registry import environment_spec
@@ -172,7 +172,7 @@ def ppo_spec(
 
 def compare(
     environment: str,
-    objectives: Sequence[Objective],
+    objectives: Sequence[Objective | str],
     seeds: Sequence[int],
     spec: AgentSpec | None = None,
     backend: str | None = None,
@@ -187,7 +187,8 @@ def compare(
 
     Args:
       environment: a name that `scb.make` takes.
-      objectives: what replaces PPO's surrogate; the first is what the others are compared with.
+      objectives: what replaces PPO's surrogate, or names as `load_objective` takes them; the first is what the
+        others are compared with.
       seeds: one agent each; the same seeds pair agents of different objectives.
       spec: PPO's; the environment's own where None.
       backend: of an environment with a choice of physics, such as "spring" in Brax.
@@ -201,14 +202,15 @@ def compare(
     Raises:
       UserError: two objectives bear one name, by which their results are told apart.
     """
-    check_names(objectives)
+    loaded = [load_objective(x) if isinstance(x, str) else x for x in objectives]
+    check_names(loaded)
     spec = spec or ppo_spec(environment)
     place = Place.named(environment, backend)
     found = measure(
         spec,
         place,
         agents=seeds,
-        objectives=objectives,
+        objectives=loaded,
         points=points,
         episodes=episodes,
         actions=(MODE if mode_actions else SAMPLED,),
@@ -237,13 +239,13 @@ def compare(
                 {name: measured[name][i] for name in DIAGNOSIS} if diagnose else None,
                 int(failed[i].any(axis=1).sum()),
             )
-            for i, objective in enumerate(objectives)
+            for i, objective in enumerate(loaded)
         ]
     )
 
 
 def learning_curves(
-    environment: str, objective: Objective, seeds: Sequence[int], **arguments: Any
+    environment: str, objective: Objective | str, seeds: Sequence[int], **arguments: Any
 ) -> LearningCurves:
     """`compare` with a single objective."""
     (curves,) = compare(environment, [objective], seeds, **arguments).curves

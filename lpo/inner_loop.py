@@ -14,6 +14,7 @@ from jax.typing import ArrayLike
 
 from lpo.drifts import Drift, LearnedDrift
 from lpo.fitness import FITNESSES, Fitness
+from scb.agents.agent import evaluated_after
 from scb.agents.ppo import PPOConfig, PPOHyperparameters
 from scb.agents.spec import AgentSpec, check_lists, environment_agent
 from scb.command_line import listed, numbers, text
@@ -203,9 +204,7 @@ class TaskTraining:
         self.spec = replace(
             agent, config=config.agent or agent.config, lists=config.hyperparameters
         )
-        self.every, iterations = spaced(self.spec.config.num_iterations, POINTS)
-        if config.judgement.along:
-            self.spec = self.spec.with_steps(self.spec.config.steps_after(iterations))
+        self.every = spaced(self.spec.config.num_iterations, POINTS)
         self.agent = self.spec.agent(self.env, config.drift)
         self.evaluation_episodes = config.evaluation_episodes or (50 if judged_in.is_bandit else 20)
         self.training_params = self.spec.training_params(self.env_params)
@@ -270,7 +269,7 @@ class TaskTraining:
         training = sum(map(config.steps_after, trained)) / len(trained)
         points = 1
         if self.config.judgement.along:
-            points = config.num_iterations // self.every + 1
+            points = len(evaluated_after(config.num_iterations, self.every))
         return EnvironmentSteps(
             training=round(agents * training),
             evaluation=agents

@@ -9,7 +9,7 @@ elsewhere. Here the bandit's reward carries noise of several of its own standard
 makes it rank objectives almost as the environment does.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -89,23 +89,20 @@ class MetaTraining:
         ]
         return {"fitness": jnp.stack(scores).mean(), **_apart(fitness)}
 
-    def steps(self) -> EnvironmentSteps:
+    def steps(self, generation: int = 0) -> EnvironmentSteps:
         """Of one candidate; with random horizons the mean over them."""
-        return _sum(task.steps(self.config.agents_per_candidate) for task in self.tasks.values())
+        each = (task.steps(self.config.agents_per_candidate) for task in self.tasks.values())
+        return sum(each, EnvironmentSteps(0, 0))
 
     def judgement_steps(self) -> EnvironmentSteps:
         """Of one agent for each judge, trained in full."""
-        return _sum(judge.steps(1, full=True) for judge in self.judges.values())
+        each = (judge.steps(1, full=True) for judge in self.judges.values())
+        return sum(each, EnvironmentSteps(0, 0))
 
 
 def _apart(fitness: Mapping[str, jax.Array]) -> dict[str, jax.Array]:
     """For the log, where there are several."""
     return {} if len(fitness) == 1 else {f"fitness/{name}": x for name, x in fitness.items()}
-
-
-def _sum(counts: Iterable[EnvironmentSteps]) -> EnvironmentSteps:
-    counts = list(counts)
-    return EnvironmentSteps(sum(c.training for c in counts), sum(c.evaluation for c in counts))
 
 
 def meta_train(config: MetaTrainingConfig, run: Run | None = None, quiet: bool = False) -> Outcome:

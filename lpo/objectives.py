@@ -153,6 +153,9 @@ def save_objective(
       drift: any member of the contract.
       parameters: its own.
       metadata: config (of the meta-training), seeds, results, cost, command, what of it there is to tell.
+
+    Raises:
+      UserError: parameters of another drift, or of one that is its settings.
     """
     if not isinstance(parameters, Mapping):
         raise UserError(
@@ -162,6 +165,8 @@ def save_objective(
     told = drift.with_parameters(parameters)
     if told != drift:  # trained on: what its text says now is what is saved
         drift, parameters = told, told.init(root_key(0))
+    own = artefacts.Artefact(drift.name, parameters, {"kind": KIND})
+    artefacts.expect_shapes(own, drift.shapes())
     certificate = certify(drift, parameters)
     config = {**metadata.get("config", {}), "drift": drift.to_config()}
     full = {**metadata, "kind": KIND, "config": config, "certificate": certificate.as_dict()}

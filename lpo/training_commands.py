@@ -43,7 +43,7 @@ class Agents:
     Attributes:
       environment: Pendulum-v1, CartPole-v1, hopper, Synthetic-Pendulum-v1, ..., or one's own as
         package.module:factory; Pendulum-v1 where nothing says another.
-      steps: environment steps; the environment's own setting where left out.
+      steps: environment steps, rounded up to whole batches; the environment's own setting where left out.
       policy_output_scale: factor on the policy's last layer at initialisation; many public PPOs take
         0.01.
       seed: the first of the agents' seeds.
@@ -211,8 +211,9 @@ class Evaluate(Comparing):
             cells = [c.objective, final, area, str(differences.get(c.objective, ""))]
             table.add_row(*cells, *_moving(c))
         console().print(table)
-        for said in filter(None, (comparison.caution, comparison.few)):
-            console().print(said)
+        said = (f"after {first.steps[-1]} steps", comparison.caution, comparison.few)
+        for words in filter(None, said):
+            console().print(words)
 
     def run_suite(self, name: str, objectives: Sequence[Objective]) -> None:
         config, seeds = self.config, self.config.seed_list()

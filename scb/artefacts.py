@@ -27,7 +27,7 @@ from flax import traverse_util
 
 from scb import schema
 from scb.errors import UserError, first_line, unknown_name
-from scb.files import strict_json, write_together
+from scb.files import make_folder, strict_json, write_together
 
 # numpy.ndarray leaves under any depth of dictionaries: {"reward": {"Dense_0": {"kernel": ...}}}.
 ArrayTree: TypeAlias = "dict[str, np.ndarray | ArrayTree]"
@@ -91,7 +91,7 @@ def save(path: str | Path, arrays: Mapping[str, Any], metadata: Mapping[str, Any
     # As a reader will see it: a mapping or tuple of the caller's is a plain dict or list by now.
     schema.check(json_path, json.loads(text))
 
-    npz_path.parent.mkdir(parents=True, exist_ok=True)
+    make_folder(npz_path.parent, "path")
     write_together({npz_path: data, json_path: (text + "\n").encode()})
     return npz_path
 
@@ -228,9 +228,11 @@ def flatten(arrays: Mapping[str, Any]) -> dict[str, np.ndarray]:
     """{"a": {"b": x}} as {"a/b": x}, in the order of the names.
 
     Raises:
-      UserError: a name is empty, is no text or holds a "/", or a dictionary is empty: none of
+      UserError: a name is empty, is no text or holds a "/", a dictionary is empty, or none is given: none of
         these would come back from a file.
     """
+    if not isinstance(arrays, Mapping):
+        raise UserError(f"the arrays are a {type(arrays).__name__}: give a dictionary of them.")
     flat = {}
     for path, array in traverse_util.flatten_dict({"": arrays}, keep_empty_nodes=True).items():
         wrong = [x for x in path[1:] if not isinstance(x, str) or not x or "/" in x]

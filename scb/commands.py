@@ -150,9 +150,27 @@ class Discover(LongRun):
         folder.end_log()
         outcome.check(best)
         weights = outcome.best_mean if best else outcome.mean
-        results = {}
+        metadata = {
+            "config": {
+                "evaluation_environment": config.environment,
+                "backend": spec.physics(config.backend),
+                "discovery": config_dict(config),
+                "started_from": None if config.start is None else _origin(config.start),
+            },
+            "seeds": {"discovery": config.evolution.seed, "validation": VALIDATING.start},
+            "results": {},
+            "cost": {
+                **outcome.cost(problem, config.evolution, best),
+                **problem.start_reports,
+            },
+            "command": self.command,
+        }
+        path = folder.folder / f"{spec.bandit}.npz"
+        # Before it is judged, which may take longer than the search.
+        if processes.first():
+            save_bandit(path, problem.bandit, weights, metadata)
         if self.judgement.judge_agents:
-            results = judge_all(
+            metadata["results"] = judge_all(
                 problem.bandit,
                 weights,
                 problem.place,
@@ -162,25 +180,10 @@ class Discover(LongRun):
             )
             compared = scale(config.environment, config.backend, problem.start_reports)
             console().print(compared, soft_wrap=True)
-        if not processes.first():
-            return
-        metadata = {
-            "config": {
-                "evaluation_environment": config.environment,
-                "backend": spec.physics(config.backend),
-                "discovery": config_dict(config),
-                "started_from": None if config.start is None else _origin(config.start),
-            },
-            "seeds": {"discovery": config.evolution.seed, "validation": VALIDATING.start},
-            "results": results,
-            "cost": {
-                **outcome.cost(problem, config.evolution, best),
-                **problem.start_reports,
-            },
-            "command": self.command,
-        }
-        path = save_bandit(folder.folder / f"{spec.bandit}.npz", problem.bandit, weights, metadata)
-        console().print(f"bandit: {path}", soft_wrap=True)
+        if processes.first():
+            if metadata["results"]:
+                save_bandit(path, problem.bandit, weights, metadata)
+            console().print(f"bandit: {path}", soft_wrap=True)
 
 
 def scale(environment: str, backend: str | None, start: Mapping[str, Mapping[str, float]]) -> str:
@@ -221,7 +224,8 @@ class TrainConfig:
       algorithm: such as ppo, sac, dqn, ddqn, ddpg or td3; dqn draws whether it is double, and is with fixed
         hyperparameters.
       evaluation_environment: where to evaluate; the bandit's own where left out.
-      backend: Brax's physics: generalized, positional, spring or mjx.
+      backend: Brax's physics: generalized, positional, spring or mjx; those that the bandit was found with where left
+        out.
       agents: how many to train, with the paper's 10 000 steps each.
       episodes: of each agent's evaluation.
       seed: decides everything.
@@ -279,5 +283,5 @@ class Train(Measuring):
         )
         by_actions, failed = counted(by_actions, judge_in)
         (returns,) = by_actions.values()
-        print(f"returns on {judge_in.name}: {' '.join(f'{r:.0f}' for r in np.sort(returns))}")
+        print(f"returns on {judge_in}: {' '.join(f'{r:.0f}' for r in np.sort(returns))}")
         print(f"IQM: {estimate(returns)}{told(failed)}")

@@ -62,10 +62,12 @@ class Progress:
         self._bar.update(self._task, advance=1, fitness=text)
         milestone = judged or self._done in (1, self._total)
         if not self._console.is_terminal and milestone:
-            left = float(np.median(self._seconds)) * (self._total - self._done)
-            self._console.print(
-                f"generation {self._done}/{self._total}: {text}, {left / 60:.1f} min left"
-            )
+            # The first of a process is compiled, and says nothing of the others.
+            left = ""
+            if len(self._seconds) > 1:
+                minutes = float(np.median(self._seconds[1:])) * (self._total - self._done) / 60
+                left = f", {minutes:.1f} min left"
+            self._console.print(f"generation {self._done}/{self._total}: {text}{left}")
 
     def __exit__(self, *_: object) -> None:
         self._bar.stop()

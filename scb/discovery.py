@@ -435,7 +435,7 @@ class BanditDiscovery:
             )
         return {"fitness": jnp.stack(list(results.values())).mean(), **results}
 
-    def steps(self) -> EnvironmentSteps:
+    def steps(self, generation: int = 0) -> EnvironmentSteps:
         """Of one candidate; in the mode "sequential" the mean over the algorithms' turns."""
         config = self.config
         agents = config.agents_per_candidate
@@ -445,7 +445,9 @@ class BanditDiscovery:
         else:
             turns = [self.specs[name].steps for name in config.algorithms]
             training, evaluations = sum(turns) // len(turns), 1
-        limit = self._longest or int(self.place.params.max_steps_in_episode)
+        limit = int(self.place.params.max_steps_in_episode)
+        if self._horizon is not None:
+            limit = int(self._horizon(generation))
         return EnvironmentSteps(
             training=agents * training,
             evaluation=agents * evaluations * config.evaluation_episodes * limit,

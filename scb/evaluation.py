@@ -38,7 +38,7 @@ def evaluate(
       env: any gymnax 1.x environment. Where it has a `forward_velocity` of a state, episodes have speeds.
       env_params: its parameters.
       policy: (observation, key) -> action, for one environment.
-      key: decides start states, transitions and the policy's randomness.
+      key: decides start states (`reset_env`'s: in Brax of a pool of 1024), transitions and the policy's randomness.
       num_episodes: E, static.
       horizon: steps after which an episode is cut even if the environment would go on; traced, so a
         curriculum does not recompile. None: the environment's own limit.

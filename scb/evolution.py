@@ -46,7 +46,7 @@ class EvolutionConfig:
     Attributes:
       strategy: any of evosax's, by name (SNES, Open_ES, CMA_ES, ...).
       population_size: candidates a generation.
-      num_generations: how many of them; with 0 what the search would start from is what it ends with.
+      num_generations: how many of them; with 0, of a bandit, what the search would start from is what it ends with.
       sigma: initial standard deviation of the search distribution.
       sigma_decay: factor on it a generation, for strategies with a schedule (Open_ES).
       sigma_limit: what it decays down to.
@@ -117,6 +117,12 @@ class EnvironmentSteps:
     def total(self) -> int:
         return self.training + self.evaluation
 
+    def __add__(self, other: "EnvironmentSteps") -> "EnvironmentSteps":
+        return EnvironmentSteps(self.training + other.training, self.evaluation + other.evaluation)
+
+    def __mul__(self, number: int) -> "EnvironmentSteps":
+        return EnvironmentSteps(number * self.training, number * self.evaluation)
+
 
 class Problem(Protocol):
     """What is evolved."""
@@ -135,11 +141,17 @@ class Problem(Protocol):
     def evaluate_mean(self, candidate: Any, key: jax.Array) -> dict[str, jax.Array]:
         """{"fitness": [], ...} of one agent, in the setting that the result is judged by."""
 
-    def steps(self) -> EnvironmentSteps:
-        """Environment steps of one `evaluate`."""
+    def steps(self, generation: int = 0) -> EnvironmentSteps:
+        """Environment steps of one `evaluate` in this generation."""
 
     def judgement_steps(self) -> EnvironmentSteps:
         """Environment steps of one `evaluate_mean`."""
+
+
+def evaluated(problem: Problem, config: EvolutionConfig, generations: int) -> EnvironmentSteps:
+    """Environment steps of all candidates of so many generations."""
+    each = [problem.steps(generation) for generation in range(generations)]
+    return sum(each, EnvironmentSteps(0, 0)) * config.population_size
 
 
 @runtime_checkable
@@ -187,15 +199,15 @@ class Outcome:
 
     def cost(self, problem: Problem, config: EvolutionConfig, best: bool) -> dict[str, Any]:
         """What an artefact says of the search's cost; `best` where the mean judged best was taken."""
-        steps, evaluations = problem.steps(), config.num_generations * config.population_size
+        steps = evaluated(problem, config, config.num_generations)
         judgements = sum(
             name in line for line in self.metrics for name in ("mean/fitness", "final_mean/fitness")
         )
         agents = judgements * config.mean_evaluations
         judging = problem.judgement_steps()
         return {
-            "environment_steps_training": evaluations * steps.training,
-            "environment_steps_evaluation": evaluations * steps.evaluation,
+            "environment_steps_training": steps.training,
+            "environment_steps_evaluation": steps.evaluation,
             "environment_steps_judgements_training": agents * judging.training,
             "environment_steps_judgements_evaluation": agents * judging.evaluation,
             "seconds": round(self.seconds, 1),
@@ -343,7 +355,7 @@ def evolve(
         return f"{run.folder} is saved after {generation} generations, and continues with --resume."
 
     evaluate = map_population(problem.evaluate, config.population_size, (0, None, None))
-    steps = problem.steps()
+    steps = evaluated(problem, config, first)
     # Of several processes the first alone keeps the log.
     history, total_seconds = (run.metrics(), run.seconds()) if run and checkpoints else ([], 0.0)
     watch = Stopwatch()
@@ -401,12 +413,12 @@ def evolve(
                     "fitness/max": finite.max(),
                     "fitness/min": finite.min(),
                 }
-            done = (generation + 1) * config.population_size
+            steps += problem.steps(generation) * config.population_size
             metrics |= {
                 "failed": config.population_size - finite.size,
-                "steps/training": done * steps.training,
-                "steps/evaluation": done * steps.evaluation,
-                "steps/total": done * steps.total,
+                "steps/training": steps.training,
+                "steps/evaluation": steps.evaluation,
+                "steps/total": steps.total,
                 # What has no number in this generation (an algorithm whose turn it wasn't) is left out.
                 **{
                     f"candidates/{name}": np.nanmean(value)

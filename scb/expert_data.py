@@ -13,7 +13,7 @@ from jax.tree_util import Partial
 from scb.aggregation import TRAJECTORIES, Visited, trajectory
 from scb.errors import UserError, at_least, one_of, positive, unused
 from scb.experts import Expert
-from scb.fitting import CONSTRUCTIONS, ExpertDataset
+from scb.fitting import CONSTRUCTIONS, ExpertDataset, unchanging
 from scb.keys import named_key, split_key
 from scb.linear_expert import erring, noisy
 from scb.measurement import Place
@@ -38,7 +38,7 @@ class DatasetConfig:
         too little errs so, and not anew at every step.
       min_spread: entries of the observation whose standard deviation is smaller are stretched about
         their mean until they have it, and the expert says what it does there; 0 for the states as
-        they are. Agents learn little from an entry as small as a car's velocity. For
+        they are. One that never changes stays. Agents learn little from an entry as small as a car's velocity. For
         "action_distance" only: Q-values cannot be simulated from states that don't exist.
       stretch: factor on the states' deviations from their mean, after that; the expert says what it does
         there. Agents that meet more than they need learn better what they need. For
@@ -201,6 +201,8 @@ def _stretched(observations: jax.Array, key: jax.Array, config: DatasetConfig) -
     flat = jnp.reshape(observations, (observations.shape[0], -1))
     mean, std = flat.mean(axis=0), flat.std(axis=0)
     spread = jnp.maximum(1.0, config.min_spread / (std + 1e-8))
+    # An entry that never changes has a deviation by rounding alone, which is nothing to stretch.
+    spread = jnp.where(unchanging(flat), 1.0, spread)
     stretched = mean + (flat - mean) * (config.stretch * spread)
     if config.jitter:
         stretched += config.jitter * std * spread * jax.random.normal(key, flat.shape)

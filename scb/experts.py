@@ -191,8 +191,9 @@ class _PolicySearch:
         limit = self.env_params.max_steps_in_episode
         return {"fitness": self._returns(candidate, key, limit).mean()}
 
-    def steps(self) -> EnvironmentSteps:
-        return EnvironmentSteps(training=0, evaluation=self.config.episodes * self.longest)
+    def steps(self, generation: int = 0) -> EnvironmentSteps:
+        limit = self.longest if self.horizon is None else int(self.horizon(generation))
+        return EnvironmentSteps(training=0, evaluation=self.config.episodes * limit)
 
     def judgement_steps(self) -> EnvironmentSteps:
         limit = int(self.env_params.max_steps_in_episode)

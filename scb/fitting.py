@@ -41,6 +41,11 @@ def reward_targets(dataset: ExpertDataset, construction: str, discrete: bool) ->
     return target / (target.std() + 1e-8)
 
 
+def unchanging(observation: jax.Array) -> jax.Array:
+    """[O] whether an entry is the same in all of [S, O] states, up to the rounding of 32 bits."""
+    return jnp.ptp(observation, axis=0) <= 1e-6 * jnp.abs(observation).max(axis=0)
+
+
 def fit_bandit(
     bandit: SyntheticBandit,
     dataset: ExpertDataset,
@@ -68,7 +73,9 @@ def fit_bandit(
     target = reward_targets(dataset, construction, bandit.discrete)
     optimizer = optax.adam(optax.cosine_decay_schedule(5e-3, steps))
     num_states = dataset.observation.shape[0]
-    scale = dataset.observation.std(axis=0) + 1e-6
+    # An entry that never changes has no scale, and next to none would drown the others: it is left out, and held.
+    held = unchanging(dataset.observation)
+    scale = jnp.where(held, jnp.inf, dataset.observation.std(axis=0) + 1e-6)
 
     def reward_loss(reward_weights: Any, index: jax.Array, _: jax.Array) -> jax.Array:
         params = BanditParams(weights={"initial_state": {}, "reward": reward_weights})
@@ -101,6 +108,11 @@ def fit_bandit(
 
     reward, error = fit(reward_loss, weights["reward"], key_reward)
     context, distance = fit(context_loss, weights["initial_state"], key_context)
+    last = context["Dense_1"]
+    context["Dense_1"] = {
+        "kernel": jnp.where(held, 0.0, last["kernel"]),
+        "bias": jnp.where(held, dataset.observation[0], last["bias"]),
+    }
     report = {
         "reward_r2": float(1.0 - error / jnp.var(target)),
         "energy_distance": float(distance),

@@ -58,6 +58,10 @@ def _check_finite(actions: np.ndarray) -> None:
             )
 
 
+class NothingToShow(UserError, TypeError):
+    """A render mode is asked for. Stable-Baselines3 asks for one, and leaves it out after a TypeError."""
+
+
 class SyntheticEnv(gymnasium.Env[np.ndarray, Any]):
     """One bandit or synthetic MDP.
 
@@ -69,12 +73,12 @@ class SyntheticEnv(gymnasium.Env[np.ndarray, Any]):
       render_mode: None, as many scripts say it.
 
     Raises:
-      UserError: the file cannot be read, or is none of them; another render mode.
+      UserError: the file cannot be read, or is none of them; another render mode, which is a TypeError too.
     """
 
     def __init__(self, file: str, render_mode: None = None) -> None:
         if render_mode is not None:
-            raise UserError(
+            raise NothingToShow(
                 f"render_mode is {render_mode!r}, and a bandit has nothing to show: leave it out."
             )
         self._functions, self.observation_space, self.action_space = _opened(file)

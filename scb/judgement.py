@@ -11,6 +11,7 @@ from scb.console import console
 from scb.environments.registry import environment_spec
 from scb.environments.synthetic import SyntheticBandit, Weights
 from scb.environments.synthetic_mdp import SyntheticMDP
+from scb.environments.zoo import bandit_metadata
 from scb.errors import UserError
 from scb.measurement import MODE, SAMPLED, Agents, Place, as_random, measure
 from scb.rows import Rows, pivot
@@ -40,10 +41,14 @@ def evaluation_place(
 ) -> Place:
     """Where agents of a bandit, opened by this name, are judged: in what it stands for where no other is named.
 
+    There the physics are those that it was found with, where no others are named.
+
     Raises:
       UserError: it stands for none, or does not fit the environment.
     """
     target = environment or environment_spec(name).evaluation_environment
+    if environment is None and backend is None:
+        backend = bandit_metadata(name).get("config", {}).get("backend")
     place = Place.named(target, backend)
     check_fits(bandit, place.env, place.params, target)
     return place

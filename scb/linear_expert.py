@@ -113,7 +113,7 @@ def search_linear_expert(
     worth: Worth | None = None,
     folder: Path | None = None,
 ) -> Expert:
-    """The best unperturbed policy of an augmented random search; its return is one on fresh start states.
+    """The best unperturbed policy of an augmented random search; its return is of episodes that chose nothing.
 
     Args:
       env, env_params: with continuous actions.

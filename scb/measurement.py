@@ -18,7 +18,7 @@ import numpy as np
 from gymnax.environments import environment
 from jax.typing import ArrayLike
 
-from scb.agents.agent import Agent
+from scb.agents.agent import Agent, evaluated_after
 from scb.agents.spec import AgentSpec
 from scb.artefacts import package_versions
 from scb.environments.registry import environment_spec
@@ -77,8 +77,8 @@ def train_and_judge(
       key: decides everything. All judges meet one key, so that they see the same start states.
       params: of the environment that the agent trains in.
       judges: by name, `Judge` or whatever else tells something of an agent.
-      every: iterations between judgements along the training, the first of them before it; must divide
-        the configuration's. None: judged at the end alone.
+      every: iterations between judgements along the training, the first of them before it and one at its
+        end. None: judged at the end alone.
       iterations: a traced number of iterations instead of the configuration's; without `every`.
 
     Returns:
@@ -99,19 +99,17 @@ def train_and_judge(
     return state, judged(state, key_judge)
 
 
-def spaced(iterations: int, points: int) -> tuple[int, int]:
-    """(iterations between about `points` judgements, iterations of the training).
+def spaced(iterations: int, points: int) -> int:
+    """Iterations between about so many judgements of a training.
 
-    The judgements divide the training evenly. Where no divisor gives between half and twice as many as
-    asked (a prime number of iterations), it is rounded up to a multiple of the points.
+    They divide it evenly, but where no divisor gives between half and twice as many as asked (a prime number of
+    iterations): there the last come sooner.
     """
     points = min(points, iterations)
     divisors = (n for n in range(1, iterations + 1) if iterations % n == 0)
     every = min(divisors, key=lambda n: abs(iterations / n - points))
-    if not points / 2 <= iterations / every <= points * 2:
-        every = -(-iterations // points)
-        iterations = every * points
-    return every, iterations
+    even = points / 2 <= iterations / every <= points * 2
+    return every if even else round(iterations / points)
 
 
 # -- many agents ----------------------------------------------------------------------------------
@@ -131,6 +129,9 @@ class Place:
         """An environment or bandit of the registry, with this physics."""
         spec = environment_spec(name)
         return cls(spec.name, *spec.make(backend), spec.physics(backend))
+
+    def __str__(self) -> str:
+        return self.name if self.backend is None else f"{self.name} ({self.backend} physics)"
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,10 +171,18 @@ class Agents:
 
 
 def as_random(returns: np.ndarray, place: Place) -> tuple[np.ndarray, np.ndarray]:
-    """(returns, which were no finite number): those of agents that diverged are those of random actions there."""
+    """(returns, which were no finite number): those of agents that diverged are those of random actions there.
+
+    Raises:
+      UserError: random actions earn no finite number either.
+    """
     failed = ~np.isfinite(returns)
     if failed.any():
         random = environment_spec(place.name).random_return(place.backend)
+        if not np.isfinite(random):
+            raise UserError(
+                f"neither agents nor random actions earn a finite number in {place}: look at its rewards."
+            )
         returns = np.where(failed, random, returns)
     return returns, failed
 
@@ -221,8 +230,8 @@ def measure(
       train_in, judge_in: where; judged where they train if left out.
       agents: or seeds, of one agent each.
       objectives: each trains all agents, on the same seeds; none for the algorithm's own.
-      points: about how many judgements along the training, the untrained agent's not counted, for which
-        the training may be rounded up (`spaced`). None: at the end alone.
+      points: about how many judgements along the training (`spaced`), the untrained agent's not counted. None: at
+        the end alone.
       episodes: of each judgement.
       actions: "mode", the most likely ones, or "sampled", or both of the same agents.
       diagnose: whether rows say also what an iteration does to the policy (`PPO.diagnose`); PPO only.
@@ -253,11 +262,8 @@ def measure(
     agents = agents if isinstance(agents, Agents) else Agents.seeded(spec, agents)
     every, iterations = None, spec.config.num_iterations
     if points is not None:
-        every, iterations = spaced(iterations, points)
-        if iterations != spec.config.num_iterations:
-            longer = replace(spec.config, total_steps=spec.config.steps_after(iterations))
-            spec = replace(spec, config=longer)
-    judged_at = [iterations] if every is None else range(0, iterations + 1, every)
+        every = spaced(iterations, points)
+    judged_at = [iterations] if every is None else evaluated_after(iterations, every)
     steps = [spec.config.steps_after(n) for n in judged_at]
     params = (spec.training_params(train_in.params), judge_in.params)
     long = train_in.backend is not None or spec.steps >= LONG

@@ -66,6 +66,8 @@ class Strategy:
 
     def __init__(self, config: "EvolutionConfig", solution: Any) -> None:
         algorithm = STRATEGIES[config.strategy]
+        self._sigma, self._name = config.sigma, config.strategy
+        self._size = config.population_size
         # Others keep a population, and have no mean to judge before the first tell.
         self.has_mean = config.strategy in evosax.algorithms.distribution_based_algorithms
         arguments: dict[str, Any] = {}
@@ -90,11 +92,25 @@ class Strategy:
                 f"({error}): choose another size or strategy."
             ) from error
         self._params = self._algorithm.default_params
+        if self.has_mean:
+            self._check_size(solution)
         if hasattr(self._params, "std_init"):
             # evosax starts SNES at a standard deviation of 1; the paper's is 0.05.
             self._params = self._params.replace(std_init=config.sigma)
-        self._sigma, self._name = config.sigma, config.strategy
-        self._size = config.population_size
+
+    def _check_size(self, solution: Any) -> None:
+        """ESMC asks for fewer where their number is odd, which its own assertion does not say."""
+
+        def ask(key: jax.Array) -> Any:
+            state = self._algorithm.init(key, solution, self._params)
+            return self._algorithm.ask(key, state, self._params)[0]
+
+        asked = len(jax.tree.leaves(jax.eval_shape(ask, root_key(0)))[0])
+        if asked != self._size:
+            raise UserError(
+                f"{self._name} does not take a population_size of {self._size}, of which it would ask for {asked}: "
+                "choose an even size or another strategy."
+            )
 
     def start(self, key: jax.Array, solution: Any, units: Any = None) -> Any:
         """The state before the first ask; `units`, a tree like the solution, are factors on its initial deviations."""

@@ -28,6 +28,13 @@ def anchors(page):
 
 
 @pytest.mark.parametrize("page", PAGES, ids=[page.stem for page in PAGES])
+def test_no_page_has_a_section_twice(page):
+    text = re.sub(r"```.*?```", "", page.read_text(), flags=re.S)
+    sections = re.findall(r"^## (.*)$", text, re.M)
+    assert len(sections) == len(set(sections))
+
+
+@pytest.mark.parametrize("page", PAGES, ids=[page.stem for page in PAGES])
 def test_every_link_leads_somewhere(page):
     text = re.sub(r"```.*?```", "", page.read_text(), flags=re.S)
     for target in re.findall(r"\]\(([^)\s]+)\)", text):

@@ -90,6 +90,19 @@ class Step(NamedTuple):
     final_observation: jax.Array
 
 
+def evaluated_after(iterations: int, every: int) -> list[int]:
+    """Iterations after which an agent is evaluated: none, every `every`-th, and the last."""
+    return [*range(0, iterations, every), iterations]
+
+
+def _check_environment(env: Any) -> None:
+    if not isinstance(env, environment.Environment):
+        raise UserError(
+            f"the environment is a {type(env).__name__}: give a gymnax 1.x environment, such as the first of "
+            "scb.make(NAME), and make a subclass of one for what a wrapper would do."
+        )
+
+
 @dataclass(frozen=True, eq=False)
 class Agent(ABC):
     """An algorithm in one environment.
@@ -103,10 +116,12 @@ class Agent(ABC):
     config: AgentConfig
 
     def __post_init__(self) -> None:
-        if not isinstance(self.env, environment.Environment):
+        _check_environment(self.env)
+        (wanted,) = (field.type for field in fields(self) if field.name == "config")
+        if isinstance(wanted, type) and not isinstance(self.config, wanted):
             raise UserError(
-                f"the environment is a {type(self.env).__name__}: give a gymnax 1.x environment, such as the first of "
-                "scb.make(NAME), and make a subclass of one for what a wrapper would do."
+                f"the configuration is a {type(self.config).__name__}, and {type(self).__name__} takes a "
+                f"{wanted.__name__}."
             )
 
     @property
@@ -163,30 +178,33 @@ class Agent(ABC):
         evaluation: Callable[[Any, jax.Array], Any],
         every: int,
     ) -> tuple[Any, Any]:
-        """Trains, and evaluates before the first and after every `every`-th iteration.
+        """Trains, and evaluates before the first and after every `every`-th iteration, and at the end.
 
         Args:
           evaluation: (state, key) -> pytree of what is wanted of the agent at that point.
-          every: iterations between evaluations; must divide `config.num_iterations`.
+          every: iterations between evaluations; the last are fewer where it does not divide
+            `config.num_iterations`.
 
         Returns:
-          The trained agent, and the evaluations stacked along a new first axis of num_iterations /
-          every + 1 entries.
+          The trained agent, and the evaluations stacked along a new first axis, after the iterations that
+          `evaluated_after` names.
         """
-        if every < 1 or self.config.num_iterations % every:
-            raise UserError(
-                f"evaluation every {every} iterations does not divide {self.config.num_iterations} iterations: "
-                "choose a divisor."
-            )
+        if every < 1:
+            raise UserError(f"evaluation every {every} iterations: give a number from 1 on.")
+        at = evaluated_after(self.config.num_iterations, every)
+        lengths = np.diff(at)
         key_train, key_evaluate = split_key(key)
         state = self.init(key_train, hyperparameters, env_params)
 
-        def segment(state: Any, key: jax.Array) -> tuple[Any, Any]:
+        def segment(state: Any, inputs: tuple[jax.Array, jax.Array]) -> tuple[Any, Any]:
+            key, length = inputs
             outcome = evaluation(state, key)
-            return self.train_iterations(state, hyperparameters, env_params, every), outcome
+            # A fixed length is a little faster, and a traced one makes one program of two lengths.
+            number = every if lengths[-1] == every else length
+            return self.train_iterations(state, hyperparameters, env_params, number), outcome
 
-        keys = split_key(key_evaluate, self.config.num_iterations // every + 1)
-        state, outcomes = jax.lax.scan(segment, state, keys[:-1])
+        keys = split_key(key_evaluate, len(at))
+        state, outcomes = jax.lax.scan(segment, state, (keys[:-1], jnp.asarray(lengths)))
         last = evaluation(state, keys[-1])
         return state, jax.tree.map(lambda a, b: jnp.concatenate([a, b[None]]), outcomes, last)
 
@@ -224,10 +242,15 @@ class Agent(ABC):
             scaled to the bounds of its own environment with its default parameters.
           env_params: None for the environment's default parameters.
 
+        Returns:
+          Episodes of shape [num_episodes], with returns of NaN where the agent diverged.
+
         Raises:
           UserError: the other environment has other observations or actions.
         """
         env = self.env if env is None else env
+        _check_environment(env)
+        at_least(1, num_episodes=num_episodes)
         env_params = env.default_params if env_params is None else env_params
         own_params = env_params
         if env is not self.env:
@@ -242,7 +265,15 @@ class Agent(ABC):
             action = self.choose(state, jnp.ravel(observation), key, own_params, mode)
             return clip_to_space(action, env.action_space(env_params))
 
-        return evaluate(env, env_params, policy, key, num_episodes, horizon)
+        episodes = evaluate(env, env_params, policy, key, num_episodes, horizon)
+        # Of what is no number the largest is discrete action 0, which would earn something.
+        leaves = jax.tree.leaves(self.learned(state))
+        sound = jnp.all(jnp.stack([jnp.isfinite(x).all() for x in leaves])) if leaves else True
+        return episodes._replace(returns=jnp.where(sound, episodes.returns, jnp.nan))
+
+    def learned(self, state: Any) -> Any:
+        """A pytree of all numbers that were learned, of which an agent that diverged has some that are not finite."""
+        return ()
 
     def _reset(self, key: jax.Array, number: int, env_params: Any) -> tuple[Any, jax.Array]:
         """Where `number` environments stand at the start of an episode: (their states, [N, O] observations)."""

@@ -252,6 +252,9 @@ class OffPolicyAgent(Agent):
             learner = self.update_targets(learner, hyperparameters, state.iteration)
         return replace(state, learner=learner, iteration=state.iteration + 1)
 
+    def learned(self, state: OffPolicyState) -> Any:
+        return state.learner.params
+
     def choose(
         self,
         state: OffPolicyState,

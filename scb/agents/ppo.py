@@ -23,7 +23,7 @@ from jax.typing import ArrayLike
 from scb.agents import networks
 from scb.agents.agent import Agent, AgentConfig, Algorithm, clipped_adam
 from scb.agents.normalization import RunningStatistics, update_statistics
-from scb.errors import UserError
+from scb.errors import UserError, first_line
 from scb.keys import split_key
 from scb.spaces import action_size
 
@@ -219,17 +219,28 @@ class PPO(Agent):
         """A UserError where the drift cannot take what the hyperparameters hold, such as their default clip."""
         one = jnp.zeros(1)
         try:
-            jax.eval_shape(self.drift, parameters, one, one, one)
+            penalty = jax.eval_shape(self.drift, parameters, one, one, one)
         except Exception as error:  # what a drift raises for parameters of another kind is its own
             raise UserError(
-                "the agent's drift cannot take the hyperparameters' drift: of an objective give "
-                "objective.drift to the agent, and objective.parameters as the hyperparameters' drift."
+                "the agent's drift cannot take the hyperparameters' drift: of an objective give objective.drift to the "
+                "agent, and objective.parameters as the hyperparameters' drift; one of your own takes (parameters, "
+                f"log_ratio [B], advantage [B], progress [B]), and says here: {first_line(error)}."
             ) from error
+        if getattr(penalty, "shape", None) != one.shape:
+            raise UserError(
+                f"the agent's drift returns {getattr(penalty, 'shape', penalty)} for one ratio: give a penalty for "
+                "each, of the shape of log_ratio."
+            )
 
     def init(
         self, key: jax.Array, hyperparameters: PPOHyperparameters, env_params: Any
     ) -> PPOState:
         """A fresh agent, its environments at their first observation."""
+        if not isinstance(hyperparameters, PPOHyperparameters):
+            raise UserError(
+                f"the hyperparameters are a {type(hyperparameters).__name__}: give (key, PPOHyperparameters, the "
+                "environment's parameters), in this order."
+            )
         self._check_parameters(hyperparameters.drift)
         key_policy, key_value, key_reset, key_train = split_key(key, 4)
         policy, value = self._networks(env_params)
@@ -259,6 +270,9 @@ class PPO(Agent):
     ) -> jax.Array:
         distribution = self._policy(state, observation, env_params)
         return distribution.mode() if mode else distribution.sample(seed=key)
+
+    def learned(self, state: PPOState) -> Any:
+        return state.params
 
     def _policy(
         self, state: PPOState, observation: jax.Array, env_params: Any

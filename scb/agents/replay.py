@@ -49,6 +49,8 @@ def add(buffer: ReplayBuffer, batch: Any) -> ReplayBuffer:
         def write(ring: jax.Array, new: jax.Array) -> jax.Array:
             return ring.at[index].set(new)
 
+    # With jax_enable_x64 what is added can be of twice the size.
+    batch = jax.tree.map(lambda ring, new: jnp.asarray(new, ring.dtype), buffer.transitions, batch)
     transitions = jax.tree.map(write, buffer.transitions, batch)
     return ReplayBuffer(transitions, buffer.written + number)
 

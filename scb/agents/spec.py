@@ -154,7 +154,8 @@ def bandit_agent(algorithm: str, environment: str, sampled: bool = True) -> Agen
     """The paper's inner loop: an algorithm in the bandit of an environment.
 
     Networks are tanh, but ReLU for Pendulum. Hyperparameters are drawn in classic control (without
-    the learning rate 0.01 where actions are continuous), and fixed in Brax.
+    the learning rate 0.01 where actions are continuous, which the paper leaves out of PPO's list alone), and
+    fixed in Brax.
 
     Args:
       algorithm: one of `ALGORITHMS`.

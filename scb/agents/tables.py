@@ -60,7 +60,7 @@ class Tables:
 ACTIVATIONS = {"Pendulum-v1": "relu"}
 
 _LEARNING_RATES = (0.01, 0.005, 0.001, 0.0005, 0.0001)
-# Of the learning rates, the one that is not drawn where actions are continuous.
+# Of the learning rates, the one that is not drawn where actions are continuous: in the paper's tables PPO's alone.
 DISCRETE_ONLY = {"learning_rate": (0.01,)}
 _DISCOUNTS = (1.0, 0.99, 0.95, 0.9, 0.8)
 _POLYAK = (0.99, 0.95, 0.9, 0.7, 0.8)

@@ -120,7 +120,8 @@ def explain_command(
       bandit: a zoo name such as Synthetic-Pendulum-v1, or path.npz.
       out: folder for explain.png, explain.json and explain.html; runs/explain/NAME where left out.
       evaluation_environment: where the bandit's optimal policy acts; the bandit's own where left out.
-      backend: Brax's physics: generalized, positional, spring or mjx.
+      backend: Brax's physics: generalized, positional, spring or mjx; those that the bandit was found with where left
+        out.
       episodes: of the optimal policy.
       seed: decides everything.
       html: also write a page where the reward's surface can be turned and the action moved (extra `html`).
@@ -141,7 +142,7 @@ def explain_command(
     printer = console()
     earned = numbers["return_of_optimal_policy"]
     printer.print(
-        f"The bandit's optimal policy earns {earned['value']:.1f} in {place.name} ({episodes} episodes)."
+        f"The bandit's optimal policy earns {earned['value']:.1f} in {place} ({episodes} episodes)."
     )
     for name, share in sorted(numbers["importance"].items(), key=lambda item: -item[1]):
         printer.print(f"  {share:6.1%} of the reward's variance, alone or with others: {name}")

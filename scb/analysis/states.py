@@ -33,7 +33,7 @@ class Trajectories(NamedTuple):
 
     def returns(self) -> np.ndarray:
         """[E] undiscounted."""
-        return np.sum(self.rewards * self.active, axis=1)
+        return np.sum(np.where(self.active, self.rewards, 0.0), axis=1)
 
 
 def bandit_states(bandit: SyntheticBandit, key: jax.Array, number: int) -> np.ndarray:

@@ -93,8 +93,9 @@ class BraxEnvironment(environment.Environment[BraxState, BraxParams]):
     Args:
       name: one of `BRAX_NAMES`.
       backend: one of `BACKENDS`; swimmer knows only "generalized".
-      num_start_states: size of the pool that auto-reset draws from, the same in every process;
-        None resets the physics afresh at the end of every episode.
+      num_start_states: size of the pool that auto-reset draws from, the same in every process, and that episodes
+        of an evaluation start in (`scb.evaluation.evaluate`), whatever its seed; None resets the physics afresh at
+        the end of every episode.
 
     Raises:
       UserError: an unknown name or backend, or a pool without states.
@@ -167,7 +168,7 @@ class BraxEnvironment(environment.Environment[BraxState, BraxParams]):
         return self._start(self.brax_env.reset(key))
 
     def reset_env(self, key: jax.Array, params: BraxParams) -> tuple[jax.Array, BraxState]:
-        """What auto-reset calls at every step: a start state from the pool.
+        """What auto-reset calls at every step, and an evaluation once: a start state from the pool.
 
         Brax's own wrapper returns to the cached state that its environment first started in, so
         that N environments see N start states in all of training. Here every episode draws anew

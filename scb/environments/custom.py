@@ -90,7 +90,10 @@ def _check(name: str, env: environment.Environment[Any, Any], params: Any) -> No
         found = env.reset(key, params)
         check_values("reset", found, "observation, state")
         observation, state = found
-        step = env.step(key, state, actions.sample(key), params)
+        action = actions.sample(key)
+        inner = env.step_env(key, state, action, params)
+        check_values("step_env", inner, "observation, state, reward, terminated, info")
+        step = env.step(key, state, action, params)
         check_values("step", step, "observation, state, reward, terminated, truncated, info")
         return observation, step
 

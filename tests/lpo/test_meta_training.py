@@ -259,12 +259,12 @@ def test_steps_of_a_candidate(config, changes, training, evaluation):
     assert steps.total == training + evaluation
 
 
-def test_area_of_a_training_with_a_prime_number_of_batches_has_equal_distances(config):
-    # Nothing near a fifth of 13 divides it: 15 batches have five points and the start.
+def test_area_of_a_training_with_a_prime_number_of_batches_trains_no_more_of_them(config):
+    # Nothing near a fifth of 13 divides it: three batches a point and one for the last, and the start.
     agent = replace(config.agent, total_steps=13 * 8)
     problem = MetaTraining(replace(config, fitness="area", agent=agent, reward_noise=0.0))
     steps = problem.steps()
-    assert (steps.training, steps.evaluation) == (15 * 8, 6 * 2)
+    assert (steps.training, steps.evaluation) == (13 * 8, 6 * 2)
 
 
 # -- several tasks -------------------------------------------------------------------------------

@@ -188,7 +188,7 @@ class Parabola:
     ) -> dict[str, jax.Array]:
         return {"fitness": self.evaluate(candidate, key, jnp.int32(0))["fitness"]}
 
-    def steps(self) -> EnvironmentSteps:
+    def steps(self, generation: int = 0) -> EnvironmentSteps:
         return EnvironmentSteps(training=10, evaluation=3)
 
     def judgement_steps(self) -> EnvironmentSteps:

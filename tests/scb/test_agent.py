@@ -25,7 +25,7 @@ from scb.environments.returns import random_return
 from scb.environments.synthetic import BanditConfig
 from scb.errors import UserError
 from scb.warm_start import WarmStartConfig
-from tests.scb.probes import ContinuousCorridor, Corridor, CorridorParams
+from tests.scb.probes import ContinuousCorridor, Corridor, CorridorParams, small_agents
 
 # -- what agents are made of
 # ------------------------------------------------------------
@@ -135,6 +135,70 @@ def test_an_environment_of_other_observations_or_actions_is_refused():
     ):
         with pytest.raises(UserError, match=f"{has}, .* has {theirs}"):
             agent.evaluate(state, jax.random.key(0), 1, other)
+
+
+@pytest.mark.parametrize("name", ["ppo", "sac", "dqn"])
+@pytest.mark.parametrize("mode", [True, False])
+def test_an_agent_that_diverged_earns_no_number(name, mode):
+    # Discrete actions would hide it: the likeliest of NaN is action 0.
+    env = Corridor()
+    with small_agents():
+        spec = environment_agent(name, "CartPole-v1")
+    agent = spec.agent(env)
+    state = agent.init(jax.random.key(0), spec.hyperparameters, env.default_params)
+    earned = jax.jit(lambda s: agent.evaluate(s, jax.random.key(1), 3, mode=mode).returns)
+    assert np.isfinite(earned(state)).all()
+    broken = jax.tree.map(
+        lambda x: x * jnp.nan if jnp.issubdtype(x.dtype, jnp.floating) else x, agent.learned(state)
+    )
+    if name == "ppo":
+        state = state.replace(params=broken)
+    else:
+        state = state.replace(learner=state.learner.replace(params=broken))
+    assert np.isnan(earned(state)).all()
+
+
+def test_an_agent_says_what_it_takes():
+    env = Corridor()
+    params = env.default_params
+    with pytest.raises(UserError, match="is a TD3Config, and PPO takes a PPOConfig"):
+        PPO(env, TD3Config())
+    agent = PPO(env, PPOConfig())
+    with pytest.raises(
+        UserError, match=r"the hyperparameters are a CorridorParams: give \(key, PPOHyp"
+    ):
+        agent.train(jax.random.key(0), params, PPOHyperparameters())
+    state = agent.init(jax.random.key(0), PPOHyperparameters(), params)
+    with pytest.raises(UserError, match="the environment is a str: give a gymnax 1"):
+        agent.evaluate(state, jax.random.key(0), 5, "CartPole-v1")
+    with pytest.raises(UserError, match="num_episodes is -1: it must be at least 1"):
+        agent.evaluate(state, jax.random.key(0), -1)
+
+
+@pytest.mark.parametrize(
+    ("drift", "message"),
+    [
+        (lambda p, l, a, t: missing, "name 'missing' is not defined"),  # noqa: E741, F821
+        (lambda p, l: l, "takes 2 positional arguments but 4 were given"),  # noqa: E741
+        (lambda p, l, a, t: 0.0, r"drift returns \(\) for one ratio: give a penalty for each"),  # noqa: E741
+        (lambda p, l, a, t: l.sum(), r"drift returns \(\) for one ratio"),  # noqa: E741
+    ],
+)
+def test_a_drift_of_ones_own_that_fails_says_why(drift, message):
+    agent = PPO(Corridor(), PPOConfig(), drift)
+    with pytest.raises(UserError, match=message):
+        agent.init(jax.random.key(0), PPOHyperparameters(), CorridorParams())
+
+
+@pytest.mark.parametrize("name", ["ppo", "sac", "dqn"])
+def test_agents_train_where_numbers_have_64_bits(name):
+    env = Corridor()
+    with small_agents():
+        spec = environment_agent(name, "CartPole-v1")
+    with jax.enable_x64(True):
+        agent = spec.agent(env)
+        trained = jax.jit(agent.train)(jax.random.key(0), spec.hyperparameters, env.default_params)
+        assert np.isfinite(agent.evaluate(trained, jax.random.key(1), 2).returns).all()
 
 
 # -- a new algorithm: its module and a row of the tables

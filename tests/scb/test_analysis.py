@@ -11,7 +11,7 @@ from scb.analysis import figures
 from scb.analysis.importance import reward_variance
 from scb.analysis.optimal_actions import optimal_actions, optimal_policy
 from scb.analysis.planes import observation_names, plane_for
-from scb.analysis.states import bandit_states, follow
+from scb.analysis.states import Trajectories, bandit_states, follow
 from scb.cli import main
 from scb.environments.synthetic import BanditConfig, SyntheticBandit
 from scb.environments.zoo import load_bandit
@@ -110,6 +110,12 @@ def test_reward_variance_draws_entries_apart_from_each_other():
     a, others = rng.uniform(-1, 1, (20_000, 1)), rng.normal(scale=np.sqrt(2), size=(20_000, 1))
     r = -np.abs(a - others - rng.normal(size=(20_000, 64)))
     np.testing.assert_allclose(shares, r.var(axis=1).mean() / r.var(), atol=0.06)
+
+
+def test_what_comes_after_an_episodes_end_is_no_part_of_its_return():
+    rewards, active = np.array([[1.0, 2.0, np.nan]]), np.array([[True, True, False]])
+    followed = Trajectories(np.zeros((1, 3, 1)), np.zeros((1, 3)), rewards, active)
+    np.testing.assert_array_equal(followed.returns(), [3.0])
 
 
 def test_follow_earns_what_evaluate_earns():

@@ -12,8 +12,9 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+from gymnax.environments import spaces
 
-from scb import artefacts, listing
+from scb import artefacts, judgement, listing
 from scb.cli import main
 from scb.command_line import Output
 from scb.commands import Discover, Judgement, TrainConfig
@@ -21,9 +22,10 @@ from scb.console import console
 from scb.curriculum import CurriculumConfig, paper_curriculum
 from scb.discovery import BanditDiscovery, DiscoveryConfig
 from scb.environments.registry import environment_spec, make
-from scb.environments.synthetic import BanditConfig
-from scb.environments.zoo import bandit_metadata, load_bandit, zoo_names
+from scb.environments.synthetic import BanditConfig, SyntheticBandit
+from scb.environments.zoo import bandit_metadata, load_bandit, save_bandit, zoo_names
 from scb.evolution import EvolutionConfig
+from scb.measurement import Place
 from scb.runs import config_dict
 from scb.warm_start import WarmStartConfig
 from tests.recording import recorded_seeds
@@ -398,6 +400,24 @@ def test_training_prints_the_sorted_returns_and_their_mean(bandit_file):
     # The seed decides everything.
     assert call(*train).out == result.out
     assert call(*train, "--seed", "1").out != result.out
+
+
+def test_a_bandit_is_judged_with_the_physics_that_it_was_found_with(tmp_path, monkeypatch):
+    made = []
+    monkeypatch.setattr(judgement, "check_fits", lambda *_: None)
+    monkeypatch.setattr(
+        judgement.Place,
+        "named",
+        classmethod(lambda cls, *place: made.append(place) or cls(*place[:1], None, None)),
+    )
+    bandit = SyntheticBandit(11, spaces.Box(-1.0, 1.0, (3,)))
+    metadata = {"config": {"evaluation_environment": "hopper", "backend": "spring"}}
+    path = tmp_path / "bandit.npz"
+    save_bandit(path, bandit, bandit.init_weights(jax.random.key(0)), metadata)
+    for environment, backend in [(None, None), (None, "generalized"), ("walker2d", None)]:
+        judgement.evaluation_place(load_bandit(path), str(path), environment, backend)
+    assert made == [("hopper", "spring"), ("hopper", "generalized"), ("walker2d", None)]
+    assert str(Place("hopper", None, None, "spring")) == "hopper (spring physics)"
 
 
 def test_agents_that_diverge_count_as_random_actions_and_are_told(bandit_file, monkeypatch):

@@ -2,13 +2,14 @@
 
 import sys
 
+import numpy as np
 import pytest
 
 from scb.cli import main
 from scb.environments.registry import check_backend, environment_spec, make
 from scb.environments.zoo import bandit_metadata
 from scb.errors import UserError
-from scb.measurement import Place
+from scb.measurement import Place, as_random
 
 MODULE = """
 import gymnax, jax.numpy as jnp
@@ -49,6 +50,15 @@ class OlderReset(Pendulum):
 class NoStep(Pendulum):
     def step(self, *arguments):
         pass
+
+class FourValues(Pendulum):
+    def step_env(self, *arguments):
+        return super().step_env(*arguments)[:4]
+
+class NoRewards(Pendulum):
+    def step_env(self, *arguments):
+        observation, state, reward, *others = super().step_env(*arguments)
+        return observation, state, reward * jnp.nan, *others
 
 class ManyRewards(Pendulum):
     def step_env(self, *arguments):
@@ -115,6 +125,7 @@ def test_the_physics_that_a_factory_takes_is_part_of_the_place(module):
         ("{}:OlderStep", "returns 5 of step, where gymnax 1.x returns observation, state, reward"),
         ("{}:OlderReset", "returns 3 of reset, where gymnax 1.x returns observation, state: "),
         ("{}:NoStep", "returns 1 of step, where gymnax 1.x returns"),
+        ("{}:FourValues", "returns 4 of step_env, where gymnax 1.x returns observation, state, re"),
         ("{}:ManyRewards", r"rewards of shape \(2,\)"),
         ("{}:endless", "without max_steps_in_episode"),
         ("{}:wrong", "returned a str: it must return a gymnax"),
@@ -124,6 +135,12 @@ def test_the_physics_that_a_factory_takes_is_part_of_the_place(module):
 def test_what_is_no_factory_is_refused(module, name, message):
     with pytest.raises(UserError, match=message):
         make(name.format(module))
+
+
+def test_where_nobody_earns_a_number_the_environment_is_told(module):
+    place = Place.named(f"{module}:NoRewards")
+    with pytest.raises(UserError, match=r"random actions earn a finite number in .*NoRewards: look"):
+        as_random(np.array([np.nan]), place)
 
 
 def test_a_bug_inside_of_a_factory_is_not_taken_for_wrong_arguments(module):

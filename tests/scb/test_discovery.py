@@ -26,7 +26,7 @@ from scb.environments.zoo import (
 )
 from scb.errors import UserError
 from scb.evaluation import Episodes
-from scb.evolution import EvolutionConfig, map_population
+from scb.evolution import EvolutionConfig, evaluated, map_population
 from scb.fitting import standardize_reward
 from scb.judgement import check_fits, judge
 from scb.measurement import Place
@@ -377,8 +377,10 @@ def test_a_curriculum_is_one_program_whose_horizon_is_traced():
         fitness = population(weights, jax.random.key(1), jnp.int32(generation))
         np.testing.assert_array_equal(fitness, np.full((2, 3), expected))
     assert len(traces) == 1
-    # Candidates are given 3 steps at most; the mean is judged in the environment as it is.
-    assert problem.steps().evaluation == 3 * 2 * 3
+    # Three agents of each candidate, two episodes of each; the mean is judged in the environment as it is.
+    assert [problem.steps(g).evaluation for g in range(4)] == [6 * 1, 6 * 2, 6 * 3, 6 * 3]
+    spent = evaluated(problem, replace(problem.config.evolution, population_size=5), 3)
+    assert spent.evaluation == 5 * 6 * (1 + 2 + 3)
     mean = jax.tree.map(lambda x: x[0], weights)
     judged = jax.jit(problem.evaluate_mean)(mean, jax.random.key(2))
     assert judged["fitness"] >= 8
@@ -390,6 +392,7 @@ def test_the_papers_curriculum_raises_mountaincars_limit(monkeypatch):
     curriculum = paper_curriculum("MountainCar-v0")
     problem = BanditDiscovery(replace(CONFIG, environment="MountainCar-v0", curriculum=curriculum))
     assert problem.steps().evaluation == 3 * 2 * 1000
+    assert problem.steps(500).evaluation == 3 * 2 * 600
     agent = problem.specs["ppo"].agent(problem.bandit)
     weights = problem.bandit.init_weights(jax.random.key(0))
     state = agent.init(jax.random.key(1), PPOHyperparameters(), problem.bandit.params(weights))

@@ -12,8 +12,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from scb import measurement
+from scb.agents.agent import evaluated_after
 from scb.agents.ppo import DIAGNOSIS, PPOConfig, PPOHyperparameters, clipped_surrogate_drift
-from scb.agents.spec import AgentSpec
+from scb.agents.spec import AgentSpec, environment_agent
 from scb.errors import UserError
 from scb.evolution import map_population
 from scb.measurement import Agents, Judge, Place, measure, spaced, train_and_judge
@@ -21,7 +22,7 @@ from scb.rows import Rows, pivot
 
 # Seven batches of eight contexts, which have no divisor near three points: nine are trained.
 CONFIG = PPOConfig(
-    num_envs=8, num_steps=1, num_epochs=2, num_minibatches=2, total_steps=56, hidden_sizes=(4,)
+    num_envs=8, num_steps=1, num_epochs=2, num_minibatches=2, total_steps=72, hidden_sizes=(4,)
 )
 SPEC = AgentSpec("ppo", CONFIG, PPOHyperparameters(learning_rate=0.03))
 SEEDS = (3, 4, 5)
@@ -388,28 +389,37 @@ def test_rows_become_arrays_in_the_order_of_the_rows():
 
 
 @given(iterations=st.integers(1, 500), points=st.integers(1, 50))
-def test_points_lie_at_equal_distances_and_are_about_as_many_as_asked(iterations, points):
-    every, trained = spaced(iterations, points)
-    assert trained % every == 0 and trained >= iterations
+def test_points_are_about_as_many_as_asked(iterations, points):
+    judged = len(evaluated_after(iterations, spaced(iterations, points))) - 1
     asked = min(points, iterations)
-    assert asked / 2 <= trained / every <= 2 * asked
+    assert asked / 2 <= judged <= 2 * asked
 
 
 @pytest.mark.parametrize(
     ("iterations", "points", "expected"),
     [
-        (15, 15, (1, 15)),
-        (150, 15, (10, 150)),
+        (15, 15, 1),
+        (150, 15, 10),
         # 16 gives 16, 8, 4, 2 or 1 points; 16 is nearest to 15.
-        (16, 15, (1, 16)),
-        # 7 gives 7 or 1, both too far from 3: three iterations a point.
-        (7, 3, (3, 9)),
-        (97, 15, (7, 105)),
-        (5120, 15, (320, 5120)),
+        (16, 15, 1),
+        # 7 gives 7 or 1, both too far from 3: two iterations a point, and one for the last.
+        (7, 3, 2),
+        (97, 15, 6),
+        (5120, 15, 320),
     ],
 )
 def test_points_of_some_trainings(iterations, points, expected):
     assert spaced(iterations, points) == expected
+
+
+def test_a_training_is_as_long_as_asked_wherever_its_points_lie():
+    spec = environment_agent("ppo", "Pendulum-v1").with_values(
+        num_steps=2, num_envs=1, num_minibatches=1
+    )
+    rows = measure(
+        spec.with_steps(14), Place.named("Pendulum-v1"), agents=[0], points=3, episodes=1
+    )
+    assert [row["step"] for row in rows] == [0, 4, 8, 12, 14]
 
 
 def test_a_configuration_can_be_read(file):

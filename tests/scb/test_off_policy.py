@@ -844,18 +844,22 @@ def test_training_normalises_what_it_learns_from():
     assert np.abs(after["bias"] - before["bias"]).max() > 1e-3
 
 
-def test_evaluations_happen_before_the_first_and_after_every_nth_iteration():
+@pytest.mark.parametrize(
+    ("every", "expected"), [(10, [0, 10, 20]), (8, [0, 8, 16, 20]), (30, [0, 20])]
+)
+def test_evaluations_happen_before_the_first_after_every_nth_iteration_and_at_the_end(
+    every, expected
+):
     # 440 steps, 400 of them prefill, in twos: 20 iterations.
     agent, h = CASES["dqn"].make(total_steps=440), CASES["dqn"].hyperparameters
     params = agent.env.default_params
-    _, iterations = jax.jit(
+    state, iterations = jax.jit(
         lambda key: agent.train_with_evaluations(
-            key, h, params, lambda state, _: state.iteration, 10
+            key, h, params, lambda state, _: state.iteration, every
         )
     )(jax.random.key(0))
-    np.testing.assert_array_equal(iterations, [0, 10, 20])
-    with pytest.raises(UserError, match="every 3 iterations does not divide 20 iterations"):
-        agent.train_with_evaluations(jax.random.key(0), h, params, lambda state, _: 0, 3)
+    np.testing.assert_array_equal(iterations, expected)
+    assert state.iteration == 20
 
 
 # MNISTBandit downloads its pictures when it is made; Brax takes a minute to trace.

@@ -496,12 +496,28 @@ def test_evaluations_happen_before_the_first_and_after_every_nth_iteration(watch
     assert state.iteration == 4
 
 
-@pytest.mark.parametrize("every", [3, 0, -1, 5])
-def test_evaluations_that_do_not_divide_the_training_are_refused(small, every):
+def test_where_evaluations_divide_a_training_unevenly_it_is_the_same(small):
     agent, params = small
-    with pytest.raises(UserError, match=f"every {every} iterations does not divide 4 iterations"):
+    train = jax.jit(
+        lambda every: agent.train_with_evaluations(
+            jax.random.key(0),
+            PPOHyperparameters(),
+            params,
+            lambda state, key: state.iteration,
+            every,
+        ),
+        static_argnums=0,
+    )
+    (even, _), (uneven, at) = train(2), train(3)
+    np.testing.assert_array_equal(at, [0, 3, 4])
+    chex.assert_trees_all_close(uneven.params, even.params, rtol=1e-5, atol=1e-6)
+
+
+def test_evaluations_after_no_iteration_are_refused(small):
+    agent, params = small
+    with pytest.raises(UserError, match="every 0 iterations: give a number from 1 on"):
         agent.train_with_evaluations(
-            jax.random.key(0), PPOHyperparameters(), params, lambda state, key: 0, every
+            jax.random.key(0), PPOHyperparameters(), params, lambda state, key: 0, 0
         )
 
 

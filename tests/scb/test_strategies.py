@@ -6,9 +6,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from scb.errors import UserError
 from scb.evolution import EvolutionConfig, evolve
 from scb.keys import root_key
-from scb.strategies import Strategy
+from scb.strategies import STRATEGIES, Strategy
 from tests.scb.probes import Slope
 
 MANY = EvolutionConfig(population_size=400, sigma=0.1)
@@ -19,6 +20,18 @@ def test_every_weight_is_searched_in_its_own_unit():
     state = strategy.start(root_key(0), jnp.zeros(2), jnp.array([1.0, 100.0]))
     population, _ = strategy.ask(root_key(1), state)
     np.testing.assert_allclose(np.std(population, axis=0), [0.1, 10.0], rtol=0.15)
+
+
+@pytest.mark.parametrize("name", sorted(STRATEGIES))
+@pytest.mark.parametrize("size", [4, 7])
+def test_a_strategy_asks_for_as_many_as_it_is_given_or_refuses(name, size):
+    try:
+        strategy = Strategy(EvolutionConfig(strategy=name, population_size=size), jnp.zeros(8))
+    except UserError as error:
+        assert size == 7 and "population_size" in str(error)
+        return
+    population, _ = strategy.ask(root_key(1), strategy.start(root_key(0), jnp.zeros(8)))
+    assert population.shape == (size, 8)
 
 
 @pytest.mark.parametrize("sigma", [0.05, 2.0])

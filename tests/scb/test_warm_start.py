@@ -16,7 +16,7 @@ from scb.environments.registry import make
 from scb.environments.spec import EnvironmentSpec
 from scb.environments.synthetic import BanditConfig, BanditParams, SyntheticBandit, bandit_for
 from scb.errors import UserError
-from scb.expert_data import expert_dataset
+from scb.expert_data import DatasetConfig, _stretched, expert_dataset
 from scb.experts import Expert, judged, train_expert
 from scb.fitting import ExpertDataset, energy_distance, fit_bandit, reward_targets
 from scb.keys import root_key
@@ -325,6 +325,14 @@ def test_an_entry_that_scatters_enough_is_left_as_it_is():
     np.testing.assert_allclose(stretched.observation, plain.observation, atol=1e-6)
 
 
+@pytest.mark.parametrize("value", [0.0, 0.1, -0.7, 9.81])
+def test_an_entry_that_never_changes_is_not_stretched(value):
+    states = jax.random.normal(jax.random.key(0), (4096, 2)).at[:, 1].set(value)
+    stretched = _stretched(states, jax.random.key(1), DatasetConfig(min_spread=3.0, jitter=1.0))
+    np.testing.assert_allclose(stretched[:, 1], value, rtol=1e-5)
+    assert stretched[:, 0].std() > 3.0
+
+
 @pytest.mark.parametrize("min_spread", [0.0, 1.0, 3.0])
 def test_the_label_of_a_state_is_the_experts_action_in_that_very_state(min_spread):
     dataset = contexts(min_spread)
@@ -417,6 +425,24 @@ def test_the_contexts_are_fitted_to_the_states(fitted, bandit_dataset):
     # Uniform in [0, 1]: mean 1/2, deviation sqrt(1/12) = 0.289.
     assert float(contexts.mean()) == pytest.approx(0.5, abs=0.08)
     assert float(contexts.std()) == pytest.approx(0.289, abs=0.06)
+
+
+def test_an_entry_that_never_changes_leaves_the_others_theirs(bandit_dataset):
+    size, dataset = 4, jax.tree.map(jnp.asarray, bandit_dataset)
+    spread = jnp.array([2.0, 0.0, 0.5, 1.0])
+    at = jnp.array([0.0, 9.81, -3.0, 1.0])
+    states = at + spread * jax.random.normal(jax.random.key(6), (len(dataset.observation), size))
+    bandit = SyntheticBandit(size, spaces.Box(-1.0, 1.0, (1,)), BanditConfig(hidden_size=16))
+    weights, report = fit_bandit(
+        bandit, dataset._replace(observation=states), jax.random.key(0), "q", steps=1500
+    )
+    assert report["energy_distance"] < 0.05
+    contexts, _ = jax.jit(jax.vmap(bandit.reset, (0, None)))(
+        jax.random.split(jax.random.key(4), 1000), BanditParams(weights=weights)
+    )
+    np.testing.assert_allclose(contexts.mean(axis=0), at, atol=0.3)
+    np.testing.assert_allclose(contexts.std(axis=0), spread, atol=0.3)
+    np.testing.assert_allclose(contexts[:, 1], 9.81, rtol=1e-6)
 
 
 def test_the_fitted_weights_are_a_bandits(fitted):
