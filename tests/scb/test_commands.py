@@ -80,6 +80,20 @@ def test_a_discovery_says_what_its_bandit_is_worth_and_where_it_lies(discovered)
     assert "generation 2/2: fitness" in result.err
 
 
+def test_a_bandit_is_there_before_it_is_judged(discovered, tmp_path, monkeypatch):
+    def interrupted(*arguments):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("scb.commands.judge_all", interrupted)
+    assert call(*DISCOVER, "--out", tmp_path).code == 130
+    path, whole = (
+        tmp_path / "Synthetic-CartPole-v1.npz",
+        discovered[0] / "Synthetic-CartPole-v1.npz",
+    )
+    assert path.read_bytes() == whole.read_bytes()
+    assert bandit_metadata(path)["results"] == {}
+
+
 def test_a_discovery_leaves_a_bandit_with_its_story(discovered):
     folder, _ = discovered
     bandit = load_bandit(folder / "Synthetic-CartPole-v1.npz")

@@ -139,7 +139,9 @@ def test_what_is_no_factory_is_refused(module, name, message):
 
 def test_where_nobody_earns_a_number_the_environment_is_told(module):
     place = Place.named(f"{module}:NoRewards")
-    with pytest.raises(UserError, match=r"random actions earn a finite number in .*NoRewards: look"):
+    with pytest.raises(
+        UserError, match=r"random actions earn a finite number in .*NoRewards: look"
+    ):
         as_random(np.array([np.nan]), place)
 
 
