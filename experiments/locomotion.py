@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from experiments.claims import Claim, Judged, judge, of_agents
+from experiments.claims import CONFIDENCE, Claim, Judged, judge, of_agents
 from experiments.harness import Experiment, Report, packed
 from experiments.parts import InParts, Keys, Part, lacking
 from lpo import figures
@@ -38,6 +38,7 @@ MARGIN = 0.05  # of what the reference earns: what is not worse by more is as go
 ASKED = {
     "final": "ends no lower than PPO",
     "late": "earns no less over the last quarter than PPO",
+    "early": "earns more over the first half than PPO",
     "area": "earns more over the training than PPO",
 }
 
@@ -165,13 +166,13 @@ def kept(curves: LearningCurves) -> dict[str, dict[str, Any]]:
 def paired(
     curves: LearningCurves, reference: LearningCurves, of: str
 ) -> Callable[..., Estimate] | Estimate | None:
-    """How much more agents of the same seeds earn ("final", "late", "area"), no interval where there are few."""
+    """How much more agents of the same seeds earn, by one of `ASKED`; no interval where there are few."""
     ours, theirs = curves.paired(reference, of)
     return of_agents(partial(paired_difference, ours, theirs), len(ours)) if len(ours) else None
 
 
 def claims(report: Report) -> list[Claim]:
-    """Of every objective but the reference: no worse at the end and over the last quarter, and better over all."""
+    """Of every objective but the reference, by each of `ASKED`."""
     found = []
     for environment, entry in looked_at(report).items():
         curves = {x.objective: x for x in as_comparison(environment, entry).curves}
@@ -183,7 +184,7 @@ def claims(report: Report) -> list[Claim]:
 
 def _claim(curves: LearningCurves, reference: LearningCurves, of: str) -> Claim:
     text = f"{curves.environment}: {curves.objective} {ASKED[of]}"
-    if of == "area":
+    if of in ("early", "area"):
         return Claim(text, paired(curves, reference, of), places=0)
     margin = float(f"{MARGIN * abs(float(getattr(reference, of).mean())):.4g}")
     reason = "a twentieth of what PPO's clip earns"
@@ -241,6 +242,11 @@ def facts(report: Report) -> dict[str, Any]:
             for name, entry in report["environments"].items()
             if (sweep := swept(entry))
         },
+        "led": {
+            name: leading(curves)
+            for name, comparison in comparisons.items()
+            if (curves := _comparable(comparison))
+        },
         "diagnosed": {
             name: {curve.objective: width(curve) for curve in curves}
             for name, comparison in comparisons.items()
@@ -250,11 +256,13 @@ def facts(report: Report) -> dict[str, Any]:
 
 
 def draw(report: Mapping[str, Any]) -> dict[str, Figure]:
-    """Learning curves of each environment, and what an iteration does to the policy where that is known."""
+    """Learning curves of each environment, leads over PPO, and what an iteration does to the policy, where known."""
     drawn = {}
     for name, entry in looked_at(report).items():
         comparison = as_comparison(name, entry)
         drawn[f"locomotion_{name}"] = figures.learning_curves(comparison.curves)
+        if curves := _comparable(comparison):
+            drawn[f"locomotion_{name}_leads"] = figures.leads(curves)
         if curves := _diagnosed(comparison):
             drawn[f"locomotion_{name}_updates"] = figures.diagnosis(curves)
     return drawn
@@ -277,6 +285,36 @@ def width(curves: LearningCurves) -> float:
     of_one = 0.5 * math.log(2 * math.pi * math.e)
     joints = round(entropy[0] / of_one)
     return math.exp(entropy[-1] / joints - of_one)
+
+
+def leading(curves: Sequence[LearningCurves]) -> tuple[int, dict[str, dict[str, list[int]]]]:
+    """Where objectives are apart from the first one along the training.
+
+    Returns:
+      (number of differences, {"ahead" or "behind": {objective: steps}}): of the points whose interval lies on one side
+      of 0, corrected for that number.
+    """
+    reference, *others = curves
+    number = len(others) * np.count_nonzero(reference.steps)
+    found: dict[str, dict[str, list[int]]] = {"ahead": {}, "behind": {}}
+    for curve in others:
+        ours, theirs = curve.paired(reference, "returns")
+        for steps, one, other in zip(reference.steps, ours.T, theirs.T, strict=True):
+            if not steps:
+                continue
+            apart = paired_difference(one, other, 1.0 - (1.0 - CONFIDENCE) / number)
+            assert apart.low is not None and apart.high is not None
+            if apart.low > 0 or apart.high < 0:
+                side = found["ahead" if apart.low > 0 else "behind"]
+                side.setdefault(curve.objective, []).append(int(steps))
+    return int(number), found
+
+
+def _comparable(comparison: Comparison) -> list[LearningCurves]:
+    """PPO's clip, and objectives with enough agents on its seeds; none where there is no such objective."""
+    reference, *others = comparison.curves
+    enough = [x for x in others if len(x.paired(reference)[0]) >= DECIDING]
+    return [reference, *enough] if enough else []
 
 
 def _diagnosed(comparison: Comparison) -> list[LearningCurves]:

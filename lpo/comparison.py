@@ -67,6 +67,11 @@ class LearningCurves:
         return self.returns[:, self.steps > 0.75 * self.steps[-1]].mean(axis=1)
 
     @property
+    def early(self) -> np.ndarray:
+        """[S] mean return over the first half of the training, the untrained agent left out."""
+        return self.returns[:, (self.steps > 0) & (self.steps <= 0.5 * self.steps[-1])].mean(axis=1)
+
+    @property
     def area(self) -> np.ndarray:
         """[S] mean return over the training, the untrained agent left out."""
         return self.returns[:, 1:].mean(axis=1)
@@ -92,7 +97,7 @@ class LearningCurves:
     def paired(
         self, reference: "LearningCurves", of: str = "final"
     ) -> tuple[np.ndarray, np.ndarray]:
-        """([S], [S]) "final", "late" or "area" of both, of the S seeds that both have."""
+        """([S, ...], [S, ...]) "final", "early", "late", "area" or "returns" of both, of the S seeds that both have."""
         shared = [seed for seed in self.seeds if seed in reference.seeds]
         ours, theirs = (
             getattr(x, of)[[x.seeds.index(seed) for seed in shared]] for x in (self, reference)

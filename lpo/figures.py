@@ -36,7 +36,7 @@ from scb.plotting import (
     legend_below,
     ratio_text,
 )
-from scb.statistics import estimate
+from scb.statistics import estimate, paired_difference
 
 if TYPE_CHECKING:
     from lpo.comparison import LearningCurves
@@ -269,6 +269,44 @@ def learning_curves(curves: "Sequence[LearningCurves]") -> Figure:
         figure_title(figure, f"{_protocol(first)}, {_number(counts, 'seeds')}")
         # Under its own panel, beside the names on the right; constrained layout keeps its room.
         training.legend(loc="upper center", bbox_to_anchor=(0.5, -0.17), ncols=min(len(curves), 3))
+    return figure
+
+
+def leads(curves: "Sequence[LearningCurves]") -> Figure:
+    """By how much agents earn more along the training than those of the first objective, on the seeds of both.
+
+    Differences of interquartile means; bands are 95 % bootstrap intervals over pairs, at each point for itself.
+
+    Args:
+      curves: of one environment, one an objective; the first is what the others are compared with.
+
+    Raises:
+      UserError: there is nothing to compare, or no seed that both have.
+    """
+    reference, *others = curves
+    if not others or not all(len(x.paired(reference)[0]) for x in others):
+        raise UserError(
+            f"nothing shares a seed with {reference.objective}: give objectives that do."
+        )
+    style = looks([curve.objective for curve in curves])
+    with figure_style():
+        figure = Figure(figsize=(WIDTH, 2.8))
+        panels = figure.subplots(1, len(others), sharex=True, sharey=True, squeeze=False)[0]
+        for axes, curve in zip(panels, others, strict=True):
+            look, (ours, theirs) = style[curve.objective], curve.paired(reference, "returns")
+            points = [paired_difference(*both) for both in zip(ours.T, theirs.T, strict=True)]
+            estimate_curve(
+                axes, curve.steps, points, look.color, look.linestyle, marker=look.marker
+            )
+            axes.axhline(0.0, color=BLACK, linewidth=1)
+            axes.set_title(f"{curve.objective}\n{len(ours)} pairs", fontsize=10, weight="normal")
+            axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+            axes.margins(x=0.02)
+        panels[0].set_ylabel(f"return less that of {reference.objective}")
+        panels[len(panels) // 2].set_xlabel("environment steps")
+        figure_title(
+            figure, f"{_place(reference)}: lead over {reference.objective}, of paired seeds"
+        )
     return figure
 
 

@@ -27,7 +27,7 @@ class Confirmation:
     Attributes:
       environment, objective: whose it is.
       seeds: of its agents, none of which suggested the claim.
-      of: what is said of them, "final", "late" or "area".
+      of: what is said of them, "final", "early", "late" or "area".
       reference_known: whether PPO's agents of these seeds had been trained, and seen, before.
     """
 
@@ -42,6 +42,7 @@ CONFIRMATIONS = (
     Confirmation("hopper", "ta-lpo", reporting(30, offset=20)),
     Confirmation("hopper", "lpo-pendulum", reporting(40, offset=10), "late", reference_known=True),
     Confirmation("hopper", "ta-lpo", reporting(60, offset=50), "area"),
+    Confirmation("hopper", "ta-lpo", reporting(40, offset=110), "early"),
 )
 
 

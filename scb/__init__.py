@@ -15,6 +15,7 @@ from scb import start as start  # before what imports gymnax
 from scb.agents.dqn import DQN, DQNConfig, DQNHyperparameters
 from scb.agents.ppo import PPO, PPOConfig, PPOHyperparameters
 from scb.agents.sac import SAC, SACConfig, SACHyperparameters
+from scb.agents.spec import AgentSpec, environment_agent
 from scb.agents.td3 import TD3, TD3Config, TD3Hyperparameters, ddpg_config, ddpg_hyperparameters
 from scb.environments.registry import make
 from scb.environments.synthetic import BanditConfig, BanditParams, SyntheticBandit
@@ -31,6 +32,7 @@ __all__ = [
     "PPO",
     "SAC",
     "TD3",
+    "AgentSpec",
     "BanditConfig",
     "BanditParams",
     "DQNConfig",
@@ -47,6 +49,7 @@ __all__ = [
     "UserError",
     "ddpg_config",
     "ddpg_hyperparameters",
+    "environment_agent",
     "load_bandit",
     "make",
     "save_bandit",

@@ -9,10 +9,12 @@ import pytest
 
 from experiments import claims
 from experiments import locomotion as module
-from lpo import full_size
+from lpo import figures, full_size
 from lpo.comparison import Comparison, LearningCurves
 from scb.agents.ppo import DIAGNOSIS
+from scb.errors import UserError
 from scb.seeds import REPORTING, VALIDATING
+from scb.statistics import iqm
 
 STEPS = [0, 50, 100]
 
@@ -143,8 +145,11 @@ def report(number):
 
 def test_ten_agents_decide_and_fewer_do_not():
     judged = claims.judge(module.claims(report(10)))
-    assert [x.outcome for x in judged] == [claims.HOLDS] * 3 + [claims.FAILS] * 3
-    assert "lpo-pendulum ends no lower than PPO" in judged[3].claim.text
+    assert [x.outcome for x in judged] == [
+        *(claims.HOLDS, claims.HOLDS, claims.UNDECIDED, claims.HOLDS),
+        *(claims.FAILS, claims.FAILS, claims.UNDECIDED, claims.FAILS),
+    ]
+    assert "lpo-pendulum ends no lower than PPO" in judged[4].claim.text
     assert {x.outcome for x in claims.judge(module.claims(report(9)))} == {claims.UNDECIDED}
 
 
@@ -170,6 +175,28 @@ def test_only_agents_of_the_same_seeds_are_compared():
     agents["dpo"] = module.kept(curves("dpo", range(100, 104)))
     judged = claims.judge(module.claims(made))
     assert [x.outcome for x in judged[:3]] == [claims.UNTESTED] * 3
+
+
+def test_leads_along_the_training_are_corrected_for_all_points(tmp_path):
+    seeds = REPORTING[:12]
+    ppo, far, near = (curves(x, seeds) for x in ("ppo", "far", "near"))
+    jitter = np.random.default_rng(0).normal(0.0, 5.0, (2, 12))
+    far.returns[:, 1] += 40.0 + jitter[0]
+    far.returns[:, 2] -= 40.0 + jitter[1]
+    near.returns[:, 1] += jitter[0]
+    number, sides = module.leading([ppo, far, near])
+    assert number == 2 * 2  # the untrained agents are the same
+    assert sides == {"ahead": {"far": [50]}, "behind": {"far": [100]}}
+    figure = figures.leads([ppo, far, near])
+    assert [axes.get_title(loc="left") for axes in figure.axes] == [
+        "far\n12 pairs",
+        "near\n12 pairs",
+    ]
+    drawn = figure.axes[0].lines[0].get_ydata()
+    ours, theirs = far.paired(ppo, "returns")
+    np.testing.assert_allclose(drawn, iqm(ours, axis=0) - iqm(theirs, axis=0))
+    with pytest.raises(UserError, match="nothing shares a seed with ppo"):
+        figures.leads([ppo, curves("other", REPORTING[12:14])])
 
 
 def test_the_width_of_a_policy_is_read_off_its_entropy():
