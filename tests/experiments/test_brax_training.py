@@ -96,7 +96,7 @@ def outcomes(found):
 def test_claims_follow_the_figures(report):
     said = experiment.EXPERIMENT.block("verdict", report)
     assert "fewer than 10 agents in the environment, which decide nothing: 2 of 2" in said
-    assert "1 of the 2 the median agent does not reach" in said
+    assert "1 of the 2 levels the median agent does not reach" in said
     body = experiment.EXPERIMENT.block("body", report)
     assert "| 200 [200, 200] | 2 of 2 | 200000 | 600000 | 20 to 60 | 20 to 60 |" in body
     assert "| 200 [200, 200] | 0 of 2 | 800000 |  | more than 80 |" in body
@@ -112,7 +112,7 @@ def test_claims_follow_the_figures(report):
     # Of two agents one gets there: the median is not that one's.
     report["environments"]["hopper (spring)"]["ppo"]["returns"][0] = [0.0, 0.0, 0.0]
     said = experiment.EXPERIMENT.block("verdict", report)
-    assert "2 of the 2 the median agent does not reach" in said
+    assert "2 of the 2 levels the median agent does not reach" in said
     assert "| 1 of 2 | 600000 |  | more than 60 |" in experiment.EXPERIMENT.block("body", report)
 
 
