@@ -10,15 +10,32 @@ from scb.environments.spec import EnvironmentSpec
 DOCS = Path(__file__).parents[1] / "docs"
 
 
+def blocks(page):
+    return re.findall(r"```python\n(.*?)```", (DOCS / page).read_text(), re.DOTALL)
+
+
 def block(page):
-    (code,) = re.findall(r"```python\n(.*?)```", (DOCS / page).read_text(), re.DOTALL)
+    (code,) = blocks(page)
     return code
 
 
 def test_an_agent_is_kept_and_acts_in_gymnasiums_environment(tmp_path, capsys):
-    code = block("agents.md").replace("/tmp/agent", str(tmp_path / "agent"))
-    exec(compile(code, "agents.md", "exec"), {})
+    kept, _ = blocks("agents.md")
+    exec(compile(kept.replace("/tmp/agent", str(tmp_path / "agent")), "agents.md", "exec"), {})
     assert -1000 < float(capsys.readouterr().out) < 0
+
+
+def test_agents_of_several_learning_rates_train_at_once(capsys):
+    _, together = blocks("agents.md")
+    exec(compile(together, "agents.md", "exec"), {})
+    returns = [float(x) for x in capsys.readouterr().out.strip(" []\n").split()]
+    assert len(set(returns)) == 4 and min(returns) > -1600 and max(returns) < -50
+
+
+def test_objectives_are_compared_under_settings_of_ones_own(capsys):
+    code = block("objectives.md").replace("20_000", "2_000").replace("range(10)", "range(2)")
+    exec(compile(code, "objectives.md", "exec"), {})
+    assert "(n=2)" in capsys.readouterr().out
 
 
 def test_an_environment_of_ones_own_is_made(tmp_path, monkeypatch):

@@ -69,7 +69,7 @@ def test_the_page_has_a_row_for_every_expert_and_contexts():
         "hopper: a search has 30 or 40 generations" in page and "12 agents of PPO and 4 of" in page
     )
     assert "Standing still earns 1000." in page
-    assert "Shown: hopper: PPO's agents earn more with errors and jitter than with noise" in page
+    assert "Shown: on hopper, PPO's agents earn more with errors and jitter than with noise" in page
     few = module.EXPERIMENT.page(report(1))
     assert "Not shown yet" in few
 

@@ -199,7 +199,7 @@ def test_an_agent_refuses_a_drift_of_another_shape():
         return 0.0 * log_ratio[:, None]
 
     agent = PPO(context_bandit(), SMALL, drift=column)
-    with pytest.raises(AssertionError):
+    with pytest.raises(UserError, match=r"the agent's drift returns \(1, 1\) for one ratio"):
         jax.eval_shape(
             agent.train, jax.random.key(0), PPOHyperparameters(), agent.env.default_params
         )
