@@ -125,6 +125,15 @@ def test_a_closed_form_without_parameters_by_name_is_not_saved(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+def test_parameters_of_another_drift_are_not_saved(tmp_path):
+    parameters = {"hidden": np.zeros((8, 3)), "output": np.zeros((3, 1))}
+    with pytest.raises(
+        UserError, match=r"array 'hidden' .* shape \(8, 3\) where \(8, 128\) is expec"
+    ):
+        save_objective(tmp_path / "mine.npz", LearnedDrift(), parameters)
+    assert not list(tmp_path.iterdir())
+
+
 def test_dpo_is_saved_with_the_parameters_it_has(tmp_path):
     trained = {"alpha": jnp.float32(4.0), "beta": jnp.float32(1.5)}
     path, _ = save_objective(tmp_path / "mine.npz", DPODrift(), trained, METADATA)

@@ -87,6 +87,22 @@ def test_the_metadata_is_kept_beside_what_the_bandit_needs(tmp_path):
     assert (metadata["kind"], metadata["seeds"]) == ("bandit", {"discovery": 3})
 
 
+def test_what_could_not_be_loaded_is_not_saved(tmp_path):
+    path = tmp_path / "bandit.npz"
+    other = BANDITS["discrete"].init_weights(jax.random.key(0))
+    with pytest.raises(UserError, match=r"array 'reward/Dense_0/kernel' .* is expected"):
+        save_bandit(path, BANDITS["box"], other)
+    with pytest.raises(UserError, match="the arrays are a ndarray: give a dictionary of them"):
+        artefacts.save(path, np.zeros(420), METADATA)
+    assert not path.exists()
+    with pytest.raises(UserError, match="cannot write to /proc/nowhere"):
+        artefacts.save(
+            "/proc/nowhere/bandit.npz",
+            {"x": np.zeros(1)},
+            METADATA | {"kind": "bandit", "config": {}},
+        )
+
+
 def test_weights_of_another_architecture_are_refused(tmp_path):
     path, _ = saved(tmp_path, BANDITS["box"])
     edit(path, lambda content: content["config"]["bandit"].update(hidden_size=5))
