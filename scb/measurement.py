@@ -260,9 +260,8 @@ def measure(
         )
     judge_in, rows = judge_in or train_in, Rows() if rows is None else rows
     agents = agents if isinstance(agents, Agents) else Agents.seeded(spec, agents)
-    every, iterations = None, spec.config.num_iterations
-    if points is not None:
-        every = spaced(iterations, points)
+    iterations = spec.config.num_iterations
+    every = None if points is None else spaced(iterations, points)
     judged_at = [iterations] if every is None else evaluated_after(iterations, every)
     steps = [spec.config.steps_after(n) for n in judged_at]
     params = (spec.training_params(train_in.params), judge_in.params)
