@@ -19,11 +19,11 @@ from matplotlib.figure import Figure
 
 import scb
 from experiments import searches
-from experiments.claims import OF_THE_WAY, TENTH, Claim, over_environments
-from experiments.harness import Experiment, Report, bandit_of, finite
+from experiments.claims import OF_THE_WAY, TENTH, Claim
+from experiments.harness import CLASSIC_CONTROL, Experiment, Report, bandit_of, finite
 from experiments.parts import InParts, Part, lacking
 from scb import measurement, plotting
-from scb.agents.spec import algorithms_for, bandit_agent
+from scb.agents.spec import ALGORITHMS, algorithms_for, bandit_agent
 from scb.analysis.optimal_actions import optimal_policy
 from scb.curriculum import paper_curriculum
 from scb.discovery import DiscoveryConfig
@@ -34,11 +34,14 @@ from scb.keys import root_key, split_key
 from scb.measurement import Agents, Place
 from scb.neuroevolution import NeuroevolutionConfig, evolve_policy
 from scb.rows import Rows, pivot
-from scb.seeds import REPORTING
+from scb.seeds import reporting
 from scb.statistics import (
     Estimate,
+    estimate,
     iqm,
     normalized_score,
+    paired_difference,
+    stratified_estimate,
     worst_decile,
 )
 
@@ -141,10 +144,11 @@ def _source(judge_in: Place, source: str, plan: Mapping[str, Any]) -> tuple[Plac
 def _returns(agent: str, train_in: Place, judge_in: Place, plan: Mapping[str, Any]) -> np.ndarray:
     """[N] mean returns of agents of one kind, most likely actions."""
     number, episodes = plan["agents"], plan["episodes"]
+    algorithm, _, network = agent.partition(", ")
+    seed = seed_of(judge_in.name, algorithm)
     if agent not in (OPTIMAL, EVOLVED):
-        algorithm, _, network = agent.partition(", ")
         spec = bandit_agent(algorithm, judge_in.name).with_values(**NETWORKS[network])
-        agents = Agents.drawn_from(spec, REPORTING.start, number)
+        agents = Agents.drawn_from(spec, seed, number)
         folder = plan.get("rows")
         kept = Rows(folder and folder / f"{judge_in.name}, {train_in.name}, {agent}.jsonl")
         rows = measurement.measure(spec, train_in, judge_in, agents, episodes=episodes, rows=kept)
@@ -159,8 +163,18 @@ def _returns(agent: str, train_in: Place, judge_in: Place, plan: Mapping[str, An
         policy = optimal or evolve_policy(train_in.env, train_in.params, key_make, config)
         return evaluate(judge_in.env, judge_in.params, policy, key_judge, episodes).returns.mean()
 
-    keys = split_key(root_key(REPORTING.start), number)
+    keys = split_key(root_key(seed), number)
     return np.asarray(map_population(judged, number, (0,))(keys))
+
+
+def seed_of(environment: str, agent: str) -> int:
+    """The reporting seed of an algorithm, or of an agent that is none, in an environment, whatever it is trained in.
+
+    One for each: agents that shared their draws over algorithms and environments would be few.
+    """
+    agents = [*ALGORITHMS, EVOLVED, OPTIMAL]
+    offset = CLASSIC_CONTROL.index(environment) * len(agents) + agents.index(agent)
+    return reporting(offset=offset)[0]
 
 
 def in_environment(config: NeuroevolutionConfig, limit: int) -> NeuroevolutionConfig:
@@ -171,26 +185,23 @@ def in_environment(config: NeuroevolutionConfig, limit: int) -> NeuroevolutionCo
 
 
 def columns(entry: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """{column of the figure: [N, K] returns}: algorithms, all together, and agents that no search saw.
-
-    Of N draws of a seed and hyperparameters, which K algorithms share.
-    """
-    trained = {name: np.asarray(x)[:, None] for name, x in entry["returns"].items()}
+    """{column of the figure: [N] returns}: algorithms, all together, and agents that no search saw."""
+    trained = {name: np.asarray(x) for name, x in entry["returns"].items()}
     algorithms = [name for name in trained if "," not in name and name not in UNSEEN]
     found = {name: trained[name] for name in algorithms}
-    found[TOGETHER] = np.hstack(list(found.values()))
+    found[TOGETHER] = np.concatenate(list(found.values()))
     for network in (WIDE, SWISH):
-        found[network] = np.hstack([trained[f"{name}, {network}"] for name in algorithms])
+        found[network] = np.concatenate([trained[f"{name}, {network}"] for name in algorithms])
     return found | {name: trained[name] for name in (EVOLVED, OPTIMAL) if name in trained}
 
 
 def estimates(entry: Mapping[str, Any]) -> dict[str, Estimate]:
     """{column of the figure: what its agents earn}."""
-    return {name: over_environments([x]) for name, x in columns(entry).items()}
+    return {name: estimate(x) for name, x in columns(entry).items()}
 
 
 def normalized(report: Mapping[str, Any], source: str, column: str) -> list[np.ndarray]:
-    """Per environment the scores [N, K] of one kind of agent: 0 a random policy, 1 the paper's expert."""
+    """Per environment the scores [N] of one kind of agent: 0 a random policy, 1 the paper's expert."""
     return [
         normalized_score(
             columns(entry[source])[column],
@@ -204,9 +215,9 @@ def normalized(report: Mapping[str, Any], source: str, column: str) -> list[np.n
 def claims(report: Report) -> list[Claim]:
     """Robustness, by all agents and by the worst; what drawing hyperparameters brings; agents that no search saw."""
     scores = {source: normalized(report, source, TOGETHER) for source in SOURCES}
-    robust = partial(over_environments, scores[ZOO], scores[ENVIRONMENT], num_resamples=RESAMPLES)
+    robust = partial(stratified_estimate, scores[ZOO], scores[ENVIRONMENT], num_resamples=RESAMPLES)
     # One search each: how far two others would be apart, agents can't tell.
-    brought = over_environments(scores[DRAWN], scores[FIXED]).value
+    brought = stratified_estimate(scores[DRAWN], scores[FIXED]).value
     found = [
         Claim(
             "drawn hyperparameters: the mean score is better in the zoo's bandits",
@@ -218,7 +229,7 @@ def claims(report: Report) -> list[Claim]:
     for name in UNSEEN:
         # Networks differ from the paper's agent by agent; other agents have nothing in common with them.
         evidence = partial(
-            over_environments,
+            stratified_estimate,
             normalized(report, ZOO, name),
             scores[ZOO],
             paired=name in (WIDE, SWISH),
@@ -234,13 +245,13 @@ def facts(report: Report) -> dict[str, Any]:
     scores = {source: normalized(report, source, TOGETHER) for source in SOURCES}
     return {
         "scores": {
-            source: [over_environments(x, statistic=s) for s in (iqm, np.mean, worst_decile)]
+            source: [stratified_estimate(x, statistic=s) for s in (iqm, np.mean, worst_decile)]
             for source, x in scores.items()
         },
-        "unseen": {name: over_environments(normalized(report, ZOO, name)) for name in UNSEEN},
+        "unseen": {name: stratified_estimate(normalized(report, ZOO, name)) for name in UNSEEN},
         "brought": {
-            name: over_environments(
-                [columns(entry[DRAWN])[TOGETHER]], [columns(entry[FIXED])[TOGETHER]]
+            name: paired_difference(
+                columns(entry[DRAWN])[TOGETHER], columns(entry[FIXED])[TOGETHER]
             )
             for name, entry in report["environments"].items()
         },

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from gymnax.environments import spaces
 
 from scb.agents.agent import Agent
-from scb.agents.tables import ACTIVATIONS, DISCRETE_ONLY, TABLES, Lists, Row, Tables, Values
+from scb.agents.tables import ACTIVATIONS, TABLES, Lists, Row, Tables, Values
 from scb.curriculum import with_limit
 from scb.environments.registry import environment_spec
 from scb.errors import UserError, at_least, one_of
@@ -153,9 +153,8 @@ class AgentSpec:
 def bandit_agent(algorithm: str, environment: str, sampled: bool = True) -> AgentSpec:
     """The paper's inner loop: an algorithm in the bandit of an environment.
 
-    Networks are tanh, but ReLU for Pendulum. Hyperparameters are drawn in classic control (without
-    the learning rate 0.01 where actions are continuous, which the paper leaves out of PPO's list alone), and
-    fixed in Brax.
+    Networks are tanh, but ReLU for Pendulum. Hyperparameters are drawn in classic control (PPO's
+    without the learning rate 0.01 where actions are continuous), and fixed in Brax.
 
     Args:
       algorithm: one of `ALGORITHMS`.
@@ -166,11 +165,8 @@ def bandit_agent(algorithm: str, environment: str, sampled: bool = True) -> Agen
     check_algorithms([algorithm], kind)
     tables, family = ALGORITHMS[algorithm], environment_spec(environment).family
     lists = dict(tables.lists) if sampled and family not in tables.families else {}
-    if kind == "continuous":
-        lists = {
-            name: tuple(x for x in values if x not in DISCRETE_ONLY.get(name, ()))
-            for name, values in lists.items()
-        }
+    if lists and kind == "continuous":
+        lists |= tables.continuous
     values = {"activation": ACTIVATIONS.get(environment), **tables.families.get(family, {})}
     source = f"Liesen et al. (2024), table of {algorithm.upper()} in the inner loop"
     return _default(tables, lists=lists, source=source).with_values(**values)

@@ -42,6 +42,7 @@ class Tables:
       families: {family of environments: values} of its bandits' inner loops, where nothing is drawn.
       general: in an environment that has no row of its own.
       environments: {environment, or a family of them: its row}.
+      continuous: the lists that are others where actions are continuous.
       by_default: whether the inner loop trains it where no algorithms are named.
     """
 
@@ -50,6 +51,7 @@ class Tables:
     general: Row
     families: Mapping[str, Values] = field(default_factory=dict)
     environments: Mapping[str, Row] = field(default_factory=dict)
+    continuous: Lists = field(default_factory=dict)
     by_default: bool = True
 
 
@@ -60,8 +62,6 @@ class Tables:
 ACTIVATIONS = {"Pendulum-v1": "relu"}
 
 _LEARNING_RATES = (0.01, 0.005, 0.001, 0.0005, 0.0001)
-# Of the learning rates, the one that is not drawn where actions are continuous: in the paper's tables PPO's alone.
-DISCRETE_ONLY = {"learning_rate": (0.01,)}
 _DISCOUNTS = (1.0, 0.99, 0.95, 0.9, 0.8)
 _POLYAK = (0.99, 0.95, 0.9, 0.7, 0.8)
 _NOISE = (0.1, 0.2, 0.3, 0.5, 0.7, 0.9)
@@ -75,6 +75,8 @@ PPO_INNER_LOOP: dict[str, tuple[float, ...]] = {
     "entropy_coefficient": (0.0, 0.01, 0.05, 0.1, 0.5),
     "value_coefficient": (0.0, 0.5, 1.0, 1.5, 2.0),
 }
+# "Without 0.01 for continuous environments": of PPO's learning rates, and of no other algorithm's.
+PPO_CONTINUOUS: dict[str, tuple[float, ...]] = {"learning_rate": _LEARNING_RATES[1:]}
 # Tables "Hyperparameters for SAC | DQN | DDPG | TD3 in the inner loop", classic control.
 SAC_INNER_LOOP: dict[str, tuple[float, ...]] = {
     "learning_rate": _LEARNING_RATES,
@@ -258,6 +260,7 @@ TABLES = (
     Tables(
         PPO_ALGORITHM,
         lists=PPO_INNER_LOOP,
+        continuous=PPO_CONTINUOUS,
         general=_GENERAL_PPO,
         families={"brax": {}},
         environments={

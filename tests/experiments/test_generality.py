@@ -18,8 +18,10 @@ from experiments.generality import (
     ZOO,
 )
 from experiments.harness import CLASSIC_CONTROL, forget_replaced
-from scb.environments.zoo import bandit_metadata
+from scb.environments.zoo import bandit_metadata, load_bandit
+from scb.measurement import Place
 from scb.neuroevolution import NeuroevolutionConfig
+from scb.seeds import REPORTING
 
 TINY = {
     "environments": ["CartPole-v1"],
@@ -68,9 +70,8 @@ def test_columns_pool_the_algorithms():
     }
     found = generality.columns({"returns": entry})
     assert list(found) == ["ppo", "sac", TOGETHER, WIDE, SWISH, EVOLVED]
-    # A row a draw, a column an algorithm.
-    np.testing.assert_array_equal(found[TOGETHER], [[1.0, 3.0], [2.0, 4.0]])
-    np.testing.assert_array_equal(found[WIDE], [[5.0, 6.0]])
+    np.testing.assert_array_equal(found[TOGETHER], [1.0, 2.0, 3.0, 4.0])
+    np.testing.assert_array_equal(found[WIDE], [5.0, 6.0])
 
 
 def test_the_two_searches_differ_in_drawn_hyperparameters_alone():
@@ -86,6 +87,37 @@ def test_neuroevolution_takes_as_many_steps_of_an_environment_as_of_a_bandit():
     assert (there.episodes, there.num_generations) == (1, 32)
     assert there.num_generations * 64 * 200 == 200 * 64 * 32
     assert generality.in_environment(replace(config, num_generations=1), 999).num_generations == 1
+
+
+def test_every_kind_of_agent_has_draws_of_its_own_in_every_environment():
+    kinds = {
+        (name, agent.partition(", ")[0])
+        for name in CLASSIC_CONTROL
+        for agent in generality.agents_of(name)
+    }
+    seeds = [generality.seed_of(*kind) for kind in kinds]
+    assert len(set(seeds)) == len(kinds) and set(seeds) <= set(REPORTING)
+
+
+def test_agents_have_the_same_draws_wherever_they_are_trained(monkeypatch):
+    drawn = []
+
+    def measured(spec, train_in, judge_in, agents, **more):
+        drawn.append((judge_in.name, tuple(agents.names), agents.hyperparameters.learning_rate))
+        return []
+
+    monkeypatch.setattr(generality.measurement, "measure", measured)
+    monkeypatch.setattr(generality, "pivot", lambda rows, column: rows)
+    plan = {"agents": 4, "episodes": 1}
+    judge_in = Place.named("Pendulum-v1")
+    bandit = load_bandit("Synthetic-Pendulum-v1")
+    for agent in ("td3", f"td3, {WIDE}"):
+        for train_in in (Place(ZOO, bandit, bandit.default_params), judge_in):
+            generality._returns(agent, train_in, judge_in, plan)
+    (first, *others) = drawn
+    for other in others:
+        assert other[:2] == first[:2]
+        np.testing.assert_array_equal(other[2], first[2])
 
 
 def test_every_algorithm_meets_every_network():
