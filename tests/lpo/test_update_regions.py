@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from matplotlib.collections import QuadMesh
 
-from experiments.rendering import ENVIRONMENT
+from experiments import understanding
 from lpo import drift_figures
 from lpo.drifts import LearnedDrift
 from lpo.objectives import Objective, load_objective
@@ -189,15 +189,15 @@ def test_the_figure_has_a_row_for_every_fraction_of_a_temporal_drift():
     np.testing.assert_array_equal(np.asarray(meshes[2].get_array()).reshape(regions.shape), regions)
 
 
-def test_sentences_say_the_numbers():
-    words = ENVIRONMENT.get_template("understanding_words.j2").module.words
-    said = words(analyze(load_objective("ppo")).as_dict())
-    assert "this one stops everywhere, whatever the advantage's sign." in said
-    # 1 - 0.3538, by the arithmetic above.
-    assert "Elsewhere, 65 % of the grid, it leaves the gradient as it is." in said
-    said = words(analyze(load_objective("none")).as_dict())
-    assert "this one goes on everywhere" in said
-    assert "It stops nowhere up to ratio 2 with an advantage of +1" in said
+def test_the_page_has_the_numbers():
+    rows = [
+        {**analyze(load_objective(name)).as_dict(), "temporal": False} for name in ("ppo", "none")
+    ]
+    page = understanding.EXPERIMENT.page({"analyses": rows, "formulas": [], "comparisons": []})
+    assert "| `ppo` | 0 % | 100 % | 0 % | 1.20 | 0 % | 100 % | 0 % | 0.80 |\n" in page
+    assert "| `none` | 100 % | 0 % | 0 % | never | 100 % | 0 % | 0 % | never |\n" in page
+    # 0.3538, by the arithmetic above.
+    assert "| `ppo` | 0 % | 35 % | 0 % | 65 % | 0 % | 0 % | 0 % |\n" in page
 
 
 def test_a_figure_of_nothing_is_refused():
