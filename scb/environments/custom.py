@@ -72,6 +72,11 @@ def _check(name: str, env: environment.Environment[Any, Any], params: Any) -> No
         raise wrong(
             "has parameters without max_steps_in_episode, after which an episode ends: give them that field"
         )
+    if type(params) is environment.EnvParams and params == environment.EnvParams():
+        raise wrong(
+            "has gymnax's own parameters, whose episodes end after one step: give it default_params with its "
+            "max_steps_in_episode"
+        )
     observations, actions = env.observation_space(params), env.action_space(params)
     for kind, space in {"observations": observations, "actions": actions}.items():
         if not isinstance(space, spaces.Box | spaces.Discrete):

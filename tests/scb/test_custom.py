@@ -13,7 +13,7 @@ from scb.measurement import Place, as_random
 
 MODULE = """
 import gymnax, jax.numpy as jnp
-from gymnax.environments import spaces
+from gymnax.environments import environment, spaces
 from gymnax.environments.classic_control.pendulum import Pendulum
 
 def alone():
@@ -64,6 +64,11 @@ class ManyRewards(Pendulum):
     def step_env(self, *arguments):
         observation, state, reward, *others = super().step_env(*arguments)
         return observation, state, jnp.full(2, reward), *others
+
+class NoParameters(Pendulum):
+    @property
+    def default_params(self):
+        return environment.EnvParams()
 
 def endless():
     return Pendulum(), {"g": 10.0}
@@ -127,6 +132,7 @@ def test_the_physics_that_a_factory_takes_is_part_of_the_place(module):
         ("{}:NoStep", "returns 1 of step, where gymnax 1.x returns"),
         ("{}:FourValues", "returns 4 of step_env, where gymnax 1.x returns observation, state, re"),
         ("{}:ManyRewards", r"rewards of shape \(2,\)"),
+        ("{}:NoParameters", "gymnax's own parameters, whose episodes end after one step: give it d"),
         ("{}:endless", "without max_steps_in_episode"),
         ("{}:wrong", "returned a str: it must return a gymnax"),
         ("{}:number", "does not take"),
