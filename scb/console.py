@@ -48,7 +48,12 @@ class Progress:
 
     def __enter__(self) -> Callable[[dict[str, Any], float], None]:
         self._bar.start()
-        self._task = self._bar.add_task("", total=self._total, completed=self._done, fitness="")
+        self._task = self._bar.add_task(
+            "", total=self._total, completed=self._done, fitness="compiling"
+        )
+        # A minute without a line looks like one that hangs.
+        if not self._console.is_terminal and self._done < self._total:
+            self._console.print(f"generation {self._done + 1}/{self._total}: compiling")
         return self._advance
 
     def _advance(self, metrics: dict[str, Any], seconds: float) -> None:
