@@ -17,7 +17,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 from matplotlib.figure import Figure
 
@@ -32,7 +31,7 @@ from lpo.alignment import (
     other_drifts,
 )
 from lpo.fitness import LABELS
-from lpo.objectives import Objective, load_objective
+from lpo.objectives import Objective, load_objective, same_drift
 from scb.environments.registry import environment_spec
 from scb.errors import UserError
 
@@ -70,6 +69,10 @@ def recommendation(report: Mapping[str, Any]) -> dict[str, Any]:
         for name in CHOICES
         if name in stages
     ]
+    if len({len(regimes) for regimes in chosen}) != 1 or not chosen[0]:
+        raise UserError(
+            "the regimes to choose among are not all measured: the same command goes on."
+        )
     names = [x["name"] for x in stages[CHOICES[0]]["regimes"]]
     confirmed = {}
     for name in stages.keys() - set(CHOICES):
@@ -78,6 +81,9 @@ def recommendation(report: Mapping[str, Any]) -> dict[str, Any]:
             for x in stages[name]["regimes"]
         }
         own, noise = environment_spec(stages[name]["environment"]).bandit, Regime().reward_noise
+        needed = {(own, noise), (own, 0.0), (PENDULUM, noise)}
+        if not needed <= of_regime.keys():
+            continue  # it was interrupted
         carried = None if own == PENDULUM else of_regime[PENDULUM, noise]
         confirmed[name] = (of_regime[own, noise], of_regime[own, 0.0], carried)
     return {
@@ -98,6 +104,7 @@ def facts(report: Mapping[str, Any]) -> dict[str, Any]:
             for row in stage["regimes"]
         ]
         for name, stage in report["stages"].items()
+        if stage["regimes"]
     }
     return {
         **recommendation(report),
@@ -106,13 +113,6 @@ def facts(report: Mapping[str, Any]) -> dict[str, Any]:
         "files": {name: figure_name(name) for name in tables},
         "measured": next(iter(report["stages"].values()))["machine"],
     }
-
-
-def same_drift(one: Objective, other: Objective) -> bool:
-    """Whether two objectives differ in nothing but their names."""
-    return one.drift == other.drift and all(
-        jax.tree.leaves(jax.tree.map(np.array_equal, one.parameters, other.parameters))
-    )
 
 
 def figure_name(stage: str) -> str:
@@ -195,7 +195,11 @@ def measure(options: Options, report: dict[str, Any], save: Save) -> None:
 def draw(report: Mapping[str, Any]) -> dict[str, Figure]:
     """A heat map a stage."""
     found = report["stages"].items()
-    return {figure_name(name): figures.alignment_heatmap(stage) for name, stage in found}
+    return {
+        figure_name(name): figures.alignment_heatmap(stage)
+        for name, stage in found
+        if stage["regimes"]
+    }
 
 
 EXPERIMENT = Experiment(

@@ -35,7 +35,7 @@ import jax
 import numpy as np
 
 import scb
-from experiments.harness import Experiment, Save, bandit_of
+from experiments.harness import Experiment, Save, bandit_of, settled
 from scb.agents.spec import bandit_agent
 from scb.artefacts import flatten
 from scb.environments.zoo import space_description
@@ -259,7 +259,8 @@ def measure(options: Options, report: dict[str, Any], save: Save) -> None:
     print(f"Training for {options.steps} steps in the bandit; median seconds an agent.")
     print(f"Return in the real environment: IQM [95 %] of agents, {EPISODES} episodes each.\n")
     print(line("algorithm", THIS, PEER, "ratio", f"return, {THIS}", f"return, {PEER}"), flush=True)
-    results: dict[str, Any] = {}
+    settled(report, steps=options.steps, episodes=EPISODES)
+    results = report.setdefault("algorithms", {})
     for name in names:
         own = f"from experiments import benchmark; benchmark.print_measured({name!r}, {options.steps})"
         measured = {THIS: _json_of([sys.executable, "-c", own])}
@@ -270,10 +271,9 @@ def measure(options: Options, report: dict[str, Any], save: Save) -> None:
                 measured[PEER] = _json_of(peer)
         results[name] = summary(TASKS[name], measured)
         print(row(name, results[name]), flush=True)
+        save()
     if options.rejax_python is None:
         print("\nrejax was not measured: `make bench` does that.")
-    report |= {"steps": options.steps, "episodes": EPISODES, "algorithms": results}
-    save()
 
 
 def print_measured(name: str, steps: int) -> None:

@@ -8,7 +8,7 @@ need to match the former. Published bandits are read from --published DIRECTORY;
 measured alone. PPO's agents in environments are those of experiments.locomotion, where it has them at this length.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -67,8 +67,11 @@ def parts(plan: Mapping[str, Any], report: dict[str, Any]) -> Iterator[Part]:
     def there(of: list[Any]) -> bool:
         return set(plan["bandit_algorithms"]) <= set(bandits.get(task(*of), ()))
 
+    def kinds(environment: str) -> Iterable[str]:
+        return zoo_table.bandits(environment, published and Path(published))
+
     left_out = [
-        x for x in plan["bandits"] if x[0] == PUBLISHED and published is None and not there(x)
+        x for x in plan["bandits"] if x[0] == PUBLISHED and not there(x) and x[0] not in kinds(x[1])
     ]
     report["left_out"] = [task(*x) for x in left_out]
     for name in report["left_out"]:

@@ -7,7 +7,7 @@ in one process, several times over; compare the ratios, for the seconds are the 
 """
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -17,7 +17,7 @@ import gymnax
 import numpy as np
 from gymnax.wrappers.gym import GymnaxToGymWrapper, GymnaxToVectorGymWrapper
 
-from experiments.harness import Experiment, Report, Save
+from experiments.harness import Experiment, Report, Save, settled
 from experiments.timing import OWN, in_turn
 from scb.errors import at_least
 from scb.gymnasium import NAMESPACE
@@ -88,32 +88,33 @@ def _episode(env: Any, action: Any, alone: bool) -> Callable[[], Any]:
 
 def measure(options: Options, report: dict[str, Any], save: Save) -> None:
     """One bandit after the other, alone and many of it."""
-    found: dict[str, Any] = {}
+    settled(report, num_envs=options.num_envs)
     for name in options.bandits:
-        found[name] = {}
+        found: dict[str, Any] = {}
         for kind, num_envs in (("one", None), ("many", options.num_envs)):
             rates = {
                 who: partial(steps_a_second, call, num_envs or 1, options.seconds)
                 for who, call in stepping(name, num_envs).items()
             }
-            found[name][kind] = in_turn(rates, options.repeats)
-            print(name, kind, found[name][kind], flush=True)
-    report |= {"bandits": found, "num_envs": options.num_envs}
-    save()
+            found[kind] = in_turn(rates, options.repeats)
+            print(name, kind, found[kind], flush=True)
+        report.setdefault("bandits", {})[name] = found
+        save()
 
 
 def facts(report: Report) -> dict[str, Any]:
-    """The medians of the ratios, and the smallest of all."""
-    cells = [cell for kinds in report["bandits"].values() for cell in kinds.values()]
+    """The medians of the ratios, and the smallest of all of one environment alone."""
+
+    def ratio(cell: Mapping[str, Any]) -> float:
+        return float(np.median(cell["ratios"]))
+
+    bandits = report["bandits"].values()
     return {
         "own": OWN,
         "peer": PEER,
-        "ratio": lambda cell: float(np.median(cell["ratios"])),
-        "least": {
-            kind: min(min(kinds[kind]["ratios"]) for kinds in report["bandits"].values())
-            for kind in ("one", "many")
-        },
-        "slowest": min(cell[OWN] for cell in cells),
+        "ratio": ratio,
+        "least": min(min(kinds["one"]["ratios"]) for kinds in bandits),
+        "together": sorted(ratio(kinds["many"]) for kinds in bandits),
     }
 
 

@@ -198,7 +198,9 @@ class Experiment:
             make_folder(out.parent)
         # Two that measure would each save what they have, and not what the other has.
         with nullcontext() if files.only_render else held(out):
-            report = read(out, missing_is_new=not files.only_render, keys=self.keys)
+            # One that was interrupted lacks some, and goes on.
+            needed = self.keys if files.only_render else ()
+            report = read(out, missing_is_new=not files.only_render, keys=needed)
             if report and report.get("experiment") != self.name:
                 raise UserError(f"{out} is no report of {self.name}: choose another --out.")
             if not files.only_render:

@@ -17,9 +17,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from experiments.claims import ENOUGH, Claim, of_searches
-from experiments.harness import Experiment, Report, packed, unpacked
+from experiments.harness import Experiment, Report, packed, settled, unpacked
 from experiments.parts import InParts, Part
-from experiments.rendering import either
 from scb import plotting
 from scb.agents.spec import bandit_agent
 from scb.environments.registry import environment_spec
@@ -46,6 +45,7 @@ CONTEXTS: dict[str, dict[str, Any]] = {
     "stretched and jittered": {"stretch": 1.5, "jitter": 1.0},
 }
 ALGORITHMS = ("ppo", "td3")
+SETTLED = ("generations", *ALGORITHMS, "episodes")  # the same for all searches of a report
 BEFORE, NOW = ("noise", "stretched"), ("errors", "stretched and jittered")
 COLORS = dict(zip(CONTEXTS, (plotting.GREY, plotting.BLUE, plotting.VERMILLION), strict=True))
 
@@ -75,6 +75,7 @@ class Options:
 
 def parts(options: Options, report: dict[str, Any]) -> Iterator[Part]:
     """One search of every kind after the other: all have as many wherever it ends."""
+    settled(report, **{name: getattr(options, name) for name in SETTLED})
     for environment in options.environments:
         for seed in range(options.first_seed, options.first_seed + options.seeds):
             for name in EXPERTS:
@@ -96,8 +97,6 @@ def _searched(environment: str, name: str, seed: int, options: Options) -> dict[
     found: dict[str, Any] = {
         "expert": round(expert.mean_return, 1),
         "steps": expert.environment_steps,
-        "generations": options.generations,
-        "episodes": options.episodes,
         "returns": {},
     }
     for contexts, fields in CONTEXTS.items():
@@ -134,7 +133,7 @@ def claims(report: Report) -> list[Claim]:
             (NOW, (NOW[0], BEFORE[1]), "with jitter than without, both with errors"),
             (NOW, ("no errors", NOW[1]), "with errors than without, both with jitter"),
         ):
-            seeds = sorted(entry[expert].keys() & entry[other].keys())
+            seeds = sorted(entry.get(expert, {}).keys() & entry.get(other, {}).keys())
             evidence = None
             if seeds:
                 ours = earned(entry, expert, contexts, "ppo", seeds)
@@ -144,17 +143,16 @@ def claims(report: Report) -> list[Claim]:
     return found
 
 
+def _searched_for(entry: Mapping[str, Any]) -> list[str]:
+    """The kinds of expert that there are searches of."""
+    return [name for name in EXPERTS if entry.get(name)]
+
+
 def facts(report: Report) -> dict[str, Any]:
     """A row for every kind of expert and contexts."""
     tables: dict[str, Any] = {}
     for environment, entry in report["environments"].items():
-        searches = [found for kind in entry.values() for found in kind.values()]
-        arms = [arm for found in searches for arm in found["returns"].values()]
         tables[environment] = {
-            **{
-                key: either(found[key] for found in searches) for key in ("generations", "episodes")
-            },
-            **{key: either(len(arm[key].split()) for arm in arms) for key in ALGORITHMS},
             "standing": environment_spec(environment).standing_still(BACKEND),
             "rows": [
                 {
@@ -167,7 +165,7 @@ def facts(report: Report) -> dict[str, Any]:
                     },
                     "searches": len(entry[expert]),
                 }
-                for expert in EXPERTS
+                for expert in _searched_for(entry)
                 for contexts in CONTEXTS
             ],
         }
@@ -182,7 +180,7 @@ def draw(report: Mapping[str, Any]) -> Figure:
     for row, (environment, entry) in zip(panels, report["environments"].items(), strict=True):
         standing = environment_spec(environment).standing_still(BACKEND)
         for axes, algorithm in zip(row, ALGORITHMS, strict=True):
-            for i, expert in enumerate(EXPERTS):
+            for i, expert in enumerate(_searched_for(entry)):
                 for j, contexts in enumerate(CONTEXTS):
                     returns = earned(entry, expert, contexts, algorithm)
                     x, found = i + 0.27 * (j - 1), pooled_estimate(returns)
@@ -194,7 +192,8 @@ def draw(report: Mapping[str, Any]) -> Figure:
                     axes.plot([x], [found.value], "s", markersize=6, **look)
             if standing:
                 axes.axhline(standing, color=plotting.GREY, linestyle=":")
-            axes.set_xticks(range(len(EXPERTS)), [f"under {name}" for name in EXPERTS])
+            names = _searched_for(entry)
+            axes.set_xticks(range(len(names)), [f"under {name}" for name in names])
             axes.set_title(f"{environment}: {algorithm.upper()}'s agents")
         row[0].set_ylabel("return in the environment")
     plotting.legend_of(

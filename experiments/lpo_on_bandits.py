@@ -50,7 +50,8 @@ def search_curve(metrics: Sequence[Mapping[str, Any]], seconds: Sequence[float])
     The time of a generation is the median of those that judged nothing: judging is no part of the
     search. The first, which compiles, is left out of it too.
     """
-    judged = [any(name.startswith("mean/") for name in line) for line in metrics]
+    of_a_judgement = ("mean/", "final_mean/")
+    judged = [any(name.startswith(of_a_judgement) for name in line) for line in metrics]
     plain = [s for s, j in list(zip(seconds, judged, strict=True))[1:] if not j] or list(seconds)
     points = [(g, x.get("fitness_iqm")) for g, x in judgements(metrics)]
     return {

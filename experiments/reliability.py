@@ -89,7 +89,7 @@ def measure(options: Options, report: dict[str, Any], save: Save) -> None:
             killed = report.setdefault("kills", {}).setdefault(name, [])
             if len(killed) < options.kills:
                 torment(Path(folder), name, command, options, killed, save)
-        if report.get("mutations", {}).get("number", 0) < options.mutations:
+        if report.get("mutations", {}).get("number", -1) < options.mutations:
             report["mutations"] = mutate_all(Path(folder), options)
             save()
 

@@ -95,6 +95,11 @@ def told(judged: Sequence[Judged]) -> str:
     return f"of its {len(judged)} parts {'; '.join(found)}."
 
 
+def computer(machine: Mapping[str, Any]) -> str:
+    """Such as "2 cores, AMD EPYC", of what a report says of the machine that measured."""
+    return f"{machine['cores']} core{'s' * (machine['cores'] != 1)}, {machine['processor']}"
+
+
 def algorithms(names: Sequence[str], otherwise: str = "all of the paper's algorithms") -> str:
     """Such as "PPO, SAC"; a plan's empty list stands for all."""
     return ", ".join(name.upper() for name in names) or otherwise
@@ -109,6 +114,7 @@ ENVIRONMENT = jinja2.Environment(
 )
 ENVIRONMENT.filters |= {
     "algorithms": algorithms,
+    "computer": computer,
     "digits": digits,
     "listed": listed,
     "mean_known": mean_known,

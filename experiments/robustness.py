@@ -10,7 +10,7 @@ and usual public defaults (plans/robustness.toml), once for all objectives, so t
 was, and with other environments or objectives adds to it.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -72,16 +72,15 @@ class Options:
 def parts(options: Options, report: dict[str, Any]) -> Iterator[Part]:
     """One setting of one environment with one objective at a time."""
     first = FIRST_TO_CHOOSE if options.validation else FIRST_SEED
-    settled(report, first_seed=first)
-    loaded = [None if x == DRAWN else load_objective(x) for x in options.objectives]
+    settled(report, first_seed=first, lists=_PLAN["lists"])
+    # Without PPO's clip there is nothing to compare with.
+    names = dict.fromkeys([REFERENCE, *options.objectives])
+    loaded = [None if x == DRAWN else load_objective(x) for x in names]
     check_names([x for x in loaded if x])
     learned_in([x for x in loaded if x])  # before the first waits, and not after
     objectives = {DRAWN if x is None else x.name: x for x in loaded}
-    settings = _PLAN["settings"]
     for environment in options.environments:
-        family = environment_spec(environment).family
-        for i, setting in enumerate(settings.get(family, settings["classic"])):
-            words = ", ".join(f"{name} {value}" for name, value in setting.items())
+        for i, (words, setting) in enumerate(settings_of(environment).items()):
             key = f"{options.draws} of {words}"
             spec = replace(ppo_spec(environment).with_values(**setting), lists=_PLAN["lists"])
             drawn = Agents.drawn_from(spec, first + i, options.draws)
@@ -89,6 +88,22 @@ def parts(options: Options, report: dict[str, Any]) -> Iterator[Part]:
                 place = (environment, name, key)
                 trained = partial(_trained, *place, objective, spec, drawn, options.runs)
                 yield Part(("environments", environment), trained, (("returns", name, key),))
+
+
+def settings_of(environment: str) -> dict[str, dict[str, Any]]:
+    """{in words: epochs and minibatches}, of which the first has the first seed."""
+    settings = _PLAN["settings"]
+    of_family = settings.get(environment_spec(environment).family, settings["classic"])
+    return {
+        ", ".join(f"{name} {x}" for name, x in setting.items()): setting for setting in of_family
+    }
+
+
+def in_order(environment: str, keys: Iterable[str]) -> list[str]:
+    """Keys of a report, such as "17 of num_epochs 4, num_minibatches 8", by the seeds of their settings."""
+    order = list(settings_of(environment))
+    words = {key: key.partition(" of ")[2] for key in keys}
+    return sorted(words, key=lambda key: order.index(words[key]) if words[key] in order else 99)
 
 
 def _trained(
@@ -131,7 +146,8 @@ def scores(report: Report) -> Scores:
     """
     found = {}
     for environment, entry in report["environments"].items():
-        settings = list(entry["returns"].get(REFERENCE, ()))
+        # In the order of their seeds, whatever ended first: draws are the same in all environments by it.
+        settings = in_order(environment, entry["returns"].get(REFERENCE, ()))
         returns = {
             name: np.concatenate([unpacked([lines[key]])[0] for key in settings])
             for name, lines in entry["returns"].items()
@@ -208,7 +224,7 @@ def facts(report: Report) -> dict[str, Any]:
                 ),
             }
         )
-    return {"rows": rows, "places": list(scored), "lists": _PLAN["lists"], "tenth": TENTH}
+    return {"rows": rows, "places": list(scored), "tenth": TENTH}
 
 
 def draw(report: Mapping[str, Any]) -> Figure:

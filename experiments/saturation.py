@@ -70,7 +70,10 @@ def spread(means: np.ndarray) -> dict[str, Any]:
       apart: [N] root mean square distance of its means to those of all, and `clipped`: of its actions.
       directions: of what all agents do, the mean of the clipped actions, how many the variance over states has
         (its participation ratio, (sum of eigenvalues)^2 / sum of their squares).
+      diverged: agents whose means are no numbers, which are in none of these.
     """
+    acts = np.isfinite(means).all(axis=(1, 2))
+    means = means[acts]
     actions = np.clip(means, -1, 1)
     together = actions.mean(axis=0)
     variances = np.linalg.svd(together - together.mean(axis=0), compute_uv=False) ** 2
@@ -78,6 +81,7 @@ def spread(means: np.ndarray) -> dict[str, Any]:
         "beyond": (np.abs(means) > 1).mean(axis=(1, 2)),
         "apart": np.sqrt(((means - means.mean(axis=0)) ** 2).mean(axis=(1, 2))),
         "clipped": np.sqrt(((actions - together) ** 2).mean(axis=(1, 2))),
+        "diverged": int(np.sum(~acts)),
         "directions": round(float(variances.sum() ** 2 / (variances**2).sum()), 4),
     }
 

@@ -166,7 +166,9 @@ def _strategy(kind: str, population: int) -> dict[str, Any]:
 
 
 def grown(points: Sequence[tuple[float, float]]) -> tuple[float, float]:
-    """(slope, intercept) of the line through points, neither of them negative."""
+    """(slope, intercept) of the line through points, neither of them negative; nothing grows where there are none."""
+    if not points:
+        return 0.0, 0.0
     x, y = np.transpose(points)
     slope, intercept = np.polyfit(x, y, 1) if len(x) > 1 else (0.0, y[0])
     return max(0.0, float(slope)), max(0.0, float(intercept))
@@ -177,7 +179,7 @@ def facts(report: Report) -> dict[str, Any]:
     cores = report["machine"]["cores"]
     alone = float(np.median(report["generations"]["1"]))
     rows = []
-    for number, seconds in report["generations"].items():
+    for number, seconds in sorted(report["generations"].items(), key=lambda x: int(x[0])):
         took, share = float(np.median(seconds)), math.ceil(int(number) / cores)
         rows.append(
             {

@@ -99,15 +99,22 @@ def difference(
     return of_searches(first, second, paired=not reference)
 
 
+def compared(report: Report) -> list[tuple[str, str]]:
+    """(objective, evaluation) of every claim."""
+    return [(name, e["name"]) for name in report["objectives"] for e in report["evaluations"]]
+
+
+def claims(report: Report) -> list[Claim]:
+    """Of every objective and evaluation: above the default."""
+    return [Claim(f"{name}, {e}", difference(report, name, e)) for name, e in compared(report)]
+
+
 def summary(report: Report) -> list[dict[str, Any]]:
     """One row an objective: per evaluation the estimate over searches and agents, and the difference to the default's.
 
     Intervals of the differences are corrected for their number.
     """
-    evaluations = [e["name"] for e in report["evaluations"]]
-    places = [(name, e) for name in report["objectives"] for e in evaluations]
-    judged = judge([Claim(f"{name}, {e}", difference(report, name, e)) for name, e in places])
-    found = dict(zip(places, judged, strict=True))
+    found = dict(zip(compared(report), judge(claims(report)), strict=True))
     rows = []
     for name, entry in report["objectives"].items():
         row: dict[str, Any] = {
@@ -153,7 +160,6 @@ def facts(report: Report) -> dict[str, Any]:
         "enough": ENOUGH,
         "number": number,
         "places": places,
-        "level": 100 * (1 - 0.05 / max(1, number)),
     }
 
 
@@ -279,6 +285,7 @@ EXPERIMENT = Experiment(
     "transfer_study",
     "What makes an objective carry over from a bandit",
     measure,
+    claims=claims,
     facts=facts,
     draw=draw,
     options=Options,

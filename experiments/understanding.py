@@ -25,7 +25,7 @@ from matplotlib.figure import Figure
 from experiments.harness import Experiment, Save
 from lpo import drift_figures
 from lpo.drifts import ClosedFormDrift
-from lpo.objectives import load_objective, zoo_names
+from lpo.objectives import load_apart, load_objective, zoo_names
 from lpo.update_regions import REGIONS, analyze
 from scb.errors import UserError
 from scb.statistics import paired_difference
@@ -34,12 +34,12 @@ PROGRESS = (0.0, 0.5, 1.0)
 
 
 def analyses(names: Sequence[str]) -> list[dict[str, Any]]:
-    """The analyses of these objectives, temporal ones at every fraction of `PROGRESS`."""
+    """The analyses of these objectives, temporal ones at every fraction of `PROGRESS`; "loads" is what loads one."""
     rows = []
-    for objective in map(load_objective, names):
-        temporal = objective.drift.temporal
-        for fraction in PROGRESS if temporal else (0.5,):
-            rows.append({**analyze(objective, fraction).as_dict(), "temporal": temporal})
+    for name, objective in zip(names, load_apart(names), strict=True):
+        said = {"temporal": objective.drift.temporal, "loads": name}
+        for fraction in PROGRESS if objective.drift.temporal else (0.5,):
+            rows.append({**analyze(objective, fraction).as_dict(), **said})
     return rows
 
 
@@ -131,8 +131,8 @@ def measure(options: Options, report: dict[str, Any], save: Save) -> None:
 
 def draw(report: Mapping[str, Any]) -> Figure:
     """Drift and gradient of every objective."""
-    names = dict.fromkeys(row["objective"] for row in report["analyses"])
-    return drift_figures.drift_and_gradient([load_objective(name) for name in names], PROGRESS)
+    names = list(dict.fromkeys(row["loads"] for row in report["analyses"]))
+    return drift_figures.drift_and_gradient(load_apart(names), PROGRESS)
 
 
 EXPERIMENT = Experiment(

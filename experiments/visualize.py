@@ -34,7 +34,7 @@ from scb.errors import UserError
 from scb.experts import best_agent
 from scb.keys import root_key, split_key
 from scb.measurement import Judge
-from scb.statistics import Estimate, estimate
+from scb.statistics import DECIDING, Estimate, estimate
 
 HOPPER = "hopper"
 STANDING = environment_spec(HOPPER).standing["generalized"]
@@ -109,6 +109,8 @@ def claims(report: Report) -> list[Claim]:
     found = []
     for name, entry in report["environments"].items():
         agents = Estimate(**entry["agents"])
+        if agents.n < DECIDING:
+            agents = agents.without_interval()
         if name == HOPPER:
             found.append(Claim(f"{name}: more than standing still", agents, STANDING, places=0))
             continue

@@ -21,6 +21,7 @@ from experiments.harness import Experiment, Save, settled
 from experiments.rendering import number, text
 from scb.agents.spec import algorithms_for, bandit_agent
 from scb.environments.synthetic import BanditConfig, bandit_for
+from scb.errors import at_least
 from scb.expert_data import expert_dataset
 from scb.fitting import fit_bandit
 from scb.judgement import judge
@@ -81,6 +82,7 @@ class Options:
 
 def measure(options: Options, report: dict[str, Any], save: Save) -> None:
     """An environment at a time."""
+    at_least(2, options, "agents")  # a single one has no interval
     settled(report, seed=SEED, agents=options.agents, episodes=options.episodes)
     report.setdefault("environments", {})
     for name in options.environment:

@@ -19,13 +19,12 @@ from scb.errors import UserError
 
 
 def _short(name: str, file: Path, zoo_name: str) -> str:
-    """What a comparison calls an objective: this file's by its name in the zoo, a run's by its folder."""
+    """What the zoo calls an objective of a comparison: this file's by its name in the zoo, a run's by its folder."""
     path = Path(name)
-    if path.suffix != ".npz":
-        return name
-    if path.resolve() == file.resolve():
+    # Files of one name go by their paths there.
+    if name == run_name(file) or path.resolve() == file.resolve():
         return zoo_name
-    return run_name(path)
+    return run_name(path) if path.suffix == ".npz" else name
 
 
 @dataclass(frozen=True)
@@ -53,6 +52,8 @@ def measure(options: Options, report: dict[str, Any], save: Save) -> None:
         environment, scale = found["environment"], found["policy_output_scale"]
         if scale != 1.0:
             environment += f", policy_output_scale {scale:g}"
+        if environment in reporting_seeds:
+            raise UserError(f"two of the comparisons are of {environment}: give one.")
         reporting_seeds[environment] = found["seeds"]
         by_objective = ("final_iqm", "area_iqm", "paired_differences")
         results[environment] = {

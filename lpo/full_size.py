@@ -95,10 +95,12 @@ def _kept() -> dict[str, Any]:
 def as_comparison(environment: str, found: Mapping[str, Any]) -> Comparison:
     """The curves of one environment of a report, {"agents": {objective: {seed: {"returns": "0.5 0.7", ...}}}, ...}.
 
-    Objectives that have agents on the same seeds as the first are compared on these.
+    PPO's clip comes first and agents by their seeds, in whatever order they ended. Objectives that have agents on the
+    same seeds as the first are compared on these.
     """
     curves = []
-    for objective, agents in found["agents"].items():
+    for objective in sorted(found["agents"], key=lambda name: name != REFERENCE):
+        agents = dict(sorted(found["agents"][objective].items(), key=lambda of: int(of[0])))
         returns = _lines("returns", agents, found["steps"])
         lengths, speeds = (
             # Of the end alone, and not known of every agent.

@@ -62,11 +62,6 @@ def zoo_names() -> list[str]:
     return artefacts.names_in(_ZOO)
 
 
-def objective_names() -> list[str]:
-    """Every name that `load_objective` takes, files apart; "ppo-0.3" is PPO with clip 0.3."""
-    return [*KNOWN, *zoo_names()]
-
-
 def load_objective(name: str | Path) -> Objective:
     """An objective by name ("ppo", "ppo-0.3", "dpo", "none", a zoo name) or file (path.npz).
 
@@ -90,6 +85,16 @@ def check_names(objectives: Sequence[Objective]) -> None:
         raise UserError(
             f"objective {repeated[0]!r} is there twice: give each once, and each a name of its own."
         )
+
+
+def same_drift(one: Objective, other: Objective) -> bool:
+    """Whether two objectives differ in nothing but their names, as "ppo" and "ppo-0.2" do."""
+    first, second = one.drift, other.drift
+    # Parameters say all that the settings of these do.
+    of_parameters = type(first) is type(second) and isinstance(first, ClipDrift | DPODrift)
+    return (first == second or of_parameters) and all(
+        jax.tree.leaves(jax.tree.map(jnp.array_equal, one.parameters, other.parameters))
+    )
 
 
 def load_apart(names: Sequence[str]) -> list[Objective]:

@@ -17,7 +17,7 @@ from lpo import figures
 from lpo.alignment import Regime, correlation_text, known_drifts, measure_alignment
 from lpo.comparison import Comparison, LearningCurves, compare, ppo_spec
 from lpo.fitness import LABELS
-from lpo.objectives import Objective, learned_in, load_apart, load_objective
+from lpo.objectives import Objective, learned_in, load_apart, load_objective, same_drift
 from lpo.suite import SuiteScores, run_suite
 from lpo.suite import suite as suite_environments
 from scb import plotting
@@ -329,7 +329,13 @@ class Align(Measuring):
 
     def run(self) -> None:
         config: AlignConfig = self.config
-        family = [*known_drifts(), *load_apart(config.objectives)]
+        known, more = known_drifts(), load_apart(config.objectives)
+        for objective in more:
+            if twins := [x.name for x in known if same_drift(objective, x)]:
+                raise UserError(
+                    f"{objective.name!r} is in the family already, as {twins[0]!r}: leave it out of --objectives."
+                )
+        family = [*known, *more]
         regimes, seeds = config.regimes(), config.seed_list()
         target = config.environment or environment_spec(regimes[0].bandit).evaluation_environment
         # A mistake must not leave a folder behind.

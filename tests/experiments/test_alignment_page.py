@@ -1,9 +1,12 @@
 import shutil
 from pathlib import Path
 
+import pytest
+
 import lpo
 from experiments import alignment, rendering
 from experiments.harness import command_of
+from scb.errors import UserError
 
 
 def recommended(report):
@@ -67,3 +70,13 @@ def test_what_is_held_out_is_not_in_the_family_under_another_name(tmp_path, caps
     assert alignment.EXPERIMENT.main(arguments) == 2
     assert "the family has it as ta-lpo: leave it out" in capsys.readouterr().err
     assert not out.exists()
+
+
+def test_what_was_interrupted_is_not_recommended_from():
+    whole = stage("Pendulum-v1", {"default": 0.9, "reward noise 0.0": 0.1})
+    half = stage("Pendulum-v1", {"default": 0.9})
+    report = {"stages": {"pendulum": whole, "pendulum_small_last_layer": half}}
+    with pytest.raises(UserError, match="are not all measured: the same command goes on"):
+        alignment.recommendation(report)
+    report["stages"] |= {"pendulum_small_last_layer": whole, "CartPole-v1": half}
+    assert alignment.recommendation(report)["confirmed"] == {}

@@ -175,6 +175,11 @@ def test_published_bandits_count_only_where_their_folder_is_named(monkeypatch, t
     experiment.measure(plan, found, lambda: None)
     assert found["left_out"] == ["hopper (generalized), published"]
     assert found["bandits"] == found["environments"] == {}
+    # Nor does one that holds others only.
+    monkeypatch.setattr(experiment.zoo_table, "bandits", lambda name, folder: {OURS: None})
+    experiment.measure({**plan, "published": tmp_path}, found, lambda: None)
+    assert found["left_out"] == ["hopper (generalized), published"]
+    monkeypatch.setattr(experiment.zoo_table, "bandits", lambda name, folder: {PUBLISHED: None})
     asked = []
     monkeypatch.setattr(
         experiment, "_in_bandit", lambda *x: asked.append(x) or curves([0, 1], [0, 1])

@@ -22,6 +22,9 @@ def test_a_bandit_is_timed_alone_and_among_others(tmp_path):
     flags += ["--bandits", "Synthetic-Pendulum-v1", "--out", str(tmp_path / "speed.json")]
     assert gymnasium_speed.EXPERIMENT.main(flags) == 0
     (kinds,) = json.loads((tmp_path / "speed.json").read_text())["bandits"].values()
+    # Another bandit joins it.
+    assert gymnasium_speed.EXPERIMENT.main([*flags, "--bandits", "Synthetic-CartPole-v1"]) == 0
+    assert len(json.loads((tmp_path / "speed.json").read_text())["bandits"]) == 2
     for kind in ("one", "many"):
         assert len(kinds[kind]["ratios"]) == 2 and min(kinds[kind]["ratios"]) > 0
     page = (tmp_path / "gymnasium_speed.md").read_text()

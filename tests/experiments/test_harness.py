@@ -69,6 +69,17 @@ def test_a_report_is_one_commands_while_it_measures(tmp_path):
     assert seen == [True] and not (tmp_path / ".c.json.lock").exists()
 
 
+def test_an_interrupted_measurement_goes_on_and_has_no_page_before(tmp_path, capsys):
+    flags = ["--out", str(tmp_path / "c.json"), "--docs", str(tmp_path / "docs")]
+    needing = {"keys": ("parts", "measured", "more")}
+    with pytest.raises(KeyboardInterrupt):
+        replace(counting(fail_at="b"), **needing).main(flags)
+    assert replace(counting(), **needing).main([*flags, "--only-render"]) == 2
+    assert "it lacks more" in capsys.readouterr().err
+    assert replace(counting(), **needing).main(flags) == 0
+    assert json.loads((tmp_path / "c.json").read_text())["measured"] == 2
+
+
 def test_an_interrupted_experiment_measures_only_what_is_missing(tmp_path):
     flags = ["--out", str(tmp_path / "c.json"), "--docs", str(tmp_path / "docs")]
     with pytest.raises(KeyboardInterrupt):

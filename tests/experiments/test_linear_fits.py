@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from experiments import linear_fits as module
-from experiments.claims import FAILS, HOLDS, UNDECIDED
+from experiments.claims import FAILS, HOLDS, UNDECIDED, UNTESTED
 from experiments.harness import packed
+from scb.errors import UserError
 
 FIVE = range(20, 25)
 
@@ -18,8 +19,6 @@ def entry(seeds, **ppo):
         return {
             "expert": 3000.0,
             "steps": 9,
-            "generations": 40 if level > 300 else 30,
-            "episodes": 3,
             "returns": {
                 contexts: {
                     "ppo": packed([level * share + little])[0],
@@ -35,7 +34,8 @@ def entry(seeds, **ppo):
 def report(*seeds, **ppo):
     levels = {"no_errors": 200.0, "noise": 600.0, "errors": 1500.0, **ppo}
     machine = {"cores": 1, "processor": "a processor"}
-    return {"environments": {"hopper": entry(seeds, **levels)}, "machine": machine}
+    settings = {"generations": 40, "ppo": 12, "td3": 4, "episodes": 3}
+    return {"environments": {"hopper": entry(seeds, **levels)}, "machine": machine, **settings}
 
 
 def outcomes(found):
@@ -65,13 +65,25 @@ def test_searches_are_paired_by_seed_in_whatever_order_they_ended():
 def test_the_page_has_a_row_for_every_expert_and_contexts():
     page = module.EXPERIMENT.page(report(*FIVE))
     assert "| errors | stretched and jittered | 3000 | 1500 [" in page and page.count("| 5 |") == 9
-    assert (
-        "hopper: a search has 30 or 40 generations" in page and "12 agents of PPO and 4 of" in page
-    )
+    assert "hopper: a search has 40 generations" in page and "12 agents of PPO and 4 of" in page
     assert "Standing still earns 1000." in page
     assert "Shown: on hopper, PPO's agents earn more with errors and jitter than with noise" in page
     few = module.EXPERIMENT.page(report(1))
-    assert "Not shown yet" in few
+    assert "**Not shown yet: no difference whose interval decides.** *Errors*" in few
+    worse = module.EXPERIMENT.page(report(*FIVE, errors=100.0))
+    assert "Not so: on hopper, PPO's agents earn more with errors and jitter than" in worse
+    assert "Not shown yet" not in worse
+
+
+def test_an_interrupted_measurement_has_a_page_and_another_size_is_refused():
+    found = report(*FIVE)
+    del found["environments"]["hopper"]["errors"]
+    assert "| errors | stretched and jittered" not in module.EXPERIMENT.page(found)
+    assert set(outcomes(found)) == {UNTESTED}
+    (figure,) = module.EXPERIMENT.figures(found).values()
+    assert len(figure.axes[0].get_xticks()) == 2
+    with pytest.raises(UserError, match="measured with ppo 12, and 48 is asked for"):
+        next(module.parts(module.Options(generations=40, ppo=48, td3=4), found))
 
 
 def test_the_figure_has_an_interval_for_every_expert_and_contexts():

@@ -48,6 +48,7 @@ def report():
             "Acrobot-v1": entry("Acrobot-v1", learned, **scores),
         },
         "machine": {"cores": 2, "processor": "a processor"},
+        "lists": module._PLAN["lists"],
     }
 
 
@@ -71,6 +72,18 @@ def test_failures_are_counted_and_draws_are_compared_in_pairs(report):
     assert "**Shown: lpo-pendulum: a higher mean than ppo; lpo-pendulum: a higher worst" in page
     (figure,) = module.EXPERIMENT.figures(report).values()
     assert len(figure.axes) == 3
+
+
+def test_settings_are_paired_by_their_seeds_whatever_ended_first():
+    words = list(module.settings_of("Pendulum-v1"))
+    keys = [f"17 of {x}" for x in words]
+    assert len(keys) == 3 and module.in_order("Pendulum-v1", reversed(keys)) == keys
+
+
+def test_without_ppos_clip_there_is_nothing_to_compare_with(tmp_path):
+    options = module.Options(("CartPole-v1",), ("dpo",), draws=2, runs=tmp_path)
+    names = [x.names[0][1] for x in module.parts(options, {})]
+    assert names == ["ppo", "dpo"] * 3
 
 
 def test_an_objective_with_fewer_draws_is_left_out_until_it_has_them(report):

@@ -24,6 +24,16 @@ def test_two_actions_that_move_apart_are_two_directions():
     assert spread(corners[None])["directions"] == pytest.approx(2.0)
 
 
+def test_an_agent_that_diverged_is_counted_and_left_out():
+    means = np.random.default_rng(0).normal(size=(5, 7, 2))
+    without = saturation.spread(means[1:])
+    means[0, 3] = np.nan
+    found = saturation.spread(means)
+    assert (without.pop("diverged"), found.pop("diverged")) == (0, 1)
+    for name, values in without.items():
+        np.testing.assert_array_equal(found[name], values)
+
+
 def test_a_bandit_of_ours_is_taken_where_there_is_one():
     assert set(bandits("hopper", None)) == {"ours"}
     with pytest.raises(UserError, match="unknown bandit 'Synthetic-ant'"):

@@ -44,6 +44,17 @@ def test_the_page_says_what_a_core_is_worth_and_from_where_gathering_costs():
     assert "at no number of processes" in scaling.EXPERIMENT.page(report({"2": 2.0, "4": 2.0}))
 
 
+def test_the_page_of_one_process_compares_nothing():
+    alone = {**report({}), "generations": {"1": [2.0, 2.0, 2.2]}}
+    assert "**One process is all that was measured.**" in scaling.EXPERIMENT.page(alone)
+
+
+def test_processes_are_in_their_order_whatever_was_measured_first():
+    found = report({"2": 2.0, "4": 4.0})
+    found["generations"] = dict(reversed(found["generations"].items()))
+    assert "2 times the candidates in 1.25 times" in scaling.EXPERIMENT.page(found)
+
+
 @pytest.mark.parametrize("processes", [["0", "1", "2"], ["1"], ["2", "3"]])
 def test_processes_that_cannot_be_compared_are_refused(processes, capsys):
     assert scaling.EXPERIMENT.main(["--processes", *processes]) == 2

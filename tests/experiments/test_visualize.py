@@ -46,6 +46,12 @@ def test_an_agent_is_trained_in_its_bandit_and_shown(monkeypatch):
     assert np.abs(visualize.film(entry)[0]).max() <= 0.05
 
 
+def test_few_agents_decide_nothing(report):
+    for entry in report["environments"].values():
+        entry["agents"]["n"] = 4
+    assert {x.outcome for x in visualize.EXPERIMENT.judged(report)} == {"undecided"}
+
+
 def test_the_page_says_what_the_shown_episodes_earn(report):
     said = visualize.EXPERIMENT.block("verdict", report)
     told = [x.outcome for x in visualize.EXPERIMENT.judged(report)]

@@ -10,6 +10,7 @@ def test_a_comparison_names_a_run_by_its_folder_and_the_entry_by_its_name():
         return _short(name, Path("runs/temporal/objective.npz"), "ta-lpo")
 
     assert short("runs/temporal/objective.npz") == "ta-lpo"
+    assert short("temporal") == "ta-lpo"  # as lpo evaluate names it
     assert short("runs/several-bandits/objective.npz") == "several-bandits"
     assert short("runs/kept/first.npz") == "first"
     assert short("ppo-0.3") == "ppo-0.3"

@@ -149,6 +149,7 @@ def test_brax_is_scored_between_random_actions_and_the_papers_best():
     assert [x.get_text() for x in axes.get_yticklabels()] == list(found)
     page = zoo_table.EXPERIMENT.page(report(*entries))
     assert "| hopper | 0.50 [0.50, 0.50] | 0.50 [0.50, 0.50] | 3326 |" in page
+    assert "Over 1 Brax environments ours are at" in page
     assert "zoo_table_brax" not in zoo_table.EXPERIMENT.figures(PENDULUM)
 
 

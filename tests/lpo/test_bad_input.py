@@ -93,6 +93,7 @@ def test_a_number_out_of_range_is_told_its_range(refused, arguments, message):
         ("meta-train --environment a --tasks b,c", "the environment a and the tasks b,c are both"),
         ("meta-train --horizons 0.5,x", "horizons '0.5,x' are no numbers"),
         ("align --bandits Pendulum-v1", "'Pendulum-v1' is none"),
+        ("align --objectives ppo", "'ppo' is in the family already, as 'ppo-0.2': leave it out"),
         ("align --agents -4", "agents is -4: it must be at least 1."),
         # Before the agents of the environment are trained.
         ("align --minibatches 7", "num_minibatches is 7, which does not divide a batch of 200"),

@@ -13,6 +13,18 @@ def test_what_ships_can_be_shown_beside_a_short_run():
         assert whole.as_dict()["paired_differences"].keys() == others, environment
 
 
+def test_the_order_in_which_agents_ended_does_not_matter():
+    def agents(*seeds):
+        return {seed: {"returns": f"0 {seed}", "length": None, "speed": None} for seed in seeds}
+
+    entry = {"backend": "generalized", "steps": [0, 10], "episodes": 2}
+    found = as_comparison(
+        "hopper", {**entry, "agents": {"dpo": agents("2"), "ppo": agents("9", "10")}}
+    )
+    assert [curves.objective for curves in found.curves] == ["ppo", "dpo"]
+    assert found.curves[0].seeds == [9, 10] and found.curves[0].final.tolist() == [9.0, 10.0]
+
+
 def test_objectives_are_compared_on_the_seeds_that_both_have():
     def agents(earned):
         return {seed: {"returns": f"0 {x}", "length": None, "speed": None} for seed, x in earned}

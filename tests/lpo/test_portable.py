@@ -14,7 +14,7 @@ import pytest
 
 from lpo.drifts import ClosedFormDrift, LearnedDrift, MirrorDrift
 from lpo.drifts.contract import BASES
-from lpo.objectives import Objective, load_objective, objective_names
+from lpo.objectives import KNOWN, Objective, load_objective, zoo_names
 from lpo.portable import _policy_loss, drift_function, numpy_drift, torch_drift, torch_loss
 from scb.agents.ppo import MAX_LOG_RATIO
 from scb.errors import UserError
@@ -40,7 +40,7 @@ def formula(base: str, expression: str) -> Objective:
     return Objective(f"formula-{base}", drift, drift.init(jax.random.key(0)))
 
 
-OBJECTIVES = [load_objective(name) for name in [*objective_names(), "ppo-0.3"]] + [
+OBJECTIVES = [load_objective(name) for name in [*KNOWN, *zoo_names(), "ppo-0.3"]] + [
     random_objective(base, temporal) for base in BASES for temporal in (False, True)
 ]
 OBJECTIVES += [

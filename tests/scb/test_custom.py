@@ -132,7 +132,10 @@ def test_the_physics_that_a_factory_takes_is_part_of_the_place(module):
         ("{}:NoStep", "returns 1 of step, where gymnax 1.x returns"),
         ("{}:FourValues", "returns 4 of step_env, where gymnax 1.x returns observation, state, re"),
         ("{}:ManyRewards", r"rewards of shape \(2,\)"),
-        ("{}:NoParameters", "gymnax's own parameters, whose episodes end after one step: give it d"),
+        (
+            "{}:NoParameters",
+            "gymnax's own parameters, whose episodes end after one step: give it d",
+        ),
         ("{}:endless", "without max_steps_in_episode"),
         ("{}:wrong", "returned a str: it must return a gymnax"),
         ("{}:number", "does not take"),
