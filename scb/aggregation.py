@@ -59,11 +59,13 @@ class Learned(NamedTuple):
       returns: [N] what each earns; one that diverged counts as random actions.
       states: of the agents, every leaf [N], to act with; keys are left as numbers.
       keys: [N] that decided them.
+      failed: [N] which diverged.
     """
 
     returns: np.ndarray
     states: Any
     keys: jax.Array
+    failed: np.ndarray
 
 
 class Learners:
@@ -88,7 +90,7 @@ class Learners:
         self._bandit, self._specs, self._place, self._number = bandit, specs, place, number
         self.agents = {name: spec.agent(bandit) for name, spec in specs.items()}
         judge = Judge(place.env, place.params, episodes, mode=True)
-        each = -(-TRAJECTORIES // (number * len(specs)))
+        self._each = each = -(-TRAJECTORIES // (number * len(specs)))
 
         def training(agent: Agent) -> Any:
             def one(hyperparameters: Any, key: jax.Array, params: Any) -> Any:
@@ -123,8 +125,8 @@ class Learners:
             key_draw, key_agents = split_key(named_key(key, name))
             drawn, keys = spec.sample(key_draw, self._number), split_key(key_agents, self._number)
             earned, states = self._training[name](drawn, keys, params)
-            returns, _ = as_random(np.asarray(earned), self._place)
-            learned[name] = Learned(returns, states, keys)
+            returns, failed = as_random(np.asarray(earned), self._place)
+            learned[name] = Learned(returns, states, keys, failed)
         mean = np.concatenate([of.returns for of in learned.values()]).mean()
         return float(mean), learned
 
@@ -139,7 +141,10 @@ class Learners:
         flat = jax.tree.map(lambda x: jnp.reshape(x, (-1, *x.shape[2:])), visits)
         visited: Visited = jax.tree.map(lambda *x: jnp.concatenate(x), *flat)
         observed = np.asarray(visited.observation)
+        # With discrete actions one that diverged acts on, and its states are numbers.
+        failed = np.concatenate([of.failed for of in learned.values()])
         usable = np.isfinite(np.reshape(observed, (len(observed), -1))).all(axis=1)
+        usable &= ~np.repeat(failed, self._each)
         if not usable.any():
             raise UserError(
                 f"all agents of {self._bandit.name} diverge: lower their learning rate, or fit another bandit."

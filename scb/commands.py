@@ -27,6 +27,7 @@ from scb.judgement import (
     judge_all,
     told,
 )
+from scb.listing import found
 from scb.measurement import check_seeds
 from scb.runs import config_dict
 from scb.seeds import VALIDATING
@@ -211,6 +212,7 @@ def _origin(bandit: str) -> dict[str, Any]:
         "command": metadata["command"],
         "sha256": metadata["sha256"],
         "cost": metadata["cost"],
+        "found": found(metadata),
         "started_from": metadata["config"].get("started_from"),
     }
 
@@ -283,5 +285,5 @@ class Train(Measuring):
         )
         by_actions, failed = counted(by_actions, judge_in)
         (returns,) = by_actions.values()
-        print(f"returns on {judge_in}: {' '.join(f'{r:.0f}' for r in np.sort(returns))}")
+        print(f"returns on {judge_in}: {' '.join(f'{r:.4g}' for r in np.sort(returns))}")
         print(f"IQM: {estimate(returns)}{told(failed)}")

@@ -173,6 +173,28 @@ def check_curriculum(config: CurriculumConfig, limit: int, environment_name: str
         )
 
 
+class EpisodeLengths:
+    """How long a search's evaluation episodes are: the environment's own, or as its curriculum says.
+
+    Attributes:
+      params: the environment's, which leave all cutting to `limit` where there is a curriculum.
+    """
+
+    def __init__(self, config: CurriculumConfig | None, env_params: Any) -> None:
+        self._horizon, self.params = None, env_params
+        if config is not None:
+            self._horizon, self.params = horizon(config), with_limit(env_params, config.longest)
+
+    def limit(self, generation: ArrayLike) -> jax.Array | None:
+        """[] after how many steps an episode of this generation is cut; None where the environment alone says."""
+        return None if self._horizon is None else self._horizon(generation)
+
+    def steps(self, generation: int) -> int:
+        """Of the longest episode of this generation."""
+        limit = self.limit(generation)
+        return int(self.params.max_steps_in_episode if limit is None else limit)
+
+
 def with_limit(env_params: Any, limit: ArrayLike) -> Any:
     """An environment's parameters with another time limit, in steps.
 

@@ -5,7 +5,7 @@ hyperparameters drawn from the paper's lists so that the bandit suits any of the
 their return in the evaluation environment. The same search finds the paper's fully synthetic MDPs.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from pathlib import Path
@@ -30,11 +30,10 @@ from scb.agents.tables import Lists, Values
 from scb.command_line import listed, text
 from scb.curriculum import (
     CurriculumConfig,
+    EpisodeLengths,
     check_curriculum,
-    horizon,
     paper_curriculum,
     read_curriculum,
-    with_limit,
 )
 from scb.environments.registry import environment_spec
 from scb.environments.synthetic import (
@@ -147,6 +146,11 @@ class DiscoveryConfig:
         default_factory=lambda: EvolutionConfig(combine="ranks")
     )
 
+    @property
+    def fitted(self) -> bool:
+        """Whether it starts from a fit to an expert."""
+        return self.init == "expert" and self.start is None
+
     def __post_init__(self) -> None:
         algorithms: Any = self.algorithms
         if isinstance(algorithms, str):
@@ -155,7 +159,7 @@ class DiscoveryConfig:
         one_of("mode", self.mode, MODES)
         one_of("selection", self.select, SELECTIONS)
         one_of("parameterization", self.parameterization, PARAMETERIZATIONS)
-        if self.parameterization != "I" and self.init == "expert" and self.start is None:
+        if self.parameterization != "I" and self.fitted:
             raise UserError(
                 f"a synthetic MDP ({self.parameterization}) cannot be fitted to an expert: use init random."
             )
@@ -168,8 +172,7 @@ class DiscoveryConfig:
                 ("latent", "latent_size"),
                 "take TI or I",
             )
-        fitted = self.init == "expert" and self.start is None
-        if not fitted:
+        if not self.fitted:
             unused(
                 self.warm_start,
                 "nothing is fitted to an expert",
@@ -179,7 +182,7 @@ class DiscoveryConfig:
         if self.bandit.form == "linear":
             because, networks = "the form linear has no networks", "take the form networks"
             unused(self.bandit, because, ("hidden_size", "activation"), networks)
-            if fitted:
+            if self.fitted:
                 check_linear(self.warm_start.construction)
                 unused(
                     self.warm_start,
@@ -202,7 +205,7 @@ class DiscoveryConfig:
                 f"{strategy} compares fitness with that of earlier generations, which is another algorithm's in the "
                 "mode sequential: use the mode all, or choose another strategy, such as SNES."
             )
-        if not self.evolution.num_generations and not (fitted or self.refinement.rounds):
+        if not self.evolution.num_generations and not (self.fitted or self.refinement.rounds):
             raise UserError(
                 "there are 0 generations, and nothing is found before them: choose init expert or refinement rounds, "
                 "or at least 1."
@@ -243,7 +246,7 @@ class BanditDiscovery:
                     f"there are {what} for {', '.join(given)}, but the inner loop trains "
                     f"{', '.join(config.algorithms)}: give them for that."
                 )
-        if config.init == "expert" and config.start is None:
+        if config.fitted:
             expert_agent(config.environment, space, config.warm_start)
         self.config = config
         self.bandit = synthetic_for(
@@ -257,11 +260,11 @@ class BanditDiscovery:
         self.specs = {name: self._spec(name) for name in dict.fromkeys(config.algorithms)}
         if config.evolution.num_generations:
             self._check_strategy()
-        self._horizon, self._longest = None, None
-        if isinstance(config.curriculum, CurriculumConfig):
+        assert not isinstance(config.curriculum, str)  # the paper's is read by now
+        if config.curriculum is not None:
             limit = int(self.place.params.max_steps_in_episode)
             check_curriculum(config.curriculum, limit, config.environment)
-            self._horizon, self._longest = horizon(config.curriculum), config.curriculum.longest
+        self._lengths = EpisodeLengths(config.curriculum, self.place.params)
         self._starts: dict[str, Weights] = {}
         self.start_reports: dict[str, dict[str, float]] = {}
         self._folder: Path | None = None
@@ -373,9 +376,7 @@ class BanditDiscovery:
         self, candidate: Weights, key: jax.Array, generation: jax.Array
     ) -> dict[str, jax.Array]:
         config = self.config
-        limit, env_params = None, self.place.params
-        if self._horizon is not None and self._longest is not None:
-            limit, env_params = self._horizon(generation), with_limit(env_params, self._longest)
+        limit, env_params = self._lengths.limit(generation), self._lengths.params
 
         def returns_of(name: str, key: jax.Array) -> jax.Array:
             key_draw, key_agents = split_key(key)
@@ -436,21 +437,15 @@ class BanditDiscovery:
         return {"fitness": jnp.stack(list(results.values())).mean(), **results}
 
     def steps(self, generation: int = 0) -> EnvironmentSteps:
-        """Of one candidate; in the mode "sequential" the mean over the algorithms' turns."""
+        """Of one candidate; in the mode "sequential" of the algorithm whose turn it is."""
         config = self.config
-        agents = config.agents_per_candidate
-        if config.mode == "all":
-            training = sum(spec.steps for spec in self.specs.values())
-            evaluations = len(self.specs)
-        else:
-            turns = [self.specs[name].steps for name in config.algorithms]
-            training, evaluations = sum(turns) // len(turns), 1
-        limit = int(self.place.params.max_steps_in_episode)
-        if self._horizon is not None:
-            limit = int(self._horizon(generation))
-        return EnvironmentSteps(
-            training=agents * training,
-            evaluation=agents * evaluations * config.evaluation_episodes * limit,
+        names: Sequence[str] = list(self.specs)
+        if config.mode == "sequential":
+            names = [config.algorithms[generation % len(config.algorithms)]]
+        episodes = len(names) * config.evaluation_episodes
+        return config.agents_per_candidate * EnvironmentSteps(
+            training=sum(self.specs[name].steps for name in names),
+            evaluation=episodes * self._lengths.steps(generation),
         )
 
     def judgement_steps(self) -> EnvironmentSteps:

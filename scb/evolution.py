@@ -108,7 +108,7 @@ class EvolutionConfig:
 
 @dataclass(frozen=True)
 class EnvironmentSteps:
-    """Steps that one evaluation of one candidate takes, counted apart."""
+    """Steps of training and of evaluation, counted apart."""
 
     training: int
     evaluation: int
@@ -122,6 +122,8 @@ class EnvironmentSteps:
 
     def __mul__(self, number: int) -> "EnvironmentSteps":
         return EnvironmentSteps(number * self.training, number * self.evaluation)
+
+    __rmul__ = __mul__
 
 
 class Problem(Protocol):
@@ -173,6 +175,7 @@ class Outcome:
       best_mean_generation: which one that was; -1, and the mean that of the start, where none could be judged.
       metrics: the run's log.
       seconds: wall-clock of all generations.
+      steps: that all candidates of all generations took.
       validate: {"fitness": [N], ...} of a solution, by `evaluate_mean` with N = `mean_evaluations`
         agents of validation seeds, which neither moved the search nor chose in it.
     """
@@ -182,6 +185,7 @@ class Outcome:
     best_mean_generation: int
     metrics: list[dict[str, Any]]
     seconds: float
+    steps: EnvironmentSteps
     validate: Callable[[Any], dict[str, np.ndarray]]
 
     def check(self, best: bool = False) -> None:
@@ -199,15 +203,14 @@ class Outcome:
 
     def cost(self, problem: Problem, config: EvolutionConfig, best: bool) -> dict[str, Any]:
         """What an artefact says of the search's cost; `best` where the mean judged best was taken."""
-        steps = evaluated(problem, config, config.num_generations)
         judgements = sum(
             name in line for line in self.metrics for name in ("mean/fitness", "final_mean/fitness")
         )
         agents = judgements * config.mean_evaluations
         judging = problem.judgement_steps()
         return {
-            "environment_steps_training": steps.training,
-            "environment_steps_evaluation": steps.evaluation,
+            "environment_steps_training": self.steps.training,
+            "environment_steps_evaluation": self.steps.evaluation,
             "environment_steps_judgements_training": agents * judging.training,
             "environment_steps_judgements_evaluation": agents * judging.evaluation,
             "seconds": round(self.seconds, 1),
@@ -325,7 +328,7 @@ def evolve(
 
     if not config.num_generations:
         start = jax.device_get(solution)
-        return Outcome(start, start, 0, [], 0.0, validate)
+        return Outcome(start, start, 0, [], 0.0, EnvironmentSteps(0, 0), validate)
     strategy = strategy_for(config, solution)
     state = {
         "strategy": strategy.start(
@@ -446,5 +449,6 @@ def evolve(
         best_mean_generation=int(state["best_mean_generation"]),
         metrics=history,
         seconds=total_seconds,
+        steps=steps,
         validate=validate,
     )

@@ -25,9 +25,9 @@ class DatasetConfig:
     """The states that a bandit is fitted on, and what is asked there.
 
     Attributes:
-      construction: the reward's target. "advantage": (Q(s, a) - max_a Q(s, a)) / std; "q": (Q -
-        mean) / std; "action_distance": -||a - a*|| (discrete: 1 where a = a*), a* the expert's mode
-        action.
+      construction: the reward's target, divided by its standard deviation. "advantage": Q(s, a) - max_a Q(s, a);
+        "q": Q - mean; "action_distance": -||a - a*|| (discrete: 1 where a = a*), a* the expert's mode
+        action, which the form linear has in halves of the actions' range and undivided.
       expert_noise: standard deviation of Gaussian noise on the expert's actions, as a share of half their
         range: where a linear search looks for it, so that it bears the errors of agents that learn
         from the bandit, and on the trajectories whose states the bandit's contexts are fitted to. With 0

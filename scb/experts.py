@@ -18,7 +18,7 @@ from gymnax.environments import environment
 from scb.agents.agent import Agent
 from scb.agents.normalization import RunningStatistics, normalize, update_statistics
 from scb.agents.spec import AgentSpec
-from scb.curriculum import CurriculumConfig, horizon, with_limit
+from scb.curriculum import CurriculumConfig, EpisodeLengths
 from scb.errors import UserError
 from scb.evaluation import evaluate
 from scb.evolution import EnvironmentSteps, EvolutionConfig, evolve
@@ -152,11 +152,7 @@ class _PolicySearch:
         self, env: environment.Environment[Any, Any], env_params: Any, config: PolicySearchConfig
     ) -> None:
         self.env, self.env_params, self.config = env, env_params, config
-        curriculum = config.curriculum
-        self.horizon = None if curriculum is None else horizon(curriculum)
-        self.longest = int(
-            env_params.max_steps_in_episode if curriculum is None else curriculum.longest
-        )
+        self.lengths = EpisodeLengths(config.curriculum, env_params)
         self.space = env.action_space(env_params)
         self.network = policy_network(self.space, (config.hidden_size,), "tanh")
         self.statistics = _random_statistics(env, env_params)
@@ -172,11 +168,13 @@ class _PolicySearch:
         size = flat_size(self.env.observation_space(self.env_params))
         return self.network.init(key, jnp.zeros(size))
 
-    def _returns(self, weights: Any, key: jax.Array, limit: Any) -> jax.Array:
+    def _returns(
+        self, weights: Any, key: jax.Array, env_params: Any, limit: Any = None
+    ) -> jax.Array:
         policy = self.policy(weights)
         return evaluate(
             self.env,
-            with_limit(self.env_params, self.longest),
+            env_params,
             lambda observation, _: policy(jnp.ravel(observation)),
             key,
             self.config.episodes,
@@ -184,16 +182,14 @@ class _PolicySearch:
         ).returns
 
     def evaluate(self, candidate: Any, key: jax.Array, generation: jax.Array) -> dict[str, Any]:
-        limit = None if self.horizon is None else self.horizon(generation)
-        return {"fitness": self._returns(candidate, key, limit).mean()}
+        limit, env_params = self.lengths.limit(generation), self.lengths.params
+        return {"fitness": self._returns(candidate, key, env_params, limit).mean()}
 
     def evaluate_mean(self, candidate: Any, key: jax.Array) -> dict[str, Any]:
-        limit = self.env_params.max_steps_in_episode
-        return {"fitness": self._returns(candidate, key, limit).mean()}
+        return {"fitness": self._returns(candidate, key, self.env_params).mean()}
 
     def steps(self, generation: int = 0) -> EnvironmentSteps:
-        limit = self.longest if self.horizon is None else int(self.horizon(generation))
-        return EnvironmentSteps(training=0, evaluation=self.config.episodes * limit)
+        return EnvironmentSteps(0, self.config.episodes * self.lengths.steps(generation))
 
     def judgement_steps(self) -> EnvironmentSteps:
         limit = int(self.env_params.max_steps_in_episode)

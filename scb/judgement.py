@@ -46,9 +46,10 @@ def evaluation_place(
     Raises:
       UserError: it stands for none, or does not fit the environment.
     """
+    config = bandit_metadata(name).get("config", {})
     target = environment or environment_spec(name).evaluation_environment
-    if environment is None and backend is None:
-        backend = bandit_metadata(name).get("config", {}).get("backend")
+    if backend is None and environment in (None, config.get("evaluation_environment")):
+        backend = config.get("backend")
     place = Place.named(target, backend)
     check_fits(bandit, place.env, place.params, target)
     return place

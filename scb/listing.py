@@ -78,14 +78,16 @@ def found(metadata: Mapping[str, Any]) -> str:
     """How a bandit was: fitted to an expert, and by what more than that, or from random weights; evolved or not."""
     discovery = metadata["config"]["discovery"]
     earlier = metadata["config"].get("started_from")
-    start = "random weights" if discovery["init"] == "random" else "fitted"
-    if start == "fitted":
-        start += " with aggregation" if discovery["warm_start"].get("aggregation_rounds") else ""
+    if earlier:
+        start = str(earlier["found"])
+    elif discovery["init"] == "random":
+        start = "random weights"
+    else:
+        aggregated = discovery["warm_start"].get("aggregation_rounds")
+        start = "fitted with aggregation" if aggregated else "fitted"
     start += ", refined" if discovery.get("refinement", {}).get("rounds") else ""
-    evolved = earlier or metadata["cost"].get(
-        "generation", discovery["evolution"]["num_generations"]
-    )
-    return f"{start}, evolved" if evolved else start
+    evolved = metadata["cost"].get("generation", discovery["evolution"]["num_generations"])
+    return f"{start}, evolved" if evolved and not start.endswith("evolved") else start
 
 
 def _total(cost: Mapping[str, Any], earlier: Mapping[str, Any] | None, *names: str) -> float:

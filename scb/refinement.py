@@ -134,7 +134,7 @@ class Refinement:
     def __init__(
         self, bandit: SyntheticBandit, agents: Mapping[str, Agent], place: Place, generations: int
     ) -> None:
-        self._bandit, self._generations = bandit, generations
+        self._generations = generations
         low, high = bandit.bounds
 
         def program(agent: Agent) -> Any:

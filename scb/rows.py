@@ -154,6 +154,10 @@ def _description(value: Any) -> Any:
         return {"class": type(value).__name__, **parts}
     if isinstance(value, Mapping):
         return dict(value)
+    if hasattr(
+        value, "__qualname__"
+    ):  # a function, whose representation is another in every process
+        return f"{value.__module__}.{value.__qualname__}"
     array = np.asarray(value)
     if array.dtype == object:
         return repr(value)

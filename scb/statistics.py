@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from scb.errors import UserError
 
-# A group's resamples are drawn in batches of about this many numbers (80 MB), however many runs it has.
+# A group's resamples are drawn in batches of about this many indices (80 MB); of a group of groups each takes so many.
 _NUMBERS_PER_BATCH = 10_000_000
 PERCENTILES = 0.95  # confidence beyond which they are not the resamples'
 DECIDING = 10  # agents; of fewer a bootstrap's interval is too narrow to decide anything
@@ -121,7 +121,6 @@ def stratified_estimate(
     minus: Sequence[ArrayLike] | None = None,
     confidence: float = 0.95,
     num_resamples: int = 2000,
-    seed: int = 0,
     statistic: Statistic = iqm,
     paired: bool = True,
     shared: bool = False,
@@ -165,7 +164,7 @@ def stratified_estimate(
         return found / len(first)
 
     sizes = [len(group) for group in (*first, *second)]
-    found = _bootstrapped(mean, sizes, confidence, num_resamples, seed)
+    found = _bootstrapped(mean, sizes, confidence, num_resamples)
     return replace(found, n=sum(group.size for group in first))
 
 
@@ -299,7 +298,6 @@ def _bootstrapped(
     sizes: Sequence[int],
     confidence: float,
     num_resamples: int = 10_000,
-    seed: int = 0,
 ) -> Estimate:
     """A statistic with its interval: the percentile bootstrap's up to 95 %, beyond it Student's t.
 
@@ -318,13 +316,12 @@ def _bootstrapped(
     Args:
       statistic: rows -> [R] values, where rows(size) are [R, size] indices of runs.
       sizes: runs of every group; a single run cannot tell its spread.
-      seed: of the resampling; the same input gives the same interval.
     """
     _check_confidence(confidence)
     value, n = float(statistic(lambda size: np.arange(size)[None])[0]), sum(sizes)
     if min(sizes) < 2:
         return Estimate(value, None, None, n)
-    generator = np.random.default_rng(seed)
+    generator = np.random.default_rng(0)  # the same input gives the same interval
     batch = max(1, _NUMBERS_PER_BATCH // max(sizes))
     found = [
         statistic(partial(_drawn, generator, min(batch, num_resamples - done)))

@@ -17,7 +17,7 @@ from scb.agents.off_policy import (
     OffPolicyAgent,
     OffPolicyConfig,
     Transition,
-    require_discrete,
+    require_actions,
     target_values,
 )
 from scb.keys import split_key
@@ -66,7 +66,7 @@ class DQN(OffPolicyAgent):
 
     def _network(self, env_params: Any) -> Any:
         space = self.env.action_space(env_params)
-        require_discrete("dqn", space, True)
+        require_actions("dqn", space, "discrete")
         return networks.QNetwork(
             action_size(space), self.config.hidden_sizes, self.config.activation
         )

@@ -21,6 +21,7 @@ from scb.agents.agent import Agent, AgentConfig, clipped_adam
 from scb.agents.normalization import RunningStatistics, update_statistics
 from scb.errors import UserError
 from scb.keys import key_at, split_key
+from scb.spaces import kind_of_actions
 
 
 @dataclass(frozen=True)
@@ -305,11 +306,11 @@ def gradient_update(
     return optax.apply_updates(params, updates), optimizer_state
 
 
-def require_discrete(algorithm: str, space: spaces.Box | spaces.Discrete, discrete: bool) -> None:
-    """Raises a UserError where an algorithm doesn't fit an action space."""
-    if isinstance(space, spaces.Discrete) != discrete:
-        has, needs = ("continuous", "discrete") if discrete else ("discrete", "continuous")
+def require_actions(algorithm: str, space: spaces.Box | spaces.Discrete, needed: str) -> None:
+    """Raises a UserError where an algorithm needs "discrete" or "continuous" actions, and the space has others."""
+    has = kind_of_actions(space)
+    if has != needed:
         raise UserError(
-            f"{algorithm} needs {needs} actions, and this environment has {has} ones: use an algorithm for "
+            f"{algorithm} needs {needed} actions, and this environment has {has} ones: use an algorithm for "
             "those, such as ppo or sac."
         )

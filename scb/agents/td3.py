@@ -17,7 +17,7 @@ from scb.agents.off_policy import (
     OffPolicyConfig,
     Transition,
     gradient_update,
-    require_discrete,
+    require_actions,
     target_values,
 )
 from scb.keys import split_key
@@ -77,7 +77,7 @@ class TD3(OffPolicyAgent):
 
     def _networks(self, env_params: Any) -> tuple[Any, Any]:
         space = self.env.action_space(env_params)
-        require_discrete("ddpg" if self.config.num_critics == 1 else "td3", space, False)
+        require_actions("ddpg" if self.config.num_critics == 1 else "td3", space, "continuous")
         shape = (self.config.hidden_sizes, self.config.activation)
         # The policy follows the first critic; the second only ever lowers a bootstrapped target,
         # and without bootstrapping it has no effect on anything.

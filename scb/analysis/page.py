@@ -55,10 +55,7 @@ def _surface(parts: Mapping[str, Any], x: Any, y: Any, observations: Any, values
     plane: Plane = parts["plane"]
     clouds = {
         "contexts of the bandit": (parts["contexts"][:SHOWN], plotting.SKY_BLUE),
-        "visited by its optimal policy": (
-            thinned(parts["visited"], SHOWN)[:SHOWN],
-            plotting.VERMILLION,
-        ),
+        "visited by its optimal policy": (thinned(parts["visited"], SHOWN), plotting.VERMILLION),
     }
 
     texts = ["the best", *(f"{value:.3g}" for value in values)]

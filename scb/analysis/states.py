@@ -86,5 +86,5 @@ def record_episode(
 
 
 def thinned(states: np.ndarray, number: int) -> np.ndarray:
-    """[N, O] states -> every k-th of them, which are `number` or somewhat more."""
-    return states[:: max(1, len(states) // number)]
+    """[N, O] states -> every k-th of them, which are `number` at most."""
+    return states[:: max(1, -(-len(states) // number))]

@@ -54,7 +54,7 @@ class BanditParams(environment.EnvParams):
     """What a step may read: all traced, so bandits and noise levels vmap.
 
     Attributes:
-      weights: {"initial_state": {...}, "reward": {...}}, two Dense layers each.
+      weights: {"initial_state": {...}, "reward": {...}}, of the form networks two Dense layers each.
       reward_noise: standard deviation of Gaussian noise on the reward, in the reward's own units.
         Zero for training an agent; larger than the reward's own spread for learning objectives,
         whose advantages must be as uncertain as a real environment's.

@@ -136,9 +136,8 @@ def save_bandit(
       synthetic: whose shapes are stored, and of an MDP parameterisation and maximum episode length.
       weights: as in its parameters.
       metadata: config (of the discovery), seeds, results, cost, command, what of it there is to tell; a config's
-        "evaluation_environment" is the name of what the bandit stands for. Of a "T",
-        `config["evaluation_environment"]` is the name by which to make the environment in whose start
-        states it starts, where it isn't the environment's own.
+        "evaluation_environment" is the name of what the bandit stands for, by which a "T" makes the environment in
+        whose states it starts; of a "T" the environment's own name where it is left out.
 
     Raises:
       UserError: weights of other shapes than the environment's; a "T" whose evaluation environment would not come

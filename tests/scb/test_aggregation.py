@@ -174,6 +174,21 @@ def test_agents_whose_training_breaks_count_as_random_actions_and_are_not_follow
     assert visited.observation.shape == (1, 200, 3) and np.isfinite(visited.observation).all()
 
 
+def test_an_agent_that_diverged_is_not_followed_where_actions_are_discrete(monkeypatch):
+    # An argmax of NaN is an action, and what it leads to are states.
+    monkeypatch.setattr(aggregation, "TRAJECTORIES", 4)
+    place = Place.named("CartPole-v1")
+    bandit = bandit_for(place.env, place.params, BanditConfig(hidden_size=4), "a bandit")
+    learners = Learners(bandit, SPECS, place, 2)
+    weights = jax.tree.map(lambda x: x * np.nan, bandit.init_weights(jax.random.key(0)))
+    _, learned = learners(weights, jax.random.key(1))
+    assert learned["ppo"].failed.all()
+    with pytest.raises(UserError, match=r"all agents of .* diverge"):
+        learners.visits(weights, learned)
+    one = {"ppo": learned["ppo"]._replace(failed=np.array([True, False]))}
+    assert learners.visits(weights, one).observation.shape[0] == 2
+
+
 def test_agents_act_by_their_most_likely_actions_and_their_steps_are_counted(
     bandit, place, monkeypatch
 ):

@@ -11,7 +11,7 @@ from scb.analysis import figures
 from scb.analysis.importance import reward_variance
 from scb.analysis.optimal_actions import optimal_actions, optimal_policy
 from scb.analysis.planes import observation_names, plane_for
-from scb.analysis.states import Trajectories, bandit_states, follow
+from scb.analysis.states import Trajectories, bandit_states, follow, thinned
 from scb.cli import main
 from scb.environments.synthetic import BanditConfig, SyntheticBandit
 from scb.environments.zoo import load_bandit
@@ -176,6 +176,12 @@ def test_a_jump_of_the_angle_is_not_drawn_as_a_line():
     figures.draw_trajectory(axes, plane, states)
     x = axes.lines[0].get_xdata()
     assert len(x) == 5 and np.isnan(x[2])
+
+
+@pytest.mark.parametrize("number", [799, 400, 401, 5])
+def test_thinned_states_are_of_all_episodes(number):
+    shown = thinned(np.arange(number)[:, None], 400)
+    assert len(shown) <= 400 and shown[-1, 0] >= number - 2
 
 
 def test_explain_writes_what_it_found(tmp_path, capsys):

@@ -135,7 +135,7 @@ def test_a_finished_discovery_goes_on_with_more_generations(discovered, tmp_path
     before = json.loads(bandit.read_text())
     words = ["--resume", folder, "--generations", "3", "--judge-agents", "0"]
     result = call("discover", *words)
-    assert (result.code, result.err.count("generation 3/3")) == (0, 1)
+    assert (result.code, result.err.count("generation 3/3: fitness")) == (0, 1)
     after = json.loads(bandit.read_text())
     assert after["sha256"] != before["sha256"]
     assert after["command"] == before["command"].replace("--generations=2", "--generations=3")
@@ -187,6 +187,7 @@ def test_a_discovery_from_a_bandit_tells_where_it_started(discovered, tmp_path):
     origin = json.loads((tmp_path / "second" / "Synthetic-CartPole-v1.json").read_text())
     first = json.loads(start.with_suffix(".json").read_text())
     assert origin["config"]["started_from"]["sha256"] == first["sha256"]
+    assert origin["config"]["started_from"]["found"] == "random weights, evolved"
 
 
 def asked_for(*arguments):
@@ -428,9 +429,11 @@ def test_a_bandit_is_judged_with_the_physics_that_it_was_found_with(tmp_path, mo
     metadata = {"config": {"evaluation_environment": "hopper", "backend": "spring"}}
     path = tmp_path / "bandit.npz"
     save_bandit(path, bandit, bandit.init_weights(jax.random.key(0)), metadata)
-    for environment, backend in [(None, None), (None, "generalized"), ("walker2d", None)]:
+    places = [(None, None), ("hopper", None), (None, "generalized"), ("walker2d", None)]
+    for environment, backend in places:
         judgement.evaluation_place(load_bandit(path), str(path), environment, backend)
-    assert made == [("hopper", "spring"), ("hopper", "generalized"), ("walker2d", None)]
+    assert made[:2] == [("hopper", "spring")] * 2
+    assert made[2:] == [("hopper", "generalized"), ("walker2d", None)]
     assert str(Place("hopper", None, None, "spring")) == "hopper (spring physics)"
 
 
@@ -515,6 +518,15 @@ def test_how_a_bandit_was_found():
     assert listing.found({"config": config, "cost": {}}) == (
         "fitted with aggregation, refined, evolved"
     )
+    # One that goes on from another: the default of its own initialisation says nothing.
+    del config["discovery"]["refinement"]
+    for before, cost, expected in (
+        ("random weights, evolved", {}, "random weights, evolved"),
+        ("fitted", {}, "fitted, evolved"),
+        ("fitted", {"generation": 0}, "fitted"),
+    ):
+        config["started_from"] = {"found": before}
+        assert listing.found({"config": config, "cost": cost}) == expected
 
 
 def test_the_programs_say_their_version_and_complete_their_words():

@@ -338,12 +338,13 @@ def test_a_resumed_sequential_search_ends_with_the_same_bytes(trained_in_turns, 
 
 def test_the_steps_of_several_algorithms_are_counted():
     # A PPO agent takes 2 batches of 2 x 8 = 32 steps, a DQN agent 16; each is evaluated for 2 episodes
-    # of at most 500. All: 3 agents of each. Sequential, with turns of PPO, DQN and PPO: 3 agents of
-    # (32 + 16 + 32) / 3 = 26 steps (rounded down).
+    # of at most 500. All: 3 agents of each. Sequential: 3 of PPO, DQN and PPO in turn.
     steps = BanditDiscovery(ALL).steps()
     assert (steps.training, steps.evaluation) == (3 * (32 + 16), 2 * 3 * 2 * 500)
-    steps = BanditDiscovery(SEQUENTIAL).steps()
-    assert (steps.training, steps.evaluation) == (3 * 26, 3 * 2 * 500)
+    problem = BanditDiscovery(SEQUENTIAL)
+    turns = [problem.steps(generation) for generation in range(4)]
+    assert [steps.training for steps in turns] == [3 * 32, 3 * 16, 3 * 32, 3 * 32]
+    assert {steps.evaluation for steps in turns} == {3 * 2 * 500}
 
 
 @pytest.mark.parametrize("environment", ["CartPole-v1", "Pendulum-v1", "MountainCarContinuous-v0"])

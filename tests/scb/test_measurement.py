@@ -18,7 +18,7 @@ from scb.agents.spec import AgentSpec, environment_agent
 from scb.errors import UserError
 from scb.evolution import map_population
 from scb.measurement import Agents, Judge, Place, measure, spaced, train_and_judge
-from scb.rows import Rows, pivot
+from scb.rows import Rows, _description, pivot
 
 # Seven batches of eight contexts, which have no divisor near three points: nine are trained.
 CONFIG = PPOConfig(
@@ -254,6 +254,17 @@ def test_a_diagnosed_training_is_the_same_and_its_rows_say_what_an_iteration_doe
         if not quiet:
             without = [{k: x for k, x in row.items() if k not in DIAGNOSIS} for row in rows]
             assert without == file[1]
+
+
+def test_a_drift_that_is_a_function_is_the_same_in_another_process():
+    def drift(*arguments):
+        return 0.0
+
+    one, other = (_description(x) for x in (drift, jax.nn.relu))
+    assert one.endswith(
+        "test_a_drift_that_is_a_function_is_the_same_in_another_process.<locals>.drift"
+    )
+    assert "0x" not in one + other
 
 
 def test_agents_of_one_seed_share_out_what_is_drawn_and_their_rows_say_it(bandit):

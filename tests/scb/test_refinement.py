@@ -53,7 +53,9 @@ def test_a_policy_makes_up_for_what_all_its_agents_do_wrong():
     weights = {"initial_state": eye, "reward": zero["reward"]}
     # Alike but for a little, one of them better off by far.
     errors = jnp.array([[0.4], [0.3], [0.5]])
-    learned = {"off": Learned(np.zeros(3), errors, split_key(jax.random.key(0), 3))}
+    learned = {
+        "off": Learned(np.zeros(3), errors, split_key(jax.random.key(0), 3), np.zeros(3, bool))
+    }
     refine = Refinement(bandit, {"off": Off(bandit, weights)}, CORRIDOR, generations=100)
     found, steps = refine(weights, learned, jax.random.key(1))
     assert steps == 100 * 64 * 2
@@ -75,7 +77,9 @@ def test_algorithms_take_turns_and_a_pair_has_one_agent_and_one_start():
 
     refine = Refinement(bandit, {}, CORRIDOR, generations=3)
     refine._programs = {name: recorder(name) for name in ("ppo", "td3")}
-    learned = {name: Learned(np.zeros(3), f"{name}'s", None) for name in ("ppo", "td3")}
+    learned = {
+        name: Learned(np.zeros(3), f"{name}'s", None, np.zeros(3, bool)) for name in ("ppo", "td3")
+    }
     _, steps = refine(bandit.init_weights(jax.random.key(0)), learned, jax.random.key(1))
     assert steps == 3 * 64 * 2
     assert [(name, states) for name, _, _, states in met] == [
