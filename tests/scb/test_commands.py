@@ -444,7 +444,7 @@ def test_agents_that_diverge_count_as_random_actions_and_are_told(bandit_file, m
     monkeypatch.setattr("scb.commands.judge", judged)
     shown = call("train", "--bandit", bandit_file).out
     random = environment_spec("CartPole-v1").random_return()
-    assert f"returns on CartPole-v1: {random:.0f} 100 300" in shown
+    assert f"returns on CartPole-v1: {random:.4g} 100 300" in shown
     assert shown.endswith("(n=3); 1 diverged, counted as random actions\n")
 
 

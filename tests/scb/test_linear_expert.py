@@ -57,14 +57,15 @@ class Breaking(ContinuousCorridor):
 def test_episodes_that_break_down_are_counted_and_not_learned_from(capsys):
     env, config = Breaking(cells=2), replace(SEARCH, generations=4, judge_every=4)
     search_linear_expert(env, TWO_TARGETS, jax.random.key(0), config, quiet=False)
-    first, *_, last = capsys.readouterr().err.splitlines()
+    _, first, *_, last = capsys.readouterr().err.splitlines()
     assert "failed" in first + last and "nan" not in first + last
 
 
 def test_it_says_how_far_it_is(capsys):
     env, config = ContinuousCorridor(cells=2), replace(SEARCH, generations=3, judge_every=2)
     search_linear_expert(env, TWO_TARGETS, jax.random.key(0), config, quiet=False)
-    lines = capsys.readouterr().err.splitlines()
+    before, *lines = capsys.readouterr().err.splitlines()
+    assert before == "generation 1/3: compiling"
     assert [line.split(":")[0] for line in lines] == [f"generation {n}/3" for n in (1, 2, 3)]
     assert ["mean" in line for line in lines] == [False, True, True]
 
