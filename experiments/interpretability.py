@@ -139,6 +139,9 @@ def facts(report: Report) -> dict[str, Any]:
     }
     acrobot, cart = shares["Acrobot-v1"], shares["CartPole-v1"]
     return {
+        "most": max(
+            ((name, x) for name, x in acrobot.items() if "velocity" in name), key=lambda x: x[1]
+        ),
         "angles": max(x for name, x in acrobot.items() if "angle" in name),
         "speeds": min(x for name, x in acrobot.items() if "velocity" in name),
         "position": cart["position (m)"],

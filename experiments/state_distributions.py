@@ -36,7 +36,6 @@ STATES = 2000
 SEED = ILLUSTRATING[1_000]
 BANDIT_COVERAGE, EXPERT_COVERAGE = "bandit's coverage", "expert's coverage"
 OUTSIDE = "contexts off the plane"
-MANY = 0.5  # of the contexts, where the verdict says so
 BANDIT_ROUGHNESS, EXPERT_ROUGHNESS = "bandit's roughness", "expert's roughness"
 
 
@@ -165,7 +164,7 @@ def facts(report: Report) -> dict[str, Any]:
     found = {name: summary(x) for name, x in report["environments"].items()}
     wider = sum(x[BANDIT_COVERAGE] > x[EXPERT_COVERAGE] for x in found.values())
     smoother = sum(x[BANDIT_ROUGHNESS] < x[EXPERT_ROUGHNESS] for x in found.values())
-    return {"found": found, "states": STATES, "many": MANY, "wider": wider, "smoother": smoother}
+    return {"found": found, "states": STATES, "wider": wider, "smoother": smoother}
 
 
 def draw(report: Mapping[str, Any]) -> Figure:

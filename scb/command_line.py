@@ -218,7 +218,7 @@ class Kept:
     """Where agents' returns are kept as they come.
 
     Attributes:
-      out: folder for rows.jsonl and for what is made of them; must be new or empty.
+      out: folder for rows.jsonl and for what is made of them; must be new or empty, but for a suite that was begun.
       resume: a folder that such a command wrote, and was perhaps interrupted; its settings apply, and a
         flag that contradicts them is an error.
     """

@@ -117,7 +117,7 @@ def test_failed_searches_are_worse_than_any():
     found = report(5, none=1000.0, linear=1500.0, step=1500.0)
     found["curves"]["linear"]["0"]["fitness"][-1] = None
     assert outcomes(found) == ["undecided", "holds"]
-    assert "(1 of 5 failed)" in experiment.EXPERIMENT.block("verdict", found)
+    assert "(1 of 5 failed)" in experiment.EXPERIMENT.block("body", found)
     for curve in found["curves"][NONE].values():
         curve["fitness"][-1] = None
     said = experiment.EXPERIMENT.block("verdict", found)

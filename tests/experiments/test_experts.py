@@ -47,7 +47,7 @@ def test_an_expert_is_next_to_the_papers_by_its_whole_interval(report):
         entry["returns"] = [experts.paper(name).value] * 10
     assert {x.outcome for x in experts.EXPERIMENT.judged(changed)} == {"holds"}
     said = experts.EXPERIMENT.block("verdict", changed)
-    assert "next to the paper's, or above, everywhere" in said
+    assert "every expert is next to the paper's or above it." in said
     # Reaching the paper's level with the better end of a wide interval decides nothing.
     changed["environments"]["Acrobot-v1"]["returns"] = [-76.7] * 5 + [-500.0] * 5
     changed["environments"]["Pendulum-v1"]["returns"] = [-300.0] * 10

@@ -47,7 +47,8 @@ def test_claims_follow_the_figures(report):
         x |= share(0.5 if "velocity" in name else 0.01)
     for name in ("position (m)", "angle (rad)"):
         changed["environments"]["CartPole-v1"]["importance"][name] |= share(0.02)
-    assert "50% or more" in interpretability.EXPERIMENT.block("verdict", changed)
+    said = interpretability.EXPERIMENT.block("verdict", changed)
+    assert "causes 50%, its other angular velocity 50%, and no angle more than 1%." in said
     found = [x.outcome for x in interpretability.EXPERIMENT.judged(changed)]
     assert found == ["holds"] * 4 + ["does not hold"]
     # A share whose interval reaches over the tenth is undecided, wherever its point is.

@@ -102,7 +102,7 @@ def test_a_clip_is_chosen_on_seeds_that_report_nothing_and_compared(
     assert {seeds for *_, seeds in sweeps} == {tuple(VALIDATING[:2]), tuple(VALIDATING[2:3])}
     assert rest == [("hopper", clip, judged) for clip in ("ppo", "ppo-0.5")]
     page = (tmp_path / "locomotion.md").read_text()
-    assert "| ppo-0.5 | 2 |" in page and "ppo-0.5 is the tuned one." in page
+    assert "| ppo-0.5 | 2 |" in page and "ppo-0.5 earned most. So few" in page
 
 
 def test_what_was_kept_is_read_as_it_was(tmp_path):
