@@ -69,8 +69,8 @@ class MetaTrainingConfig:
         environment).
       initial_scale: of the drift's random start, so that the search begins near what it corrects.
       drift: the settings of what is learned.
-      evolution: of the candidates. With several tasks `combine` is ranks on the command line where nothing else is said,
-        and should be: their returns have different scales.
+      evolution: of the candidates. With several tasks `combine` should be "ranks", as it is on the command line
+        where nothing else is said: their returns have different scales.
     """
 
     tasks: Annotated[
