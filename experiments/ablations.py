@@ -7,7 +7,7 @@ learned (T the transition, I the initial state, C with a curriculum), the latent
 curriculum's shape. Run folders are under runs/ablations and are resumed.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -159,7 +159,7 @@ def facts(report: Report) -> dict[str, Any]:
 
 
 def draw(report: Mapping[str, Any]) -> Figure:
-    """The paper's panels, and Acrobot's; a line is left out where a search's mean failed."""
+    """The paper's panels, and Acrobot's, of which something moves; a line is left out where a search's mean failed."""
     colors = (
         plotting.BLACK,
         plotting.ORANGE,
@@ -169,29 +169,35 @@ def draw(report: Mapping[str, Any]) -> Figure:
         plotting.PURPLE,
     )
     styles = ("-", "--", "-.", ":", (0, (3, 1, 1, 1)), (0, (5, 1)))
-    figure = Figure(figsize=(plotting.WIDTH, 8.4))
-    panels: Any = figure.subplots(3, len(ENVIRONMENTS))
-    for column, environment in enumerate(ENVIRONMENTS):
-        drawn = rows(environment)
-        for axes, row in zip(
-            panels[:, column], ("what is learned", "latent", "curriculum"), strict=True
-        ):
-            if row not in drawn:
-                axes.axis("off")
-                axes.text(0.5, 0.5, "the paper has\nno curriculum", ha="center")
-                continue
-            for (label, search), color, style in zip(
-                drawn[row].items(), colors, styles, strict=False
-            ):
-                curves = list(report["environments"][environment][search].values())
-                plotting.search_curve(axes, curves, label, color, style)
-            axes.set_title(f"{environment}:\n{row}", fontsize=10)
-            axes.set(xlabel="generation", ylabel="return of agents" if column == 0 else "")
-            axes.legend(fontsize=7, handlelength=1.8)
+    found = {
+        f"{environment}:\n{row}": {
+            label: list(report["environments"][environment][search].values())
+            for label, search in drawn.items()
+        }
+        for environment in ENVIRONMENTS
+        for row, drawn in rows(environment).items()
+    }
+    moving = {title: lines for title, lines in found.items() if _moves(lines.values())}
+    high = -(-len(moving) // 2)
+    figure = Figure(figsize=(plotting.WIDTH, 0.6 + 3.0 * high))
+    panels = figure.subplots(high, 2, squeeze=False).ravel()
+    for axes in panels[len(moving) :]:
+        axes.axis("off")
+    for axes, (title, lines) in zip(panels, moving.items(), strict=False):
+        for (label, curves), color, style in zip(lines.items(), colors, styles, strict=False):
+            plotting.search_curve(axes, curves, label, color, style)
+        axes.set_title(title, fontsize=10)
+        axes.set(xlabel="generation", ylabel="return of agents")
+        axes.legend(fontsize=7, handlelength=1.8)
     plotting.figure_title(
         figure, "Meta-training curves: mean over searches, 95 % interval over searches"
     )
     return figure
+
+
+def _moves(searched: Iterable[Sequence[Mapping[str, Any]]]) -> bool:
+    """Whether not all means of all searches are the same number."""
+    return len({x for curves in searched for c in curves for x in c["fitness"]} - {None}) > 1
 
 
 EXPERIMENT = Experiment.of_the_paper("ablations", measure, draw, claims, facts=facts)

@@ -10,6 +10,7 @@ computed anew, and runs that the report has already stay in it, unless a folder 
 """
 
 import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import accumulate
@@ -19,7 +20,7 @@ from typing import Any
 import numpy as np
 import tyro
 from matplotlib.figure import Figure
-from matplotlib.ticker import EngFormatter, MaxNLocator
+from matplotlib.ticker import EngFormatter
 
 from experiments.harness import Experiment, Save
 from experiments.rendering import plain
@@ -291,8 +292,8 @@ def _end(run: Mapping[str, Any]) -> str:
 
 
 def figure(report: Mapping[str, Any]) -> Figure:
-    """A row an environment: the mean's return against minutes (left) and environment steps (right)."""
-    runs = report["runs"]
+    """A row an environment with a target: the mean's return against minutes (left) and environment steps."""
+    runs = [run for run in report["runs"] if run["target"] is not None]
     environments = list(dict.fromkeys(run["environment"] for run in runs))
     drawn = Figure(figsize=(plotting.WIDTH, 2.4 * len(environments) + 1.2))
     grid = drawn.subplots(len(environments), 2, sharey="row", squeeze=False)
@@ -303,18 +304,25 @@ def figure(report: Mapping[str, Any]) -> Figure:
                 x, y = ([point[i] for point in run["points"]] for i in (column, 3))
                 look = STARTS[run["start"]] | (_ON_GPU if _on_gpu(run) else {})
                 axes.plot(x, y, **look, linewidth=1.1)
-            if of_it[0]["target"] is not None:
-                axes.axhline(of_it[0]["target"], **_TARGET)
+            axes.axhline(of_it[0]["target"], **_TARGET)
             axes.margins(x=0.03, y=0.08)
-            # From zero, so that what a warm start costs before the first point can be seen.
-            right = axes.get_xlim()[1]
-            axes.set_xlim(-0.02 * right, right)
-            axes.xaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 2.5, 5, 10]))
-        row[1].xaxis.set_major_formatter(EngFormatter(sep=""))
+            # A start costs little beside a search from random weights; and what begins at zero has a place too.
+            spent = [point[column] for run in of_it for point in run["points"]]
+            least = min((x for x in spent if x > 0), default=1.0)
+            axes.set_xscale("symlog", linthresh=least)
+            axes.set_xlim(left=0.0)
+            # Minutes span few decades.
+            decades = 10.0 ** np.arange(math.floor(math.log10(least)), math.log10(max(spent)))
+            ticks = np.outer(decades, (1, 2, 5) if column == 1 else (1,)).ravel()
+            axes.set_xticks([0, *ticks[(ticks >= least) & (ticks <= max(spent))]])
+            axes.minorticks_off()
+            if column == 1:
+                axes.xaxis.set_major_formatter("{x:g}")
+            else:
+                axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+            axes.set_xlabel(("minutes", "environment steps (training + evaluation)")[column - 1])
         statistics = " or ".join(dict.fromkeys(run["statistic"] for run in of_it))
         row[0].set(title=environment, ylabel=f"return ({statistics})")
-    grid[-1][0].set_xlabel("minutes")
-    grid[-1][1].set_xlabel("environment steps (training + evaluation)")
     shown = {}
     for start, look in STARTS.items():
         for on_gpu in (False, True):
@@ -323,8 +331,7 @@ def figure(report: Mapping[str, Any]) -> Figure:
             if number:
                 name = f"{start} start{where} ({number} run{'s' if number > 1 else ''})"
                 shown[name] = look | more
-    if any(run["target"] is not None for run in runs):
-        shown["target"] = _TARGET
+    shown["target"] = _TARGET
     plotting.figure_title(
         drawn, "Discovery of a bandit: return of agents trained in the search's mean"
     )

@@ -301,7 +301,7 @@ def leads(curves: "Sequence[LearningCurves]") -> Figure:
             axes.axhline(0.0, color=BLACK, linewidth=1)
             axes.set_title(f"{curve.objective}\n{len(ours)} pairs", fontsize=10, weight="normal")
             axes.xaxis.set_major_formatter(EngFormatter(sep=""))
-            axes.margins(x=0.02)
+            axes.margins(x=0.05)
         panels[0].set_ylabel(f"return less that of {reference.objective}")
         panels[len(panels) // 2].set_xlabel("environment steps")
         figure_title(
