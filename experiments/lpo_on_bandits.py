@@ -180,14 +180,14 @@ def draw(report: Mapping[str, Any]) -> Figure:
             plotting.estimate_curve(
                 panel, x, found, look.color, look.linestyle, label, marker=look.marker
             )
-        for kind, style in (("training", ":"), ("evaluation", "-.")):
-            panels[1].plot(
-                generations[1:] * per[kind],
-                [x.value for x in returns[1:]],
-                linestyle=style,
-                color=look.color,
-                label=f"{source}: {kind}",
-            )
+        # Training takes nearly all.
+        panels[1].plot(
+            generations[1:] * per["evaluation"],
+            [x.value for x in returns[1:]],
+            linestyle=":",
+            color=look.color,
+            label=f"{source}: evaluation alone",
+        )
     titles = ("(i) over generations", "(ii a) over environment steps", "(ii b) over wall-clock")
     labels = ("generation", "environment steps of the search", "minutes of the search")
     for panel, title, label in zip(panels, titles, labels, strict=True):
@@ -202,7 +202,9 @@ def draw(report: Mapping[str, Any]) -> Figure:
     panels[1].xaxis.set_major_formatter(EngFormatter(sep=""))
     panels[0].set_ylabel("return on Pendulum of agents\ntrained with the search's mean")
     below = bottom.subplots(1, len(report["evaluations"]) + 1, squeeze=False)[0]
-    for panel, (name, table) in zip(below, report["evaluations"].items(), strict=False):
+    for panel, letter, (name, table) in zip(
+        below, "abc", report["evaluations"].items(), strict=False
+    ):
         for position, (objective, finals) in enumerate(table["finals"].items()):
             color = plotting.VERMILLION if objective.startswith("LPO") else plotting.BLUE
             pooled = pooled_estimate(finals)
@@ -210,7 +212,7 @@ def draw(report: Mapping[str, Any]) -> Figure:
         panel.set_yticks(range(len(table["finals"])), list(table["finals"]))
         panel.invert_yaxis()
         panel.set_xlabel("final return")
-        panel.set_title(f"(iii) {name}".replace(", ", ",\n", 1), fontsize=9)
+        panel.set_title(f"(iii {letter}) {name}".replace(", ", ",\n", 1), fontsize=9)
     hopper = below[-1]
     for name, curves in on_hopper().items():
         own = {BANDIT: looks["bandit"], ENVIRONMENT: looks["environment"]}
@@ -222,6 +224,9 @@ def draw(report: Mapping[str, Any]) -> Figure:
     hopper.xaxis.set_major_formatter(EngFormatter(sep=""))
     hopper.set(xlabel="environment steps", ylabel="return")
     hopper.set_title("(iv) Hopper, generalized physics,\nobjectives of the zoo", fontsize=9)
+    figure.suptitle(
+        "Objectives learned on the bandit and on Pendulum: the searches, and what they are worth"
+    )
     return figure
 
 
