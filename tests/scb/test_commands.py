@@ -373,9 +373,9 @@ def test_a_synthetic_mdp_is_discovered_and_its_command_asks_for_the_same_again(t
     assert (mdp.config.parameterization, params.max_steps_in_episode) == ("T", 3)
     metadata = json.loads(path.with_suffix(".json").read_text())
     assert (metadata["kind"], metadata["results"]) == ("synthetic_mdp", {})
-    # 2 generations of 4 candidates: 2 agents, turns of 16 steps, episodes of at most 4.
+    # 2 generations of 4 candidates: 2 agents, turns of 16 steps, episodes of at most 2, then 3.
     assert metadata["cost"]["environment_steps_training"] == 2 * 4 * 2 * 16
-    assert metadata["cost"]["environment_steps_evaluation"] == 2 * 4 * 2 * 4
+    assert metadata["cost"]["environment_steps_evaluation"] == 4 * 2 * (2 + 3)
     config = asked_for(*shlex.split(metadata["command"])[2:])
     assert config_dict(config) == metadata["config"]["discovery"]
     assert config.mode_actions and config.fixed_hyperparameters
