@@ -49,13 +49,12 @@ class MetaTrainingConfig:
         transfer (return of the bandit-trained agent in the bandit's evaluation environment).
       agent: PPO's static configuration; None takes `task_agent`'s.
       contexts: that a batch of a bandit holds.
-      horizons: how long inner agents train, as fractions of the setting's number of updates, such as
-        0.25,0.5,1; one is drawn for each generation. None: always in full. A temporally-aware drift
+      horizons: how long inner agents train, as fractions of the setting's number of updates (0.25,0.5,1), of
+        which one is drawn for each generation. None: always in full. A temporally-aware drift
         learns here that the fraction of training done is what matters.
-      hyperparameters: values that inner agents draw PPO's hyperparameters from, such as
-        "learning_rate=0.0003,0.001 policy_output_scale=1,0.01"; the rest are those of the (evaluation)
-        environment's own setting. With one initialisation of the policy alone, an objective learns to
-        make up for its weakness.
+      hyperparameters: values that inner agents draw PPO's hyperparameters from (such as learning_rate=0.001
+        policy_output_scale=1,0.01); the rest are those of the (evaluation) environment's own setting. With one
+        initialisation of the policy alone, an objective learns to make up for its weakness.
       reward_noise: noise on a bandit's reward, in standard deviations of that reward over random
         contexts and actions. Without it the drift overfits the bandit. Environments have noise of
         their own and take none.
