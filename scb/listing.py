@@ -79,7 +79,7 @@ def found(metadata: Mapping[str, Any]) -> str:
     discovery = metadata["config"]["discovery"]
     earlier = metadata["config"].get("started_from")
     if earlier:
-        start = str(earlier["found"])
+        start = str(earlier.get("found", "from a bandit"))  # earlier versions did not write it
     elif discovery["init"] == "random":
         start = "random weights"
     else:
