@@ -31,7 +31,7 @@ from scb.objectives import Objective, programs_for
 from scb.rows import Row, Rows
 
 MODE, SAMPLED = "mode", "sampled"
-DIAGNOSIS = "diagnosis"  # a judge's name, beside the kinds of actions
+_DIAGNOSIS = "diagnosis"  # a judge's name, beside the kinds of actions
 # Steps of a training from which a CPU trains only as many agents at a time as it has devices.
 LONG = 250_000
 
@@ -387,11 +387,11 @@ def _program(
             name: Judge(judge_env, judge_params, episodes, name == MODE) for name in actions
         }
         if diagnose:
-            judges[DIAGNOSIS] = lambda agent, state, key: agent.diagnose(
+            judges[_DIAGNOSIS] = lambda agent, state, key: agent.diagnose(
                 state, hyperparameters, training_params
             )
         _, found = train_and_judge(agent, hyperparameters, key, training_params, judges, every)
-        diagnosis = found.pop(DIAGNOSIS, {})
+        diagnosis = found.pop(_DIAGNOSIS, {})
         return {
             k: (
                 x.returns.mean(-1),

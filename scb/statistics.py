@@ -21,7 +21,7 @@ PERCENTILES = 0.95  # confidence beyond which they are not the resamples'
 DECIDING = 10  # agents; of fewer a bootstrap's interval is too narrow to decide anything
 
 Statistic = Callable[..., NDArray[np.floating]]
-Rows = Callable[[int], NDArray[np.integer]]
+Draw = Callable[[int], NDArray[np.integer]]
 
 
 @dataclass(frozen=True)
@@ -151,7 +151,7 @@ def stratified_estimate(
     ):
         raise UserError("the groups to subtract have other sizes: pair run by run.")
 
-    def mean(rows: Rows) -> NDArray[np.floating]:
+    def mean(rows: Draw) -> NDArray[np.floating]:
         ours = cache(rows) if shared else rows
         theirs = cache(rows) if shared else rows
         found = np.zeros(())
@@ -183,7 +183,7 @@ def pooled_estimate(groups: ArrayLike) -> Estimate:
     """
     runs = _groups("the groups", groups)
 
-    def pooled(rows: Rows) -> NDArray[np.floating]:
+    def pooled(rows: Draw) -> NDArray[np.floating]:
         run, group = rows(runs.shape[1]), rows(len(runs))
         return iqm(runs[group[:, :, None], run[:, None, :]].reshape(len(group), -1), axis=1)
 
@@ -294,7 +294,7 @@ def _check_confidence(confidence: float) -> None:
 
 
 def _bootstrapped(
-    statistic: Callable[[Rows], NDArray[np.floating]],
+    statistic: Callable[[Draw], NDArray[np.floating]],
     sizes: Sequence[int],
     confidence: float,
     num_resamples: int = 10_000,

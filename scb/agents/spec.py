@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from gymnax.environments import spaces
 
 from scb.agents.agent import Agent
-from scb.agents.tables import ACTIVATIONS, TABLES, Lists, Row, Tables, Values
+from scb.agents.tables import ACTIVATIONS, TABLES, Lists, Setting, Tables, Values
 from scb.curriculum import with_limit
 from scb.environments.registry import environment_spec
 from scb.errors import UserError, at_least, one_of
@@ -189,7 +189,7 @@ def has_values_for(algorithm: str, environment: str) -> bool:
     return _own_row(tables_of(algorithm), environment) is not None
 
 
-def _own_row(tables: Tables, environment: str) -> Row | None:
+def _own_row(tables: Tables, environment: str) -> Setting | None:
     rows = tables.environments
     return rows.get(environment) or rows.get(environment_spec(environment).family)
 

@@ -20,7 +20,7 @@ Values: TypeAlias = Mapping[str, Any]
 
 
 @dataclass(frozen=True)
-class Row:
+class Setting:
     """What an algorithm is trained with in an environment itself, and where the values come from.
 
     Attributes:
@@ -48,9 +48,9 @@ class Tables:
 
     algorithm: Algorithm
     lists: Lists
-    general: Row
+    general: Setting
     families: Mapping[str, Values] = field(default_factory=dict)
-    environments: Mapping[str, Row] = field(default_factory=dict)
+    environments: Mapping[str, Setting] = field(default_factory=dict)
     continuous: Lists = field(default_factory=dict)
     by_default: bool = True
 
@@ -153,10 +153,10 @@ _BRAX_OFF_POLICY: Values = {
 }
 
 
-def _experts(name: str, shared: Values, columns: Mapping[str, Sequence[Any]]) -> dict[str, Row]:
+def _experts(name: str, shared: Values, columns: Mapping[str, Sequence[Any]]) -> dict[str, Setting]:
     """{environment: its column of a table of experts}."""
     return {
-        environment: Row(
+        environment: Setting(
             {**shared, **{field: row[i] for field, row in columns.items()}},
             f"Liesen et al. (2024), table of {name.upper()} expert hyperparameters",
         )
@@ -165,7 +165,7 @@ def _experts(name: str, shared: Values, columns: Mapping[str, Sequence[Any]]) ->
 
 
 # 400 to 1000 entries an observation and thousands of steps to a first reward: large batches, few passes.
-_MINATAR_PPO = Row(
+_MINATAR_PPO = Setting(
     {
         "num_envs": 64,
         "num_steps": 32,
@@ -179,7 +179,7 @@ _MINATAR_PPO = Row(
     },
     "usual values for games; annealing the learning rate earned a little more on Asterix, two agents",
 )
-_PENDULUM_PPO = Row(
+_PENDULUM_PPO = Setting(
     {
         "num_envs": 100,
         "num_steps": 100,
@@ -190,7 +190,7 @@ _PENDULUM_PPO = Row(
     },
     "a public tuned setting for Pendulum; network and minibatches as in the inner loop",
 )
-_GENERAL_PPO = Row(
+_GENERAL_PPO = Setting(
     {"num_envs": 10, "num_steps": 100, "total_steps": 100_000, "learning_rate": 1e-3},
     "the inner loop's values, 10 environments, 100 000 steps",
 )
@@ -213,12 +213,12 @@ _MOUNTAIN_CAR_SAC: Values = {
 }
 _HELD = "found on seeds of its own: held random actions, targets that follow quickly"
 _CLASSIC_SAC = {
-    "MountainCar-v0": Row(
+    "MountainCar-v0": Setting(
         {**_MOUNTAIN_CAR_SAC, "target_entropy_ratio": 0.3}, _HELD, episode_limit=1000
     ),
-    "MountainCarContinuous-v0": Row(_MOUNTAIN_CAR_SAC, _HELD),
+    "MountainCarContinuous-v0": Setting(_MOUNTAIN_CAR_SAC, _HELD),
     # With half the steps, or normalised observations, half of the agents never swing up.
-    "Acrobot-v1": Row(
+    "Acrobot-v1": Setting(
         {
             "buffer_size": 50_000,
             "gradient_steps": 4,
@@ -232,7 +232,7 @@ _CLASSIC_SAC = {
 }
 
 
-def _off_policy(**more: Any) -> Row:
+def _off_policy(**more: Any) -> Setting:
     static = {
         "num_envs": 4,
         "gradient_steps": 4,
@@ -244,7 +244,7 @@ def _off_policy(**more: Any) -> Row:
         "learning_rate": 1e-3,
     }
     source = "usual values: one gradient step an environment step, slowly moving targets"
-    return Row({**static, **more}, source)
+    return Setting({**static, **more}, source)
 
 
 _GENERAL_DQN = _off_policy(total_steps=60_000, target_update_every=400, discount=0.99)

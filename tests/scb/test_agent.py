@@ -17,7 +17,7 @@ from scb.agents.normalization import RunningStatistics
 from scb.agents.off_policy import OffPolicyState
 from scb.agents.ppo import PPO, PPOConfig, PPOHyperparameters
 from scb.agents.spec import ALGORITHMS, algorithms_for, bandit_agent, environment_agent
-from scb.agents.tables import Row, Tables
+from scb.agents.tables import Setting, Tables
 from scb.agents.td3 import TD3, TD3Config, TD3Hyperparameters
 from scb.cli import main
 from scb.discovery import BanditDiscovery, DiscoveryConfig
@@ -243,8 +243,8 @@ def constant(monkeypatch):
     tables = Tables(
         algorithm,
         lists={"action": (0.0, 1.0)},
-        general=Row({"total_steps": 5}, "this test"),
-        environments={"CartPole-v1": Row({"total_steps": 7}, "this test")},
+        general=Setting({"total_steps": 5}, "this test"),
+        environments={"CartPole-v1": Setting({"total_steps": 7}, "this test")},
     )
     monkeypatch.setitem(ALGORITHMS, algorithm.name, tables)
 
