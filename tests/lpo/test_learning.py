@@ -13,7 +13,7 @@ from lpo.pipeline import RunAll
 from scb.commands import Discover
 from scb.environments.zoo import bandit_metadata, load_bandit, save_bandit
 from scb.errors import UserError
-from scb.evolution import EvolutionConfig, Outcome
+from scb.evolution import EnvironmentSteps, EvolutionConfig, Outcome
 from scb.runs import Run, config_dict
 
 DRIFT = LearnedDrift(hidden_size=4)
@@ -37,7 +37,7 @@ def learned(monkeypatch, tmp_path):
         def validate(solution):
             return {"fitness": np.full(2, float(solution["output"].sum()))}
 
-        outcome = Outcome(FINAL, BEST, generation, metrics, 1.0, validate)
+        outcome = Outcome(FINAL, BEST, generation, metrics, 1.0, EnvironmentSteps(0, 0), validate)
         monkeypatch.setattr(meta_training, "evolve", lambda *given: outcome)
         run = Run.open(tmp_path / "run", config_dict(config))
         return learn_objective(MetaTraining(config), run, "lpo meta-train")
