@@ -178,12 +178,10 @@ def draw(report: Mapping[str, Any]) -> Figure:
         for row, drawn in rows(environment).items()
     }
     moving = {title: lines for title, lines in found.items() if _moves(lines.values())}
-    high = -(-len(moving) // 2)
-    figure = Figure(figsize=(plotting.WIDTH, 0.6 + 3.0 * high))
-    panels = figure.subplots(high, 2, squeeze=False).ravel()
-    for axes in panels[len(moving) :]:
-        axes.axis("off")
-    for axes, (title, lines) in zip(panels, moving.items(), strict=False):
+    figure = Figure(figsize=(plotting.WIDTH, 0.6 + 3.0 * -(-len(moving) // 2)))
+    for axes, (title, lines) in zip(
+        plotting.panels(figure, len(moving)), moving.items(), strict=True
+    ):
         for (label, curves), color, style in zip(lines.items(), colors, styles, strict=False):
             plotting.search_curve(axes, curves, label, color, style)
         axes.set_title(title, fontsize=10)

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from scb.environments.registry import environment_spec
-from scb.statistics import DECIDING, Estimate, few_groups_difference, iqm, stratified_estimate
+from scb.statistics import DECIDING, Estimate, few_groups_difference, iqm
 
 HOLDS, IN_PART, FAILS, UNDECIDED, UNTESTED = OUTCOMES = (
     "holds",
@@ -95,10 +95,6 @@ def of_searches(
         return partial(few_groups_difference, ours, theirs, paired_groups=paired)
     one, other = (float(np.mean(iqm(x, axis=1))) for x in (ours, theirs))
     return Estimate(one - other, None, None, np.size(ours))
-
-
-# Where every environment is given the same draws, of seeds and of what they draw.
-over_environments = partial(stratified_estimate, shared=True)
 
 
 def judge(claims: Sequence[Claim]) -> list[Judged]:

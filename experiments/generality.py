@@ -276,7 +276,7 @@ def facts(report: Report) -> dict[str, Any]:
 
 def draw(report: Mapping[str, Any]) -> Figure:
     """A panel an environment; right of the dashed line what the paper's inner loop does not have."""
-    looks = {
+    looks: dict[str, dict[str, Any]] = {
         ZOO: {"color": plotting.BLUE, "marker": "o"},
         DRAWN: {"color": plotting.SKY_BLUE, "marker": "s"},
         FIXED: {"color": plotting.GREEN, "marker": "^"},
@@ -284,10 +284,7 @@ def draw(report: Mapping[str, Any]) -> Figure:
     }
     names = list(report["environments"])
     figure = Figure(figsize=(12.0, 3.1 * -(-len(names) // 2)))
-    panels = figure.subplots(-(-len(names) // 2), 2, squeeze=False).ravel()
-    for axes in panels[len(names) :]:
-        axes.axis("off")
-    for axes, name in zip(panels, names, strict=False):
+    for axes, name in zip(plotting.panels(figure, len(names)), names, strict=True):
         entry = report["environments"][name]
         shown = list(columns(entry[ZOO]))
         for i, (source, look) in enumerate(looks.items()):

@@ -20,7 +20,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from experiments.claims import TENTH, Claim, over_environments
+from experiments.claims import TENTH, Claim
 from experiments.harness import Experiment, Report, finite, packed, plan_of, settled, unpacked
 from experiments.parts import InParts, Part
 from lpo.comparison import ppo_spec
@@ -33,7 +33,7 @@ from scb.measurement import Agents, Place, measure
 from scb.plotting import BLUE, VERMILLION, estimate_row, figure_title
 from scb.rows import Rows
 from scb.seeds import REPORTING, VALIDATING
-from scb.statistics import Statistic, normalized_score, worst_decile
+from scb.statistics import Statistic, normalized_score, stratified_estimate, worst_decile
 
 _PLAN = plan_of("robustness")
 REFERENCE = "ppo"
@@ -42,6 +42,8 @@ REFERENCES = (REFERENCE, DRAWN, "dpo")
 FIRST_SEED = REPORTING[12_000]
 FIRST_TO_CHOOSE = VALIDATING[1000]
 STATISTICS: dict[str, Statistic] = {"mean": np.mean, "worst decile": worst_decile}
+# Every environment is given the same draws, of seeds and of what they draw.
+over_environments = partial(stratified_estimate, shared=True)
 
 
 @dataclass(frozen=True)
@@ -101,9 +103,8 @@ def settings_of(environment: str) -> dict[str, dict[str, Any]]:
 
 def in_order(environment: str, keys: Iterable[str]) -> list[str]:
     """Keys of a report, such as "17 of num_epochs 4, num_minibatches 8", by the seeds of their settings."""
-    order = list(settings_of(environment))
-    words = {key: key.partition(" of ")[2] for key in keys}
-    return sorted(words, key=lambda key: order.index(words[key]) if words[key] in order else 99)
+    order = {words: i for i, words in enumerate(settings_of(environment))}
+    return sorted(keys, key=lambda key: order.get(key.partition(" of ")[2], len(order)))
 
 
 def _trained(

@@ -20,7 +20,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from experiments.claims import ENOUGH, FAILS, HOLDS, Claim, judge, of_searches
+from experiments.claims import ENOUGH, FAILS, HOLDS, Claim, confidence, judge, of_searches
 from experiments.harness import Experiment, Report, plan_of, settled
 from experiments.parts import InParts, Keys, Part, lacking
 from experiments.searches import meta_training, objective_of_run
@@ -160,28 +160,27 @@ def facts(report: Report) -> dict[str, Any]:
         "enough": ENOUGH,
         "number": number,
         "places": places,
+        "level": confidence(claims(report)),
     }
 
 
 def draw(report: Mapping[str, Any]) -> Figure:
     """One panel an evaluation, one line an objective: interquartile mean with its interval, each agent a dot."""
-    rows = summary(report)
-    figure = Figure(figsize=(11.0, 1.6 + 0.32 * len(rows)))
+    objectives = report["objectives"]
+    figure = Figure(figsize=(11.0, 1.6 + 0.32 * len(objectives)))
     panels = figure.subplots(1, len(report["evaluations"]), sharey=True, squeeze=False)[0]
     for axes, at in zip(panels, report["evaluations"], strict=True):
         evaluation = at["name"]
-        for position, row in enumerate(rows):
-            if evaluation not in row["in"]:
+        for position, (name, entry) in enumerate(objectives.items()):
+            if evaluation not in entry["returns"]:
                 continue
-            name = row["name"]
             color = BLUE if name in REFERENCES else VERMILLION if name == "default" else GREY
-            returns = report["objectives"][name]["returns"][evaluation]
-            agents = np.concatenate(list(returns.values()))
-            estimate_row(axes, position, agents, row["in"][evaluation], color)
+            returns = list(entry["returns"][evaluation].values())
+            estimate_row(axes, position, np.concatenate(returns), pooled_estimate(returns), color)
         scale = "normalised score" if Evaluation(**at).normalized else "final return"
         axes.set(title=evaluation, xlabel=scale)
         axes.xaxis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10]))
-    panels[0].set_yticks(range(len(rows)), [row["name"] for row in rows])
+    panels[0].set_yticks(range(len(objectives)), list(objectives))
     panels[0].invert_yaxis()
     figure.suptitle("Interquartile mean with its 95 % interval, each agent a dot")
     return figure
@@ -285,7 +284,6 @@ EXPERIMENT = Experiment(
     "transfer_study",
     "What makes an objective carry over from a bandit",
     measure,
-    claims=claims,
     facts=facts,
     draw=draw,
     options=Options,
