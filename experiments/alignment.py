@@ -93,6 +93,11 @@ def recommendation(report: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
+def begun(report: Mapping[str, Any]) -> dict[str, Any]:
+    """The stages that have a regime."""
+    return {name: stage for name, stage in report["stages"].items() if stage["regimes"]}
+
+
 def facts(report: Mapping[str, Any]) -> dict[str, Any]:
     """Every stage's table."""
     tables = {
@@ -103,8 +108,7 @@ def facts(report: Mapping[str, Any]) -> dict[str, Any]:
             ]
             for row in stage["regimes"]
         ]
-        for name, stage in report["stages"].items()
-        if stage["regimes"]
+        for name, stage in begun(report).items()
     }
     return {
         **recommendation(report),
@@ -194,12 +198,8 @@ def measure(options: Options, report: dict[str, Any], save: Save) -> None:
 
 def draw(report: Mapping[str, Any]) -> dict[str, Figure]:
     """A heat map a stage."""
-    found = report["stages"].items()
-    return {
-        figure_name(name): figures.alignment_heatmap(stage)
-        for name, stage in found
-        if stage["regimes"]
-    }
+    found = begun(report).items()
+    return {figure_name(name): figures.alignment_heatmap(stage) for name, stage in found}
 
 
 EXPERIMENT = Experiment(

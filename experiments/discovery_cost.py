@@ -297,9 +297,13 @@ def figure(report: Mapping[str, Any]) -> Figure:
     environments = list(dict.fromkeys(run["environment"] for run in runs))
     drawn = Figure(figsize=(plotting.WIDTH, 2.4 * len(environments) + 1.2))
     grid = drawn.subplots(len(environments), 2, sharey="row", squeeze=False)
+    columns: Any = (
+        (1, "minutes", (1, 2, 5), "{x:g}"),  # which span few decades
+        (2, "environment steps (training + evaluation)", (1,), EngFormatter(sep="")),
+    )
     for row, environment in zip(grid, environments, strict=True):
         of_it = [run for run in runs if run["environment"] == environment]
-        for axes, column in zip(row, (1, 2), strict=True):
+        for axes, (column, xlabel, ticked, formatter) in zip(row, columns, strict=True):
             for run in of_it:
                 x, y = ([point[i] for point in run["points"]] for i in (column, 3))
                 look = STARTS[run["start"]] | (_ON_GPU if _on_gpu(run) else {})
@@ -311,16 +315,12 @@ def figure(report: Mapping[str, Any]) -> Figure:
             least = min((x for x in spent if x > 0), default=1.0)
             axes.set_xscale("symlog", linthresh=least)
             axes.set_xlim(left=0.0)
-            # Minutes span few decades.
             decades = 10.0 ** np.arange(math.floor(math.log10(least)), math.log10(max(spent)))
-            ticks = np.outer(decades, (1, 2, 5) if column == 1 else (1,)).ravel()
+            ticks = np.outer(decades, ticked).ravel()
             axes.set_xticks([0, *ticks[(ticks >= least) & (ticks <= max(spent))]])
             axes.minorticks_off()
-            if column == 1:
-                axes.xaxis.set_major_formatter("{x:g}")
-            else:
-                axes.xaxis.set_major_formatter(EngFormatter(sep=""))
-            axes.set_xlabel(("minutes", "environment steps (training + evaluation)")[column - 1])
+            axes.xaxis.set_major_formatter(formatter)
+            axes.set_xlabel(xlabel)
         statistics = " or ".join(dict.fromkeys(run["statistic"] for run in of_it))
         row[0].set(title=environment, ylabel=f"return ({statistics})")
     shown = {}

@@ -110,10 +110,8 @@ BOTH = "all that have both"
 def brax_scores(entries: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, Estimate]]:
     """{environment: {"ours": score, "published": score}} over all algorithms, on the physics of the paper.
 
-    By most likely actions.
-
-    A score is 0 for random actions and 1 for the best of the agents that the paper trained in the environment itself.
-    `BOTH` is over the environments that have a bandit of either kind.
+    Of most likely actions. A score is 0 for random actions and 1 for the best of the agents that the paper trained in
+    the environment itself. `BOTH` is over the environments that have a bandit of either kind.
     """
     groups: dict[str, dict[str, list[Any]]] = {}
     actions = "mode_actions"

@@ -154,9 +154,8 @@ def _description(value: Any) -> Any:
         return {"class": type(value).__name__, **parts}
     if isinstance(value, Mapping):
         return dict(value)
-    if hasattr(
-        value, "__qualname__"
-    ):  # a function, whose representation is another in every process
+    # A function, whose representation is another in every process.
+    if hasattr(value, "__qualname__"):
         return f"{value.__module__}.{value.__qualname__}"
     array = np.asarray(value)
     if array.dtype == object:
