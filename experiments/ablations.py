@@ -153,6 +153,7 @@ def facts(report: Report) -> dict[str, Any]:
                     "final": searches.final(curves, np.mean),
                     "failing": max(max(c["failed"]) for c in curves.values()) / candidates,
                     "seconds": float(np.mean([c["seconds"] for c in curves.values()])),
+                    "machines": searches.ran_on(curves.values(), report),
                 }
     untold = [x for x in ENVIRONMENTS if _at_the_start(report, x)]
     return {"rows": found, "untold": untold, "enough": ENOUGH}

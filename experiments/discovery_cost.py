@@ -177,7 +177,6 @@ def facts(report: Mapping[str, Any]) -> dict[str, Any]:
     known = {json.dumps(x, sort_keys=True) for run in runs for x in run["machines"]}
     return {
         "machines": list(map(json.loads, sorted(known))),
-        "on": on,
         "differing": differing,
         "shipped": shipped(),
         "starts": starts(runs),
@@ -190,8 +189,9 @@ def starts(runs: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """Of every environment with a target and runs of both starts, the first of each to reach it, by total steps.
 
     Returns:
-      [{"environment", "target", "warm", "random": the run or None, "longest": the random run of most steps, "times":
-      its steps to the target (where it gets there; else all that it took) over those of the warm one}].
+      [{"environment", "target", "warm", "random": the run or None, "longest": the random run of most steps,
+      "whole": whether it was not stopped before its end, "times": the random run's steps to the target (where it gets
+      there; else all that the longest took) over those of the warm one}].
     """
     found = []
     for environment in dict.fromkeys(run["environment"] for run in runs):
@@ -217,21 +217,12 @@ def starts(runs: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
                 "environment": environment,
                 "target": longest["target"],
                 "longest": longest,
+                "whole": longest["planned_generations"] in (None, longest["generations"]),
                 "times": took / fast["reached"]["steps"] if fast else None,
                 **first,
             }
         )
     return found
-
-
-def on(run: Mapping[str, Any]) -> str:
-    """The machines that a run was computed on, in turn: an accelerator, or a number of cores."""
-    return ", ".join(
-        f"{x['cores']} core{'s' if x['cores'] != 1 else ''}"
-        if x["accelerator"] == "none"
-        else x["accelerator"].removeprefix("NVIDIA ").split()[0]
-        for x in run["machines"]
-    )
 
 
 # What a generation's time depends on, but for the machine.

@@ -100,6 +100,16 @@ def computer(machine: Mapping[str, Any]) -> str:
     return f"{machine['cores']} core{'s' * (machine['cores'] != 1)}, {machine['processor']}"
 
 
+def on(machines: Iterable[Mapping[str, Any]]) -> str:
+    """Machines in turn, each by its accelerator or its number of cores: "2 cores, H100"."""
+    return ", ".join(
+        f"{x['cores']} core{'s' * (x['cores'] != 1)}"
+        if x["accelerator"] == "none"
+        else x["accelerator"].removeprefix("NVIDIA ").split()[0]
+        for x in machines
+    )
+
+
 def algorithms(names: Sequence[str], otherwise: str = "all of the paper's algorithms") -> str:
     """Such as "PPO, SAC"; a plan's empty list stands for all."""
     return ", ".join(name.upper() for name in names) or otherwise
@@ -120,6 +130,7 @@ ENVIRONMENT.filters |= {
     "mean_known": mean_known,
     "millions": millions,
     "number": number,
+    "on": on,
     "percent": percent,
     "plain": plain,
     "said": said,

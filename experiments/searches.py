@@ -2,7 +2,7 @@
 
 import json
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from experiments.claims import ENOUGH
+from experiments.harness import Report
 from experiments.rendering import text
 from lpo.commands import MetaTrain
 from lpo.objectives import Objective
@@ -99,9 +100,10 @@ def search(config: DiscoveryConfig, folder: str | Path) -> tuple[BanditDiscovery
 
 
 def searched_curve(config: DiscoveryConfig, folder: str | Path) -> dict[str, Any]:
-    """`curve` of a search, and its "seconds"; searched first where that has not ended yet."""
+    """`curve` of a search, its "seconds" and "machines"; searched first where that has not ended yet."""
     _, outcome = search(config, folder)
-    return {**curve(outcome.metrics), "seconds": round(outcome.seconds, 1)}
+    took = {"seconds": round(outcome.seconds, 1), "machines": machines(Path(folder))}
+    return {**curve(outcome.metrics), **took}
 
 
 def read_log(folder: Path) -> tuple[list[dict[str, Any]], list[float]]:
@@ -113,8 +115,20 @@ def read_log(folder: Path) -> tuple[list[dict[str, Any]], list[float]]:
 
 def machines(folder: Path) -> list[dict[str, Any]]:
     """Where a run folder's generations were computed, in turn; empty where its log is older than that it says so."""
-    found = [line["machine"] for line in _lines(folder / "timing.jsonl") if "machine" in line]
-    return [x for i, x in enumerate(found) if x not in found[:i]]
+    return _each_once(x["machine"] for x in _lines(folder / "timing.jsonl") if "machine" in x)
+
+
+def ran_on(curves: Iterable[Mapping[str, Any]], report: Report) -> list[dict[str, Any]]:
+    """The machines of searches, each once; a search that does not say which ran where the report was made."""
+    return _each_once(x for curve in curves for x in curve.get("machines", [report["machine"]]))
+
+
+def _each_once(found: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
+    once: list[dict[str, Any]] = []
+    for x in found:
+        if x not in once:
+            once.append(x)
+    return once
 
 
 def _lines(path: Path) -> list[dict[str, Any]]:

@@ -40,7 +40,11 @@ def report(seeds=5, **finals):
             for search in ablations.searches_of(environment)
         }
     preset = "quick" if seeds < ENOUGH else "paper"
-    return {"environments": environments, "plan": ablations.EXPERIMENT.presets[preset]}
+    return {
+        "environments": environments,
+        "plan": ablations.EXPERIMENT.presets[preset],
+        "machine": {"cores": 2, "accelerator": "none"},
+    }
 
 
 def test_every_search_of_the_papers_rows_is_there_once():
@@ -152,8 +156,12 @@ def test_searches_that_all_end_near_random_actions_test_no_claim(
 def test_the_page_and_the_figure_show_every_search():
     found = report()
     rows = sum(len(x) for e in ablations.ENVIRONMENTS for x in ablations.rows(e).values())
+    gpu = {"cores": 16, "accelerator": "NVIDIA H100 80GB HBM3"}
+    for curve in found["environments"]["Pendulum-v1"][name_of("T", "normal", NONE)].values():
+        curve["machines"] = [gpu]
     body = ablations.EXPERIMENT.block("body", found)
     assert sum(line.startswith("| ") for line in body.splitlines()) == rows + 2
-    assert "| 3% | 60 |" in body  # 4 of 128 candidates failed
+    assert "| 3% | 60 on 2 cores |" in body  # 4 of 128 candidates failed
+    assert body.count("| 60 on H100 |") == 1
     axes = ablations.draw(found).axes
     assert sum(len(a.lines) for a in axes) == rows
