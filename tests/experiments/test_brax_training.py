@@ -129,10 +129,10 @@ def test_the_uncertainty_of_a_level_is_that_of_its_steps(report):
 
 def test_the_page_and_the_figure_show_bandits_environments_and_the_paper(report):
     body = experiment.EXPERIMENT.block("body", report)
-    assert "| 854 | 2522 |" in body and "Left out" not in body  # the paper's PPO on Hopper
+    assert "| 854 | 2522 |" in body and "left out" not in body  # the paper's PPO on Hopper
     report["left_out"] = ["walker2d (generalized), published"]
     told = experiment.EXPERIMENT.block("body", report)
-    assert "that holds them: walker2d (generalized), published." in told
+    assert "| left out | walker2d (generalized), published: --published" in told
     figure = experiment.draw(report)
     assert len(figure.axes) == 4
     ppo, sac = figure.axes[:2]

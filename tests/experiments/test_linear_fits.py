@@ -65,8 +65,8 @@ def test_searches_are_paired_by_seed_in_whatever_order_they_ended():
 def test_the_page_has_a_row_for_every_expert_and_contexts():
     page = module.EXPERIMENT.page(report(*FIVE))
     assert "| errors | stretched and jittered | 3000 | 1500 [" in page and page.count("| 5 |") == 9
-    assert "hopper: a search has 40 generations" in page and "12 agents of PPO and 4 of" in page
-    assert "Standing still earns 1000." in page
+    assert "| hopper | 40 generations of 64" in page and "12 agents of PPO and 4 of" in page
+    assert "standing still earns 1000 |" in page
     assert "Shown: on hopper, PPO's agents earn more with errors and jitter than with noise" in page
     few = module.EXPERIMENT.page(report(1))
     assert "**Not shown yet: no difference whose interval decides.** *Errors*" in few
