@@ -11,7 +11,7 @@ from typing import Annotated
 
 import tyro
 
-from lpo import figures
+from lpo import search_figures
 from lpo.certificate import certify
 from lpo.distill import DistillConfig, distill
 from lpo.drifts import LearnedDrift, learned_drift
@@ -115,7 +115,7 @@ class MetaTrain(LongRun):
         run = self.open()
         objective = learn_objective(problem, run, self.command)
         if processes.first():
-            curve = figures.meta_training_curve(run.metrics(), self.config)
+            curve = search_figures.meta_training_curve(run.metrics(), self.config)
             plotting.save(curve, run.folder / "figures" / "meta_training.png")
         return objective
 

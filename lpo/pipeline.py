@@ -12,7 +12,7 @@ from typing import Annotated, Any
 import tyro
 from rich.console import Console
 
-from lpo import drift_figures, figures, report
+from lpo import drift_figures, figures, report, search_figures
 from lpo.certificate import certify
 from lpo.commands import MetaTrain
 from lpo.comparison import Comparison, compare, ppo_spec
@@ -215,8 +215,8 @@ def _figures(
 ) -> dict[str, Path]:
     drawn = {}
     if meta:
-        drawn["meta_training"] = figures.meta_training_curve(run.metrics(), config)
-        drawn["environment_steps"] = figures.environment_steps(
+        drawn["meta_training"] = search_figures.meta_training_curve(run.metrics(), config)
+        drawn["environment_steps"] = search_figures.environment_steps(
             meta["steps"], meta["environment_steps"]
         )
     for name, comparison in comparisons.items():

@@ -12,7 +12,7 @@ import pytest
 from matplotlib import pyplot
 from matplotlib.collections import FillBetweenPolyCollection, QuadMesh
 
-from lpo import drift_figures, figures
+from lpo import drift_figures, figures, search_figures
 from lpo.comparison import LearningCurves
 from lpo.inner_loop import MetaTrainingConfig
 from lpo.objectives import Objective, load_objective
@@ -144,7 +144,7 @@ def test_nothing_to_draw_is_refused():
     with pytest.raises(UserError, match="no objectives"):
         drift_figures.drift_and_gradient([])
     with pytest.raises(UserError, match="no generation"):
-        figures.meta_training_curve([], searched())
+        search_figures.meta_training_curve([], searched())
 
 
 def test_an_objective_looks_the_same_whatever_it_is_drawn_with():
@@ -220,7 +220,7 @@ def test_the_final_judgement_of_the_mean_stands_after_the_last_generation():
     metrics = generations(4)
     metrics[-1]["final_mean/fitness"] = 9.0
     config = searched("transfer", population_size=8, mean_evaluations=64)
-    figure = figures.meta_training_curve(metrics, config)
+    figure = search_figures.meta_training_curve(metrics, config)
     judged = line(figure.axes[0], "search distribution's mean (64 agents a point)")
     np.testing.assert_array_equal(judged.get_xdata(), [0, 2, 4])
     np.testing.assert_array_equal(judged.get_ydata(), [0.25, 2.25, 9.0])
@@ -230,7 +230,7 @@ def test_the_final_judgement_of_the_mean_stands_after_the_last_generation():
 
 def test_the_upper_axis_counts_environment_steps():
     # 400 steps in 4 generations: 100 a generation.
-    figure = figures.meta_training_curve(generations(4), searched())
+    figure = search_figures.meta_training_curve(generations(4), searched())
     figure.draw_without_rendering()
     [below] = figure.axes
     [above] = below.child_axes
@@ -238,7 +238,7 @@ def test_the_upper_axis_counts_environment_steps():
 
 
 def test_the_population_is_drawn_as_mean_and_standard_deviation():
-    [axes] = figures.meta_training_curve(generations(3), searched()).axes
+    [axes] = search_figures.meta_training_curve(generations(3), searched()).axes
     np.testing.assert_array_equal(line(axes, "population: mean").get_ydata(), [0, 1, 2])
     [band] = bands(axes)
     at_two = [y for x, y in band.get_paths()[0].vertices if x == 2]
@@ -248,13 +248,13 @@ def test_the_population_is_drawn_as_mean_and_standard_deviation():
 def test_a_judgement_that_was_not_finite_is_left_out():
     metrics = generations(3)
     metrics[0]["mean/fitness"] = None
-    [axes] = figures.meta_training_curve(metrics, searched(mean_evaluations=64)).axes
+    [axes] = search_figures.meta_training_curve(metrics, searched(mean_evaluations=64)).axes
     judged = line(axes, "search distribution's mean (64 agents a point)")
     assert list(judged.get_xdata()) == [2]
 
 
 def test_bars_end_at_the_steps_and_the_ratio_is_written_beside_them():
-    figure = figures.environment_steps(
+    figure = search_figures.environment_steps(
         {"training": 200, "evaluation": 50, "total": 250},
         {"training": 25_000, "evaluation": 50, "total": 25_050},
     )
@@ -285,7 +285,7 @@ def test_the_ratio_says_which_way_it_goes(bandit, environment, text):
 
 def test_no_steps_are_no_bar():
     nothing = {"training": 0, "evaluation": 0, "total": 0}
-    figure = figures.environment_steps(nothing, {"training": 9, "evaluation": 0, "total": 9})
+    figure = search_figures.environment_steps(nothing, {"training": 9, "evaluation": 0, "total": 9})
     assert [bar.get_width() for bar in figure.axes[0].patches[:3]] == [0, 0, 0]
 
 
@@ -293,8 +293,8 @@ def all_figures():
     steps = {"training": 10, "evaluation": 5, "total": 15}
     return [
         figures.learning_curves([curve(), curve("dpo"), curve("a-rather-long-name")]),
-        figures.meta_training_curve(generations(4), searched("area")),
-        figures.environment_steps(steps, steps),
+        search_figures.meta_training_curve(generations(4), searched("area")),
+        search_figures.environment_steps(steps, steps),
         drift_figures.drift_and_gradient([load_objective("ppo"), load_objective("dpo")]),
     ]
 
@@ -342,7 +342,7 @@ def test_a_validated_mean_has_a_scale_of_its_own():
     ]
     metrics[0]["mean/fitness"], metrics[1]["final_mean/fitness"] = -900.0, -300.0
     config = MetaTrainingConfig(tasks=("Synthetic-Pendulum-v1",), validation=True)
-    drawn = figures.meta_training_curve(metrics, config)
+    drawn = search_figures.meta_training_curve(metrics, config)
     fitness, judged = drawn.axes[:2]
     assert judged.get_ylabel() == "of the mean: return on Pendulum-v1"
     assert fitness.get_ylim()[0] > -10.0
