@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from experiments.claims import CONFIDENCE, Claim, Judged, judge, of_agents
+from experiments.claims import CONFIDENCE, HOLDS, Claim, Judged, judge, of_agents
 from experiments.harness import Experiment, Report, packed
 from experiments.parts import InParts, Keys, Part, lacking
 from lpo import figures
@@ -228,14 +228,18 @@ def _since(report: Report, asked: Confirmation) -> tuple[list[int], Estimate] | 
 def facts(report: Report) -> dict[str, Any]:
     """The curves by environment."""
     comparisons = {name: as_comparison(name, entry) for name, entry in looked_at(report).items()}
+    found = confirmed(report)
+    decided = [judged for _, _, judged in found if judged]
     return {
         "comparisons": comparisons,
         "deciding": DECIDING,
         "learned_here": _learned_here(comparisons),
         "confirmations": [
             (asked, ASKED[asked.of], pairs, judged, judged and _since(report, asked))
-            for asked, pairs, judged in confirmed(report)
+            for asked, pairs, judged in found
         ],
+        # What all pairs together may show, and those that were trained to confirm it do not.
+        "unconfirmed": {x.claim.text for x in decided if x.outcome != HOLDS},
         "asked": ASKED,
         "sweeps": {
             name: (sweep, len(entry["sweep"][REFERENCE]), tuned(sweep))

@@ -3,7 +3,8 @@
     python -m experiments lpo_on_bandits --preset quick
 
 (i) Meta-training on the bandit and on Pendulum: what agents trained on Pendulum with the mean of the
-search distribution earn, over generations. (ii) The same over environment steps and over wall-clock.
+search distribution earn, over generations. (ii) The same over environment steps and over wall-clock,
+by a timing of both on one machine, whatever the searches ran on.
 (iii) PPO on Pendulum with its clip, a tuned clip, DPO and the learned objectives, with either
 initialisation of the policy. (iv) Hopper at full size, as `experiments.locomotion` measured it, with an objective of
 the zoo for each of the two. Every search is a run folder under --runs and is
@@ -11,6 +12,7 @@ resumed; what --out holds already is not measured again, so the same command con
 one. `--only-render` makes page and figure from --out.
 """
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
@@ -21,15 +23,17 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, LogLocator, NullFormatter, StrMethodFormatter
 
+from experiments import meta_training_cost
 from experiments.claims import OF_THE_WAY, Claim, of_searches, of_the_way
 from experiments.harness import Experiment, Preset, Report, Save, settled
 from experiments.locomotion import MARGIN, paired
-from experiments.searches import judgements, objective_of_run, read_log
+from experiments.rendering import on
+from experiments.searches import judgements, machines, objective_of_run, ran_on, read_log
 from lpo import figures
 from lpo.comparison import LearningCurves, compare
 from lpo.full_size import full_size
 from lpo.objectives import CLIPS, Objective, load_objective
-from scb import plotting
+from scb import listing, plotting
 from scb.agents.spec import AgentSpec, environment_agent
 from scb.rows import Rows
 from scb.seeds import REPORTING, reporting, validation
@@ -66,8 +70,7 @@ def search_curve(metrics: Sequence[Mapping[str, Any]], seconds: Sequence[float])
 
 def claims(report: Report) -> list[Claim]:
     """Cheaper to learn on the bandit, better than PPO on Pendulum, no worse for it, comparable on Hopper."""
-    plan = [search["settings"] for search in report["searches"].values()]
-    same = all(len({x[size] for x in plan}) == 1 for size in SIZES)
+    same = of_one_size(report)
     times = cheaper(report)
     steps = f"a candidate's agent takes {TWO_ORDERS} times fewer steps on the bandit; here {times:.1f} times"
     found = [Claim(steps, times >= TWO_ORDERS)]
@@ -110,6 +113,12 @@ def _above(returns: Mapping[str, Any], name: str, other: str) -> Callable[..., E
     return found().without_interval() if once and callable(found) else found
 
 
+def of_one_size(report: Report) -> bool:
+    """Whether searches on either had as many generations, candidates and agents."""
+    plan = [search["settings"] for search in report["searches"].values()]
+    return all(len({x[size] for x in plan}) == 1 for size in SIZES)
+
+
 def cheaper(report: Report) -> float:
     """How many times the steps of a candidate's agent are fewer on the bandit."""
     steps = []
@@ -121,6 +130,38 @@ def cheaper(report: Report) -> float:
     return float(steps[1] / steps[0])
 
 
+def timed(report: Report, source: str) -> float:
+    """Seconds of a generation of this size, from the timing of both in turn on one machine."""
+    timing = report["timing"]
+    candidates = report["searches"][source]["settings"]["population_size"]
+    return float(timing[source]["seconds_per_generation"] * candidates / timing["population_size"])
+
+
+def bill(report: Report) -> dict[str, Any]:
+    """What the bandit and a search on either took, and how many searches it takes until the bandit has paid for itself.
+
+    Returns:
+      {"found": the bandit's line of `scb list`, "search": {"bandit", "environment": {"steps", "minutes"}}, "searches":
+      {"steps" of bandit and Pendulum together, "minutes": how many, None where one on the bandit saves nothing}}.
+    """
+    bandit = listing.entry("Synthetic-Pendulum-v1")
+    taken = {}
+    for source in SOURCES:
+        search = report["searches"][source]
+        generations = search["settings"]["generations"]
+        taken[source] = {
+            "steps": search["curves"][0]["steps_per_generation"]["total"] * generations,
+            "minutes": timed(report, source) * generations / 60,
+        }
+    spent = {
+        "steps": bandit["environment_steps"] + bandit["bandit_steps"],
+        "minutes": bandit["minutes"],
+    }
+    saved = {x: taken["environment"][x] - taken["bandit"][x] for x in spent}
+    searches = {x: math.ceil(spent[x] / saved[x]) if saved[x] > 0 else None for x in spent}
+    return {"found": bandit, "search": taken, "searches": searches}
+
+
 def facts(report: Report) -> dict[str, Any]:
     """What a search costs, and the tables' estimates."""
     searches = {
@@ -128,6 +169,8 @@ def facts(report: Report) -> dict[str, Any]:
             **search,
             "per": search["curves"][0]["steps_per_generation"],
             "second": float(np.median([c["seconds_per_generation"] for c in search["curves"]])),
+            "machines": ran_on(search["curves"], report),
+            "timed": timed(report, source),
         }
         for source, search in report["searches"].items()
     }
@@ -148,7 +191,10 @@ def facts(report: Report) -> dict[str, Any]:
         "hopper": on_hopper(),
         "zoo": HOPPER,
         "bandit": BANDIT,
+        "environment": ENVIRONMENT,
+        "same_size": of_one_size(report),
         "times": cheaper(report),
+        "bill": bill(report),
         "seed": REPORTING.start,
     }
 
@@ -167,7 +213,7 @@ def draw(report: Mapping[str, Any]) -> Figure:
         curves, look = search["curves"], looks[source]
         name = f"on the {source} ({len(curves)} searches)"
         per = curves[0]["steps_per_generation"]
-        minutes = float(np.median([c["seconds_per_generation"] for c in curves])) / 60
+        minutes = timed(report, source) / 60
         generations = np.asarray(curves[0]["generations"], float)
         returns = plotting.over_searches([c["returns"] for c in curves])
         # No step is taken and no time passes before generation 0, which a logarithm cannot show.
@@ -189,7 +235,8 @@ def draw(report: Mapping[str, Any]) -> Figure:
             label=f"{source}: evaluation alone",
         )
     titles = ("(i) over generations", "(ii a) over environment steps", "(ii b) over wall-clock")
-    labels = ("generation", "environment steps of the search", "minutes of the search")
+    timed_on = f"minutes of the search (timed on {on([report['machine']])})"
+    labels = ("generation", "environment steps of the search", timed_on)
     for panel, title, label in zip(panels, titles, labels, strict=True):
         panel.set(title=title, xlabel=label)
         panel.legend(fontsize=8)
@@ -231,7 +278,12 @@ def draw(report: Mapping[str, Any]) -> Figure:
 
 
 def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None:
-    """Searches, then agents trained with what they found."""
+    """A timing while nothing else runs, searches, then agents trained with what they found."""
+    if "timing" not in report:
+        timing: dict[str, Any] = {}
+        meta_training_cost.measure(meta_training_cost.Options(**plan["timing"]), timing, save)
+        report["timing"] = timing
+        save()
     runs = Path(plan["runs"]) / report["preset"]
     found = report.setdefault("searches", {})
     evaluations = report.setdefault("evaluations", {})
@@ -253,7 +305,9 @@ def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None
             cost = learned(source, seed).metadata["cost"]
             judging = "environment_steps_judgements"
             entry["steps_to_judge"] = sum(n for name, n in cost.items() if name.startswith(judging))
-            entry["curves"].append(search_curve(*read_log(runs / f"{source}-{seed}")))
+            folder = runs / f"{source}-{seed}"
+            curve = search_curve(*read_log(folder))
+            entry["curves"].append({**curve, "machines": machines(folder)})
             save()
 
     def kept(title: str) -> Rows:
@@ -342,5 +396,5 @@ EXPERIMENT = Experiment.of_the_paper(
     claims,
     facts=facts,
     options=Options,
-    keys=("preset", "searches", "evaluations"),
+    keys=("preset", "timing", "searches", "evaluations"),
 )

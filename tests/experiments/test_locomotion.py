@@ -228,6 +228,25 @@ def test_a_confirmation_is_decided_by_its_own_agents_when_all_are_there(monkeypa
     assert module.confirmed(made) == []
 
 
+def test_what_only_all_pairs_together_show_is_not_said_to_be_shown(monkeypatch):
+    asked = full_size.Confirmation("hopper", "dpo", range(30, 40), "area")
+    monkeypatch.setattr(full_size, "CONFIRMATIONS", (asked,))
+    made = report(40)
+    agents = made["environments"]["hopper"]["agents"]
+    shown, row = (
+        "Shown to earn more over the training: on hopper, dpo",
+        "dpo earns more over the training",
+    )
+    assert shown in module.EXPERIMENT.page(made)
+    for seed in asked.seeds:  # the new pairs are level
+        agents["dpo"][str(seed)] = agents["ppo"][str(seed)]
+    page = module.EXPERIMENT.page(made)
+    assert "Shown to earn more over the training: none" in page
+    assert f"though all pairs together have an interval above: hopper: {row} than PPO." in page
+    (line,) = [x for x in page.splitlines() if x.startswith(f"| hopper: {row}")]
+    assert line.endswith("| holds, not confirmed |")
+
+
 def test_of_a_pending_confirmation_whose_reference_was_known_the_objective_alone_is_left_out(
     monkeypatch,
 ):

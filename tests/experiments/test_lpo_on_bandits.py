@@ -31,6 +31,9 @@ METRICS = [
 ]
 
 
+GPU = {"cores": 16, "processor": "a processor", "accelerator": "NVIDIA H100 80GB HBM3"}
+
+
 def test_a_searchs_curve_is_its_judged_means_and_the_time_of_what_judged_nothing():
     curve = module.search_curve(METRICS, [50.0, 2.0, 9.0, 4.0])
     assert curve["generations"] == [0, 2, 4]
@@ -51,12 +54,12 @@ def report():
                 "population_size": 2,
                 "agents_per_candidate": 1,
             },
-            "curves": [curve] * number,
+            "curves": [curve | ran] * number,
             "steps_to_judge": 1000,
         }
-        for source, environment, number in (
-            ("bandit", "Synthetic-Pendulum-v1", 5),
-            ("environment", "Pendulum-v1", 1),
+        for source, environment, number, ran in (
+            ("bandit", "Synthetic-Pendulum-v1", 5, {}),
+            ("environment", "Pendulum-v1", 1, {"machines": [GPU]}),
         )
     }
     finals = {
@@ -70,6 +73,12 @@ def report():
         "preset": "quick",
         "machine": {"cores": 2, "processor": "a processor", "accelerator": "none"},
         "versions": {"jax": "0.0"},
+        "timing": {
+            "population_size": 4,
+            "bandit": {"seconds_per_generation": 3.0},
+            "environment": {"seconds_per_generation": 60.0},
+            "ratios": {"seconds_per_generation": 20.0},
+        },
         "searches": searches,
         "evaluations": {
             "Pendulum, Flax's initialisation": {
@@ -83,7 +92,14 @@ def report():
 
 def test_the_page_says_costs_returns_and_differences(report):
     page = module.EXPERIMENT.page(report)
-    assert "| Synthetic-Pendulum-v1 | 5 | 4 | 2 x 1 | 100 + 20 | 2.0 | 480 | 1,000 |" in page
+    # Half as many candidates as were timed.
+    bandit = (
+        "| Synthetic-Pendulum-v1 | 5 | 4 | 2 x 1 | 100 + 20 | 2.0 on 2 cores | 1.5 | 480 | 1,000 |"
+    )
+    environment = "| Pendulum-v1 | 1 | 4 | 2 x 1 | 100 + 20 | 2.0 on H100 | 30.0 | 480 | 1,000 |"
+    assert bandit in page and environment in page
+    # No fewer steps here; 48 minutes over 4 generations of 28.5 seconds less.
+    assert "paid for itself: never by steps of both, 26 by minutes." in page
     # (-850 of PPO, -200 of the pooled bandit's objectives.)
     assert "| ppo | −850 [" in page
     assert "| LPO (bandit) | −200 [" in page
@@ -148,10 +164,16 @@ def tiny(monkeypatch):
             ]
         )
 
+    def timing(options, found, save):
+        asked.append(options.population_size)
+        found["timed"] = True
+
+    monkeypatch.setattr(module.meta_training_cost, "measure", timing)
     monkeypatch.setattr(module, "objective_of_run", objective_of_run)
     monkeypatch.setattr(module, "compare", compare)
     plan = {
         "searches": {source: {"seeds": 1, "settings": {"of": source}} for source in module.SOURCES},
+        "timing": {"population_size": 3},
         "agents": 2,
         "tuning_agents": 2,
     }
@@ -165,7 +187,7 @@ def test_what_a_report_has_is_not_measured_again(tiny, tmp_path):
     both = ("LPO (bandit) 0", "LPO (environment) 0")
     compared = ("ppo", "ppo-0.5", "dpo", *both)
     judged = [("Pendulum-v1", scale, *x) for scale in (1.0, 0.01) for x in (module.CLIPS, compared)]
-    assert asked == ["bandit-0", "environment-0", *judged]
+    assert asked == [3, "bandit-0", "environment-0", *judged]  # timed before anything runs
     assert {entry["steps_to_judge"] for entry in report["searches"].values()} == {7}
     table = report["evaluations"]["Pendulum, small last layer"]
     assert table["finals"]["ppo-0.5"] == [[-3.0, -4.0]]
