@@ -34,6 +34,7 @@ from scb.plotting import (
     figure_style,
     figure_title,
     legend_below,
+    panels,
 )
 from scb.statistics import estimate, paired_difference
 
@@ -50,6 +51,7 @@ _LOOKS: dict[str, Look] = {
 _DIAGNOSES = {
     "kl": "KL from the old policy to the new (nats)",
     "outside": "share of ratios outside [0.8, 1.2]",
+    "gain": "mean ratio times advantage (deviations)",
     "value_error": "value error, as a share of the targets' variance",
     "entropy": "entropy of the policy (nats)",
 }
@@ -180,9 +182,9 @@ def diagnosis(curves: "Sequence[LearningCurves]") -> Figure:
     """
     style = looks([curve.objective for curve in curves])
     with figure_style():
-        figure = Figure(figsize=(WIDTH, 6.0))
-        panels = figure.subplots(2, 2, sharex=True)
-        for axes, (name, label) in zip(panels.flat, _DIAGNOSES.items(), strict=True):
+        figure = Figure(figsize=(WIDTH, 8.5))
+        drawn_in = panels(figure, len(_DIAGNOSES))
+        for axes, (name, label) in zip(drawn_in, _DIAGNOSES.items(), strict=True):
             for curve in curves:
                 if not curve.diagnosed:
                     raise UserError(
@@ -197,12 +199,11 @@ def diagnosis(curves: "Sequence[LearningCurves]") -> Figure:
             axes.set_title(label, fontsize=10, weight="normal")
             axes.xaxis.set_major_formatter(EngFormatter(sep=""))
             axes.margins(x=0.02)
-        panels[0, 0].set_yscale("log")
-        for axes in panels[1]:
             axes.set_xlabel("environment steps")
+        drawn_in[0].set_yscale("log")
         number = _number([curve.diagnosed for curve in curves], "agents")
         figure_title(figure, f"What an iteration does to the policy: {_place(curves[0])}, {number}")
-        legend_below(figure, panels[0, 0].get_legend_handles_labels(), columns=4)
+        legend_below(figure, drawn_in[0].get_legend_handles_labels(), columns=4)
     return figure
 
 
