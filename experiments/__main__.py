@@ -94,7 +94,7 @@ def overview(experiments: Sequence[Experiment], data: Path) -> str:
         entry: dict[str, Any] = {"experiment": experiment, "outcome": ""}
         sections.append(entry)
         try:
-            report = harness.read(path)
+            report = harness.read(path, keys=experiment.keys)
         except UserError:
             entry["problem"] = "Its report cannot be read."
             continue

@@ -156,7 +156,11 @@ def facts(report: Report) -> dict[str, Any]:
                     "machines": searches.ran_on(curves.values(), report),
                 }
     untold = [x for x in ENVIRONMENTS if _at_the_start(report, x)]
-    return {"rows": found, "untold": untold, "enough": ENOUGH}
+    all_of_them = (
+        c for x in report["environments"].values() for s in x.values() for c in s.values()
+    )
+    ran = searches.elsewhere(all_of_them, report)
+    return {"rows": found, "untold": untold, "enough": ENOUGH, "elsewhere": ran}
 
 
 def draw(report: Mapping[str, Any]) -> Figure:

@@ -28,13 +28,15 @@ from experiments.claims import OF_THE_WAY, Claim, of_searches, of_the_way
 from experiments.harness import Experiment, Preset, Report, Save, settled
 from experiments.locomotion import MARGIN, paired
 from experiments.rendering import on
-from experiments.searches import judgements, machines, objective_of_run, ran_on, read_log
+from experiments.searches import elsewhere, judgements, machines, objective_of_run, ran_on, read_log
 from lpo import figures
 from lpo.comparison import LearningCurves, compare
 from lpo.full_size import full_size
 from lpo.objectives import CLIPS, Objective, load_objective
 from scb import listing, plotting
 from scb.agents.spec import AgentSpec, environment_agent
+from scb.artefacts import machine_description
+from scb.environments.zoo import bandit_metadata
 from scb.rows import Rows
 from scb.seeds import REPORTING, reporting, validation
 from scb.statistics import Estimate, estimate, iqm, pooled_estimate
@@ -65,6 +67,7 @@ def search_curve(metrics: Sequence[Mapping[str, Any]], seconds: Sequence[float])
             kind: metrics[0][f"steps/{kind}"] for kind in ("training", "evaluation", "total")
         },
         "seconds_per_generation": round(float(np.median(plain)), 3),
+        "minutes": round(sum(seconds) / 60, 2),
     }
 
 
@@ -131,18 +134,20 @@ def cheaper(report: Report) -> float:
 
 
 def timed(report: Report, source: str) -> float:
-    """Seconds of a generation of this size, from the timing of both in turn on one machine."""
-    timing = report["timing"]
-    candidates = report["searches"][source]["settings"]["population_size"]
-    return float(timing[source]["seconds_per_generation"] * candidates / timing["population_size"])
+    """Seconds of a generation of this size, by its steps, from the timing of both in turn on one machine."""
+    timing, curves = report["timing"], report["searches"][source]["curves"]
+    steps = timing[source]["steps_per_candidate"] * timing["population_size"]
+    times = curves[0]["steps_per_generation"]["total"] / steps
+    return float(timing[source]["seconds_per_generation"] * times)
 
 
 def bill(report: Report) -> dict[str, Any]:
     """What the bandit and a search on either took, and how many searches it takes until the bandit has paid for itself.
 
     Returns:
-      {"found": the bandit's line of `scb list`, "search": {"bandit", "environment": {"steps", "minutes"}}, "searches":
-      {"steps" of bandit and Pendulum together, "minutes": how many, None where one on the bandit saves nothing}}.
+      {"found": the bandit's line of `scb list`, "machine": where that was, "search": {"bandit", "environment":
+      {"steps", "minutes"}}, "searches": {"steps" of bandit and Pendulum together, "minutes": how many, None where one
+      on the bandit saves nothing}}.
     """
     bandit = listing.entry("Synthetic-Pendulum-v1")
     taken = {}
@@ -159,7 +164,18 @@ def bill(report: Report) -> dict[str, Any]:
     }
     saved = {x: taken["environment"][x] - taken["bandit"][x] for x in spent}
     searches = {x: math.ceil(spent[x] / saved[x]) if saved[x] > 0 else None for x in spent}
-    return {"found": bandit, "search": taken, "searches": searches}
+    machine = bandit_metadata("Synthetic-Pendulum-v1")["cost"]["machine"]
+    return {"found": bandit, "machine": machine, "search": taken, "searches": searches}
+
+
+def _size(objective: Objective) -> dict[str, int]:
+    """{"candidates", "agents" of each, "generations"} of the search for an objective of the zoo."""
+    config = objective.metadata["config"]["meta_training"]
+    return {
+        "candidates": config["evolution"]["population_size"],
+        "agents": config["agents_per_candidate"],
+        "generations": config["evolution"]["num_generations"],
+    }
 
 
 def facts(report: Report) -> dict[str, Any]:
@@ -195,6 +211,10 @@ def facts(report: Report) -> dict[str, Any]:
         "same_size": of_one_size(report),
         "times": cheaper(report),
         "bill": bill(report),
+        "elsewhere": elsewhere(
+            (c for x in report["searches"].values() for c in x["curves"]), report
+        ),
+        "sizes": {name: _size(load_objective(HOPPER[name])) for name in (BANDIT, ENVIRONMENT)},
         "seed": REPORTING.start,
     }
 
@@ -235,7 +255,7 @@ def draw(report: Mapping[str, Any]) -> Figure:
             label=f"{source}: evaluation alone",
         )
     titles = ("(i) over generations", "(ii a) over environment steps", "(ii b) over wall-clock")
-    timed_on = f"minutes of the search (timed on {on([report['machine']])})"
+    timed_on = f"minutes of the search (timed on {on([report['timing']['machine']])})"
     labels = ("generation", "environment steps of the search", timed_on)
     for panel, title, label in zip(panels, titles, labels, strict=True):
         panel.set(title=title, xlabel=label)
@@ -282,7 +302,7 @@ def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None
     if "timing" not in report:
         timing: dict[str, Any] = {}
         meta_training_cost.measure(meta_training_cost.Options(**plan["timing"]), timing, save)
-        report["timing"] = timing
+        report["timing"] = {**timing, "machine": machine_description()}
         save()
     runs = Path(plan["runs"]) / report["preset"]
     found = report.setdefault("searches", {})

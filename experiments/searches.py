@@ -120,7 +120,13 @@ def machines(folder: Path) -> list[dict[str, Any]]:
 
 def ran_on(curves: Iterable[Mapping[str, Any]], report: Report) -> list[dict[str, Any]]:
     """The machines of searches, each once; a search that does not say which ran where the report was made."""
-    return _each_once(x for curve in curves for x in curve.get("machines", [report["machine"]]))
+    here = [report["machine"]]
+    return _each_once(x for curve in curves for x in curve.get("machines") or here)
+
+
+def elsewhere(curves: Iterable[Mapping[str, Any]], report: Report) -> list[dict[str, Any]]:
+    """Those of them on which the rest of the report was not measured."""
+    return [x for x in ran_on(curves, report) if x != report["machine"]]
 
 
 def _each_once(found: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:

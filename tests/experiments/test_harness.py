@@ -248,6 +248,13 @@ def test_all_experiments_in_one_go_leave_one_page(tmp_path, monkeypatch):
     assert "Its report cannot be read." in (tmp_path / "docs" / "experiments.md").read_text()
 
 
+def test_the_overview_says_so_of_a_report_that_lacks_what_its_page_needs(tmp_path):
+    experiment = replace(counting(), keys=("measured", "added later"))
+    report = {"preset": "quick", "complete": True, "parts": {"a": 1, "b": 1}, "measured": 2}
+    (tmp_path / "counting.json").write_text(json.dumps(report))
+    assert "Its report cannot be read." in everything.overview([experiment], tmp_path)
+
+
 def test_the_quick_presets_in_one_go_keep_a_report_of_the_papers_size(
     tmp_path, monkeypatch, capsys
 ):
