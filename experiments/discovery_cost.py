@@ -13,6 +13,7 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import accumulate
 from pathlib import Path
 from typing import Any
@@ -24,7 +25,7 @@ from matplotlib.ticker import EngFormatter
 
 from experiments.harness import Experiment, Save
 from experiments.rendering import plain
-from experiments.searches import judgements, machines, read_log
+from experiments.searches import each_once, judgements, machines, read_log
 from experiments.zoo_table_page import TARGETS, label, rank
 from scb import listing, plotting
 from scb.environments.registry import environment_spec
@@ -174,9 +175,9 @@ def facts(report: Mapping[str, Any]) -> dict[str, Any]:
             name: list(dict.fromkeys(_setting(x.get(name)) for x in settings)) for name in SETTINGS
         }
         differing[environment] = {name: x for name, x in of_each.items() if len(x) > 1}
-    known = {json.dumps(x, sort_keys=True) for run in runs for x in run["machines"]}
+    known = each_once(x for run in runs for x in run["machines"])
     return {
-        "machines": list(map(json.loads, sorted(known))),
+        "machines": sorted(known, key=partial(json.dumps, sort_keys=True)),
         "differing": differing,
         "shipped": shipped(),
         "starts": starts(runs),

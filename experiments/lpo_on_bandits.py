@@ -67,7 +67,6 @@ def search_curve(metrics: Sequence[Mapping[str, Any]], seconds: Sequence[float])
             kind: metrics[0][f"steps/{kind}"] for kind in ("training", "evaluation", "total")
         },
         "seconds_per_generation": round(float(np.median(plain)), 3),
-        "minutes": round(sum(seconds) / 60, 2),
     }
 
 

@@ -115,13 +115,13 @@ def read_log(folder: Path) -> tuple[list[dict[str, Any]], list[float]]:
 
 def machines(folder: Path) -> list[dict[str, Any]]:
     """Where a run folder's generations were computed, in turn; empty where its log is older than that it says so."""
-    return _each_once(x["machine"] for x in _lines(folder / "timing.jsonl") if "machine" in x)
+    return each_once(x["machine"] for x in _lines(folder / "timing.jsonl") if "machine" in x)
 
 
 def ran_on(curves: Iterable[Mapping[str, Any]], report: Report) -> list[dict[str, Any]]:
     """The machines of searches, each once; a search that does not say which ran where the report was made."""
     here = [report["machine"]]
-    return _each_once(x for curve in curves for x in curve.get("machines") or here)
+    return each_once(x for curve in curves for x in curve.get("machines") or here)
 
 
 def elsewhere(curves: Iterable[Mapping[str, Any]], report: Report) -> list[dict[str, Any]]:
@@ -129,7 +129,8 @@ def elsewhere(curves: Iterable[Mapping[str, Any]], report: Report) -> list[dict[
     return [x for x in ran_on(curves, report) if x != report["machine"]]
 
 
-def _each_once(found: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
+def each_once(found: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Machines, say, each where it comes first."""
     once: list[dict[str, Any]] = []
     for x in found:
         if x not in once:

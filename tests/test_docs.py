@@ -18,6 +18,11 @@ DOCS = ROOT / "docs"
 PAGES = sorted([ROOT / "README.md", *DOCS.glob("*.md")])
 
 
+def prose(page):
+    """A page without its blocks of code."""
+    return re.sub(r"```.*?```", "", page.read_text(), flags=re.S)
+
+
 def anchors(page):
     """What headings of a page are linked by."""
     found = set()
@@ -29,14 +34,19 @@ def anchors(page):
 
 @pytest.mark.parametrize("page", PAGES, ids=[page.stem for page in PAGES])
 def test_no_page_has_a_section_twice(page):
-    text = re.sub(r"```.*?```", "", page.read_text(), flags=re.S)
-    sections = re.findall(r"^## (.*)$", text, re.M)
+    sections = re.findall(r"^## (.*)$", prose(page), re.M)
     assert len(sections) == len(set(sections))
 
 
 @pytest.mark.parametrize("page", PAGES, ids=[page.stem for page in PAGES])
+def test_a_table_stands_apart_from_what_is_before_it(page):
+    # Else Markdown shows its lines as text of the paragraph.
+    assert re.findall(r"^[^|\n].*\n(\|.*)", prose(page), re.M) == []
+
+
+@pytest.mark.parametrize("page", PAGES, ids=[page.stem for page in PAGES])
 def test_every_link_leads_somewhere(page):
-    text = re.sub(r"```.*?```", "", page.read_text(), flags=re.S)
+    text = prose(page)
     for target in re.findall(r"\]\(([^)\s]+)\)", text):
         # The last two are made by `make docs`, which checks links to them.
         if target.startswith(("http://", "https://", "interactive/", "notebooks/")):
