@@ -245,8 +245,8 @@ def test_another_network_is_compared_agent_by_agent():
 def test_the_page_and_the_figure_show_every_kind_of_agent():
     found = report()
     body = generality.EXPERIMENT.block("body", found)
-    lines = body.partition("## CartPole-v1")[2].splitlines()
-    assert sum(line.startswith("| ") for line in lines) == 7 + 2
+    table = body.partition("## CartPole-v1")[2].partition("## ")[0]
+    assert sum(line.startswith("| ") for line in table.splitlines()) == 7 + 2
     assert "| 15 | 0 |\n" in body
     axes = generality.draw(found).axes[0]
     shown = (TOGETHER, WIDE, SWISH, EVOLVED, OPTIMAL)
