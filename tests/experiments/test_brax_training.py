@@ -107,7 +107,21 @@ def test_claims_follow_the_figures(report):
     report["environments"]["hopper (generalized)"]["ppo"] = many
     assert outcomes(report)[0] == ["undecided", "holds"]
     said = experiment.EXPERIMENT.block("verdict", report)
-    assert "takes more than 80 times the steps (hopper" in said and "The other 1 of 2 pairs" in said
+    assert "takes more than 80 times the steps (hopper" in said and "So say 1 of 2 pairs" in said
+    # Of three pairs that decide something the furthest two are named.
+    report["bandits"]["hopper (generalized), more"] = report["bandits"][
+        "hopper (generalized), published"
+    ]
+    spring = report["environments"]["hopper (spring)"]["ppo"]
+    report["environments"]["hopper (spring)"]["ppo"] = {**spring, "returns": spring["returns"] * 5}
+    said = experiment.EXPERIMENT.block("verdict", report)
+    assert (
+        "20 to 60 times the steps (hopper (spring), ours, PPO) at the least, and more than 80"
+        in said
+    )
+    assert "at the most. So say 3 of 3 pairs" in said and "the others" not in said
+    report["environments"]["hopper (spring)"]["ppo"] = spring
+    del report["bandits"]["hopper (generalized), more"]
     report["environments"]["hopper (generalized)"]["ppo"] = curve
     # Of two agents one gets there: the median is not that one's.
     report["environments"]["hopper (spring)"]["ppo"]["returns"][0] = [0.0, 0.0, 0.0]
