@@ -43,6 +43,9 @@ CONFIRMATIONS = (
     Confirmation("hopper", "lpo-pendulum", reporting(40, offset=10), "late", reference_known=True),
     Confirmation("hopper", "ta-lpo", reporting(60, offset=50), "area"),
     Confirmation("hopper", "ta-lpo", reporting(40, offset=110), "early"),
+    Confirmation(
+        "hopper", "lpo-pendulum-ee", reporting(40, offset=10), "area", reference_known=True
+    ),
 )
 
 
