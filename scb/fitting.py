@@ -71,53 +71,75 @@ def fit_bandit(
     key_init, key_reward, key_context = split_key(key, 3)
     weights = bandit.init_weights(key_init)
     target = reward_targets(dataset, construction, bandit.discrete)
-    optimizer = optax.adam(optax.cosine_decay_schedule(5e-3, steps))
-    num_states = dataset.observation.shape[0]
     # An entry that never changes has no scale, and next to none would drown the others: it is left out, and held.
     held = unchanging(dataset.observation)
     scale = jnp.where(held, jnp.inf, dataset.observation.std(axis=0) + 1e-6)
-
-    def reward_loss(reward_weights: Any, index: jax.Array, _: jax.Array) -> jax.Array:
-        params = BanditParams(weights={"initial_state": {}, "reward": reward_weights})
-        predict = jax.vmap(
-            jax.vmap(bandit.mean_reward, in_axes=(None, 0, None)), in_axes=(0, 0, None)
-        )
-        predicted = predict(dataset.observation[index], dataset.action[index], params)
-        return jnp.mean((predicted - target[index]) ** 2)
-
-    def context_loss(state_weights: Any, index: jax.Array, key: jax.Array) -> jax.Array:
-        params = BanditParams(weights={"initial_state": state_weights, "reward": {}})
-        generated, _ = jax.vmap(bandit.reset_env, in_axes=(0, None))(
-            split_key(key, index.shape[0]), params
-        )
-        return energy_distance(generated / scale, dataset.observation[index] / scale)
-
-    @partial(jax.jit, static_argnums=0)
-    def fit(loss: Any, start: Any, key: jax.Array) -> tuple[Any, jax.Array]:
-        def step(carry: Any, key: jax.Array) -> Any:
-            weights, state = carry
-            key_index, key_loss = split_key(key)
-            index = jax.random.randint(key_index, (256,), 0, num_states)
-            value, gradient = jax.value_and_grad(loss)(weights, index, key_loss)
-            updates, state = optimizer.update(gradient, state)
-            return (optax.apply_updates(weights, updates), state), value
-
-        carry = (start, optimizer.init(start))
-        (weights, _), losses = jax.lax.scan(step, carry, split_key(key, steps))
-        return weights, losses[-100:].mean()
-
-    reward, error = fit(reward_loss, weights["reward"], key_reward)
-    context, distance = fit(context_loss, weights["initial_state"], key_context)
+    states = dataset.observation
+    samples = states, dataset.action, target
+    descend = partial(_descend, bandit, steps)
+    reward, error = descend(_reward_loss, weights["reward"], samples, (), key_reward)
+    context, distance = descend(_context_loss, weights["initial_state"], states, scale, key_context)
     last = context["Dense_1"]
     context["Dense_1"] = {
         "kernel": jnp.where(held, 0.0, last["kernel"]),
-        "bias": jnp.where(held, dataset.observation[0], last["bias"]),
+        "bias": jnp.where(held, states[0], last["bias"]),
     }
     report = {
         "reward_r2": float(1.0 - error / jnp.var(target)),
         "energy_distance": float(distance),
     }
     return jax.tree.map(np.asarray, {"initial_state": context, "reward": reward}), report
+
+
+@partial(jax.jit, static_argnums=(0, 1, 2))
+def _descend(
+    bandit: SyntheticBandit,
+    steps: int,
+    loss: Any,
+    start: Any,
+    samples: Any,
+    fixed: Any,
+    key: jax.Array,
+) -> tuple[Any, jax.Array]:
+    """(weights, mean of the last losses) after Adam on minibatches of the samples, [S, ...] each.
+
+    Data are arguments, not constants of the program, so that a program is compiled once for all datasets of a size.
+    """
+    optimizer = optax.adam(optax.cosine_decay_schedule(5e-3, steps))
+    num_states = jax.tree.leaves(samples)[0].shape[0]
+
+    def step(carry: Any, key: jax.Array) -> Any:
+        weights, state = carry
+        key_index, key_loss = split_key(key)
+        index = jax.random.randint(key_index, (256,), 0, num_states)
+        batch = jax.tree.map(lambda x: x[index], samples)
+        value, gradient = jax.value_and_grad(loss)(weights, bandit, batch, fixed, key_loss)
+        updates, state = optimizer.update(gradient, state)
+        return (optax.apply_updates(weights, updates), state), value
+
+    carry = (start, optimizer.init(start))
+    (weights, _), losses = jax.lax.scan(step, carry, split_key(key, steps))
+    return weights, losses[-100:].mean()
+
+
+def _reward_loss(
+    weights: Any, bandit: SyntheticBandit, batch: Any, _fixed: tuple[()], _key: jax.Array
+) -> jax.Array:
+    """[] squared error over states, [B, O], actions, [B, K, ...], and what their reward should be, [B, K]."""
+    states, actions, target = batch
+    params = BanditParams(weights={"initial_state": {}, "reward": weights})
+    predict = jax.vmap(jax.vmap(bandit.mean_reward, in_axes=(None, 0, None)), in_axes=(0, 0, None))
+    return jnp.mean((predict(states, actions, params) - target) ** 2)
+
+
+def _context_loss(
+    weights: Any, bandit: SyntheticBandit, states: jax.Array, scale: jax.Array, key: jax.Array
+) -> jax.Array:
+    """[] energy distance of as many contexts to states, [B, O], each entry in units of `scale`, [O]."""
+    params = BanditParams(weights={"initial_state": weights, "reward": {}})
+    keys = split_key(key, states.shape[0])
+    generated, _ = jax.vmap(bandit.reset_env, in_axes=(0, None))(keys, params)
+    return energy_distance(generated / scale, states / scale)
 
 
 def check_linear(construction: str) -> None:

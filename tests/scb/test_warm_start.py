@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from gymnax.environments import spaces
 
-from scb import warm_start
+from scb import fitting, warm_start
 from scb.agents.dqn import DQNConfig
 from scb.agents.ppo import PPOConfig, PPOHyperparameters
 from scb.agents.spec import ALGORITHMS, AgentSpec, environment_agent
@@ -443,6 +443,17 @@ def test_an_entry_that_never_changes_leaves_the_others_theirs(bandit_dataset):
     np.testing.assert_allclose(contexts.mean(axis=0), at, atol=0.3)
     np.testing.assert_allclose(contexts.std(axis=0), spread, atol=0.3)
     np.testing.assert_allclose(contexts[:, 1], 9.81, rtol=1e-6)
+
+
+def test_another_dataset_of_the_size_needs_no_new_program(fitted, bandit_dataset, monkeypatch):
+    def traced_again(*_):
+        raise AssertionError("the program is made anew")
+
+    monkeypatch.setattr(fitting, "energy_distance", traced_again)
+    bandit, _, before = fitted
+    other = bandit_dataset._replace(observation=bandit_dataset.observation[::-1])
+    _, report = fit_bandit(bandit, other, jax.random.key(3), "q", 1000)
+    assert report["reward_r2"] != before["reward_r2"]
 
 
 def test_the_fitted_weights_are_a_bandits(fitted):
