@@ -26,7 +26,7 @@ from lpo import figures
 from lpo.comparison import Comparison, LearningCurves, compare, ppo_spec
 from lpo.full_size import REFERENCE, Confirmation, as_comparison, looked_at, with_pairs
 from lpo.objectives import CLIPS, learned_in, load_objective, zoo_names
-from scb.errors import at_least
+from scb.errors import at_least, unused
 from scb.files import plain
 from scb.rows import Rows
 from scb.seeds import reporting, validation
@@ -64,24 +64,34 @@ class Options:
     """agents that are trained side by side, and saved when all of them have ended"""
     tuning_agents: int = 0
     """of each of some clips, on seeds that report nothing: the best clip is compared as well"""
+    validated: tuple[str, ...] = ()
+    """objectives that are trained on those seeds as well, for a bandit's ranking to be held against"""
     runs: Path = Path("runs/locomotion")
     """for agents until they are saved"""
 
     def __post_init__(self) -> None:
         at_least(1, self, "seeds", "together")
         at_least(0, self, "tuning_agents")
+        if not self.tuning_agents:
+            unused(
+                self,
+                "no agents are trained on seeds that report nothing",
+                ("validated",),
+                "give tuning_agents",
+            )
 
 
 def parts(options: Options, report: dict[str, Any]) -> Iterator[Part]:
     """The choice of a clip, then a few seeds of every objective at a time: all have as many wherever it ends."""
     objectives = tuple(dict.fromkeys((REFERENCE, *options.objectives)))
-    for name in objectives:
+    for name in (*objectives, *options.validated):
         load_objective(name)  # that nobody waits for a name that is none
     for environment in options.environments:
         names = objectives
         if options.tuning_agents:
             seeds = validation(options.tuning_agents)
-            yield from _of(environment, CLIPS, seeds, options, report, "sweep")
+            judged = tuple(dict.fromkeys((*CLIPS, *options.validated)))
+            yield from _of(environment, judged, seeds, options, report, "sweep")
             best = tuned(swept(report.get("environments", {}).get(environment, {})))
             names = (*names, best) if best and best not in names else names
         yield from _of(environment, names, reporting(options.seeds), options, report, "agents")

@@ -134,7 +134,7 @@ def _clips(*clips: float) -> list[Objective]:
 def _dpo(*parameters: tuple[float, float]) -> list[Objective]:
     key = root_key(0)
     return [
-        Objective(f"dpo ({alpha:g}, {beta:g})", DPODrift(), DPODrift(alpha, beta).init(key))
+        Objective(f"dpo-{alpha:g}-{beta:g}", DPODrift(), DPODrift(alpha, beta).init(key))
         for alpha, beta in parameters
     ]
 

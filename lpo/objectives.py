@@ -21,7 +21,9 @@ KIND = "drift"
 KNOWN: dict[str, Drift] = {"ppo": ClipDrift(), "dpo": DPODrift(), "none": NoDrift()}
 CLIPS = ("ppo-0.1", "ppo", "ppo-0.3", "ppo-0.5", "ppo-1")  # among which a tuned one is looked for
 _ZOO = Path(__file__).parent / "zoo"
-_CLIP_NAME = re.compile(r"ppo-(\d*\.?\d+)$")
+_NUMBER = r"(\d*\.?\d+)"
+_CLIP_NAME = re.compile(f"ppo-{_NUMBER}$")
+_DPO_NAME = re.compile(f"dpo-{_NUMBER}-{_NUMBER}$")
 
 
 @dataclass(frozen=True)
@@ -63,17 +65,20 @@ def zoo_names() -> list[str]:
 
 
 def load_objective(name: str | Path) -> Objective:
-    """An objective by name ("ppo", "ppo-0.3", "dpo", "none", a zoo name) or file (path.npz).
+    """An objective by name ("ppo", "ppo-0.3", "dpo", "dpo-4-1.2", "none", a zoo name) or file (path.npz).
+
+    The number after PPO is its clip, those after DPO its alpha and beta.
 
     Raises:
       UserError: unknown name (with near matches), or a file that is no learned objective.
     """
     text = str(name)
-    clip = _CLIP_NAME.match(text)
     if text in KNOWN:
         return closed_form(text, KNOWN[text])
-    if clip:
+    if clip := _CLIP_NAME.match(text):
         return closed_form(text, ClipDrift(float(clip.group(1))))
+    if constants := _DPO_NAME.match(text):
+        return closed_form(text, DPODrift(*map(float, constants.groups())))
     return _from_file(artefacts.named(text, _ZOO, "objective", tuple(KNOWN)))
 
 

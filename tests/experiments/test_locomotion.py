@@ -105,6 +105,21 @@ def test_a_clip_is_chosen_on_seeds_that_report_nothing_and_compared(
     assert "| ppo-0.5 | 2 |" in page and "ppo-0.5 earned most. So few" in page
 
 
+def test_further_objectives_are_trained_on_seeds_that_report_nothing(tmp_path, compared):
+    asked, _ = compared
+    flags = ["--objectives", "ppo", "--seeds", "1", "--tuning-agents", "1", "--out"]
+    further = ["--validated", "none", "dpo-4-1.2"]
+    out = tmp_path / "report.json"
+    assert module.EXPERIMENT.main([*flags, str(out), *further]) == 0
+    validating = [(name, seeds) for _, name, seeds in asked if seeds == (VALIDATING[0],)]
+    assert {name for name, _ in validating} == {*module.CLIPS, "none", "dpo-4-1.2"}
+    entry = json.loads(out.read_text())["environments"]["hopper"]
+    assert set(module.swept(entry)) == set(module.CLIPS)
+    assert "dpo-4-1.2" not in (tmp_path / "locomotion.md").read_text()
+    with pytest.raises(UserError, match=r"validated is .*give tuning_agents"):
+        module.Options(validated=("none",))
+
+
 def test_what_was_kept_is_read_as_it_was(tmp_path):
     made = curves("ppo", range(3))
     entry = {"backend": "generalized", "steps": STEPS, "episodes": 20}

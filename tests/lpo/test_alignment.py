@@ -149,7 +149,7 @@ def test_a_regime_changes_what_it_names_and_keeps_the_settings_own():
 
 def test_the_family_is_ppo_dpo_and_none_each_with_its_own_parameters():
     family = {objective.name: objective for objective in known_drifts()}
-    assert {"ppo-0.2", "ppo-1", "none", "dpo (2, 0.6)", "dpo (4, 1.2)"} <= set(family)
+    assert {"ppo-0.2", "ppo-1", "none", "dpo-2-0.6", "dpo-4-1.2"} <= set(family)
     log_ratio, advantage = jnp.full(1, 0.5), jnp.ones(1)
 
     def charge(name):
@@ -159,7 +159,7 @@ def test_the_family_is_ppo_dpo_and_none_each_with_its_own_parameters():
     # r = 1.649: a clip of 0.2 charges r - 1.2, one of 1 and none nothing.
     assert charge("ppo-0.2") == pytest.approx(np.exp(0.5) - 1.2, rel=1e-5)
     assert charge("ppo-1") == charge("none") == 0.0
-    assert charge("dpo (1, 0.3)") > charge("dpo (4, 1.2)") > 0.0
+    assert charge("dpo-1-0.3") > charge("dpo-4-1.2") > 0.0
 
 
 def test_what_confirms_the_choice_did_not_choose():
@@ -262,7 +262,7 @@ def test_regimes_that_differ_in_traced_numbers_share_a_program_and_nothing_else(
 
 @pytest.mark.slow
 def test_the_report_holds_every_regime_and_is_drawn(monkeypatch, tmp_path):
-    fixed = returns(**{"ppo-0.2": 1.0, "none": 2.0, "dpo (2, 0.6)": 3.0})
+    fixed = returns(**{"ppo-0.2": 1.0, "none": 2.0, "dpo-2-0.6": 3.0})
     family = [objective for objective in known_drifts() if objective.name in fixed]
     curves = [SimpleNamespace(objective=n, final=x) for n, x in fixed.items()]
     found = SimpleNamespace(curves=curves)

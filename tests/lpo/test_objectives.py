@@ -72,10 +72,18 @@ def test_closed_forms_load_by_name():
     assert load_objective("ppo-0.3").drift == ClipDrift(0.3)
     assert float(load_objective("ppo-0.3").parameters) == pytest.approx(0.3)
     assert load_objective("dpo").drift == DPODrift(alpha=2.0, beta=0.6)
+    assert load_objective("dpo-4-1.2").drift == DPODrift(alpha=4.0, beta=1.2)
+    assert load_objective("dpo-1-.5").drift == DPODrift(alpha=1.0, beta=0.5)
     assert load_objective("none").drift == NoDrift()
 
 
-@pytest.mark.parametrize("name", ["ppo", "ppo-0.3", "dpo", "none"])
+@pytest.mark.parametrize("name", ["dpo-4", "dpo-4-1.2-1", "dpo-0-0.6", "dpo-1--2"])
+def test_what_is_no_pair_of_positive_constants_is_no_dpo(name):
+    with pytest.raises(UserError, match=r"dpo|positive"):
+        load_objective(name)
+
+
+@pytest.mark.parametrize("name", ["ppo", "ppo-0.3", "dpo", "dpo-4-1.2", "none"])
 def test_an_objective_bears_the_name_that_it_was_loaded_by(name):
     assert load_objective(name).name == name
 
