@@ -125,17 +125,13 @@ def other_drifts() -> list[Objective]:
     return [*_clips(0.03, 0.07, 0.15, 0.25, 0.4, 0.7), *_dpo(*between)]
 
 
-# Objectives of one drift with other parameters share a program.
 def _clips(*clips: float) -> list[Objective]:
-    key = root_key(0)
-    return [Objective(f"ppo-{clip:g}", ClipDrift(), ClipDrift(clip).init(key)) for clip in clips]
+    return [closed_form(f"ppo-{clip:g}", ClipDrift(clip)) for clip in clips]
 
 
 def _dpo(*parameters: tuple[float, float]) -> list[Objective]:
-    key = root_key(0)
     return [
-        Objective(f"dpo-{alpha:g}-{beta:g}", DPODrift(), DPODrift(alpha, beta).init(key))
-        for alpha, beta in parameters
+        closed_form(f"dpo-{alpha:g}-{beta:g}", DPODrift(alpha, beta)) for alpha, beta in parameters
     ]
 
 

@@ -32,7 +32,7 @@ class Objective:
 
     Attributes:
       name: as on the command line; a file's is its own, or of the objective.npz of a run its folder's.
-      drift: the family, passed to `PPO(env, config, drift)`.
+      drift: the family, passed to `PPO(env, config, drift)`; its settings do not count where parameters say the same.
       parameters: traced, passed as `PPOHyperparameters.drift`.
       metadata: of a learned objective, what its artefact says.
     """
@@ -94,10 +94,7 @@ def check_names(objectives: Sequence[Objective]) -> None:
 
 def same_drift(one: Objective, other: Objective) -> bool:
     """Whether two objectives differ in nothing but their names, as "ppo" and "ppo-0.2" do."""
-    first, second = one.drift, other.drift
-    # Parameters say all that the settings of these do.
-    of_parameters = type(first) is type(second) and isinstance(first, ClipDrift | DPODrift)
-    return (first == second or of_parameters) and all(
+    return one.drift == other.drift and all(
         jax.tree.leaves(jax.tree.map(jnp.array_equal, one.parameters, other.parameters))
     )
 
@@ -132,7 +129,12 @@ def run_name(file: Path) -> str:
 
 def closed_form(name: str, drift: Drift) -> Objective:
     """The objective of a drift whose parameters its settings say: none of them is random."""
-    return Objective(name, drift, drift.init(root_key(0)))
+    return Objective(name, _family(drift), drift.init(root_key(0)))
+
+
+def _family(drift: Drift) -> Drift:
+    """The drift with default settings where parameters say all that settings do: one program then trains all such."""
+    return type(drift)() if isinstance(drift, ClipDrift | DPODrift) else drift
 
 
 def _from_file(path: Path) -> Objective:
@@ -147,7 +149,7 @@ def _from_file(path: Path) -> Objective:
         raise UserError(
             f"{path} holds other numbers than the expression in its .json: fetch or save both again."
         )
-    return Objective(run_name(path.resolve()), drift, parameters, artefact.metadata)
+    return Objective(run_name(path.resolve()), _family(drift), parameters, artefact.metadata)
 
 
 def save_objective(
