@@ -14,6 +14,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.stats import rankdata
 
 from lpo.comparison import compare, ppo_spec
 from lpo.drifts import ClipDrift, DPODrift, Drift, NoDrift
@@ -264,18 +265,23 @@ def alignment(fitness: Mapping[str, np.ndarray], outcome: Mapping[str, np.ndarra
     names = list(outcome)
     generator = np.random.default_rng(0)
 
-    # The measured numbers first, then resamples of them: {objective: [1 + RESAMPLES, runs]}.
-    fit: dict[str, list[np.ndarray]] = {n: [fitness[n]] for n in names}
-    ends: dict[str, list[np.ndarray]] = {n: [outcome[n]] for n in names}
-    for _ in range(RESAMPLES):
-        for samples in (fit, ends):
-            for rows in samples.values():
-                rows.append(rows[0][generator.integers(0, len(rows[0]), len(rows[0]))])
-    means = np.stack([np.mean(fit[n], axis=1) for n in names], axis=1)
-    iqms = np.stack([iqm(ends[n], axis=1) for n in names], axis=1)
-    correlation, *resampled = (spearman(*pair) for pair in zip(means, iqms, strict=True))
-    low, high = np.percentile([x or 0.0 for x in resampled], [2.5, 97.5])
-    return Alignment(correlation, float(low), float(high))
+    def with_resamples(values: np.ndarray) -> np.ndarray:
+        """[1 + RESAMPLES, S]: the measured numbers first, then draws from them."""
+        drawn = generator.integers(0, len(values), (RESAMPLES, len(values)))
+        return np.concatenate([values[None], values[drawn]])
+
+    means = np.stack([np.mean(with_resamples(fitness[n]), axis=1) for n in names], axis=1)
+    iqms = np.stack([iqm(with_resamples(outcome[n]), axis=1) for n in names], axis=1)
+    low, high = np.percentile(_rank_correlations(means[1:], iqms[1:]), [2.5, 97.5])
+    return Alignment(spearman(means[0], iqms[0]), float(low), float(high))
+
+
+def _rank_correlations(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """[R] Spearman's, of the rows of two [R, N] arrays; 0 where it is undefined."""
+    first, second = (rankdata(x, axis=1) - (x.shape[1] + 1) / 2 for x in (a, b))
+    spread = np.sqrt(np.sum(first**2, axis=1) * np.sum(second**2, axis=1))
+    products = np.sum(first * second, axis=1)
+    return np.divide(products, spread, out=np.zeros_like(products), where=spread > 0)
 
 
 def measure_alignment(

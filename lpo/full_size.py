@@ -55,6 +55,15 @@ def full_size(environment: str) -> Comparison | None:
     return None if found is None else as_comparison(environment, found)
 
 
+def validated(environment: str) -> dict[str, LearningCurves]:
+    """{objective: curves of agents that report nothing}, at the same number of steps; {} where there are none."""
+    entry = _kept()["environments"].get(environment, {})
+    if not entry.get("sweep"):
+        return {}
+    curves = as_comparison(environment, {**entry, "agents": entry["sweep"]}).curves
+    return {curve.objective: curve for curve in curves}
+
+
 def with_pairs(report: Mapping[str, Any]) -> Iterator[tuple[Confirmation, list[str]]]:
     """Every confirmation of what a report has agents of, and its seeds of which both agents are there."""
     for asked in CONFIRMATIONS:

@@ -1,0 +1,220 @@
+"""Which bandit ranks objectives as an environment of Brax does, at the paper's full number of steps?
+
+    python -m experiments locomotion_alignment
+
+What agents earn in the environment is known from `python -m experiments locomotion --validated`, on seeds that report
+nothing. Here each of the objectives trains agents in a few regimes of bandits, and Spearman's correlation between what
+they earn there and in the environment says how well a regime ranks them. With more agents of further objectives in the
+environment the same command measures those in the bandits too.
+"""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from experiments.harness import Experiment, Report, bandit_of, packed, settled, unpacked
+from experiments.parts import InParts, Keys, Part, lacking
+from lpo.alignment import Alignment, Regime, alignment, correlation_text, regime_fitness
+from lpo.fitness import FITNESSES, LABELS
+from lpo.full_size import validated
+from lpo.objectives import load_objective
+from scb import plotting
+from scb.environments.registry import environment_spec
+from scb.errors import UserError, at_least
+from scb.statistics import iqm
+
+BACKEND = "generalized"
+PENDULUM = "Pendulum-v1"
+FIRST_SEED = 700  # as where Pendulum's regimes are confirmed: no search sees them, and nothing is reported on them
+# One thing changed at a time; what is not said is the default's of a search for an objective.
+REGIMES: dict[str, dict[str, Any]] = {
+    "its own": {},
+    "its own, without noise": {"reward_noise": 0.0},
+    "its own, noise of 10": {"reward_noise": 10.0},
+    "its own, a tenth of the batches": {"iterations": 512},
+    "Pendulum's": {"bandit": environment_spec(PENDULUM).bandit},
+    "Pendulum's, without noise": {
+        "bandit": environment_spec(PENDULUM).bandit,
+        "reward_noise": 0.0,
+    },
+}
+# Of the agents in the environment; their end is a moment, and these are levels.
+OUTCOMES = {"area": "over the training", "late": "over the last quarter"}
+KINDS = {
+    "PPO's clips, and none": plotting.GREY,
+    "DPO": plotting.BLUE,
+    "learned": plotting.VERMILLION,
+}
+FITNESS = FITNESSES["return"].label  # what a search for an objective judges candidates by
+
+
+@dataclass(frozen=True)
+class Options:
+    """Where, and how many agents train in a bandit."""
+
+    environments: tuple[str, ...] = ("hopper",)
+    """of Brax, with agents that report nothing"""
+    agents: int = 8
+    """in every regime, of each objective"""
+
+    def __post_init__(self) -> None:
+        at_least(2, self, "agents")  # a single one has no interval
+
+
+def regime(environment: str, name: str) -> Regime:
+    """One of `REGIMES`, for an environment."""
+    own: dict[str, Any] = {"bandit": environment_spec(environment).bandit}
+    return Regime(**(own | REGIMES[name]))
+
+
+def parts(options: Options, report: dict[str, Any]) -> Iterator[Part]:
+    """A regime at a time, with the objectives that it lacks."""
+    settled(report, agents=options.agents, first_seed=FIRST_SEED)
+    for environment in options.environments:
+        objectives = validated(environment)
+        if len(objectives) < 3:
+            raise UserError(
+                f"on {environment} {len(objectives)} objectives have agents that report nothing, and fewer than 3 rank "
+                f"nothing: python -m experiments locomotion --environments {environment} --tuning-agents 4 trains some."
+            )
+        for name in REGIMES:
+            of_it = regime(environment, name)
+            _, digest = bandit_of(environment_spec(of_it.bandit).evaluation_environment)
+            path = ("environments", environment, name)
+            places: dict[Keys, str] = {
+                ("fitness", objective): objective for objective in objectives
+            }
+            left = lacking(report, path, places)
+            yield Part(
+                path, partial(_trained, of_it, digest, list(left.values()), options), tuple(left)
+            )
+
+
+def _trained(of_it: Regime, digest: str, names: list[str], options: Options) -> dict[str, Any]:
+    seeds = list(range(FIRST_SEED, FIRST_SEED + options.agents))
+    found = regime_fitness(of_it, [load_objective(name) for name in names], seeds, BACKEND)
+    return {
+        "sha256": digest,
+        "fitness": {
+            name: dict(zip(LABELS, packed(found[name][label] for label in LABELS), strict=True))
+            for name in names
+        },
+    }
+
+
+def fitness(entry: Mapping[str, Any], label: str) -> dict[str, NDArray[np.floating]]:
+    """{objective: [S]} what agents earned in a regime."""
+    return {name: unpacked([of_it[label]])[0] for name, of_it in entry["fitness"].items()}
+
+
+def aligned(report: Report) -> dict[str, dict[str, dict[str, dict[str, Alignment]]]]:
+    """{environment: {outcome: {regime: {fitness: alignment}}}} of the regimes that have every objective."""
+    found: dict[str, Any] = {}
+    for environment, regimes in report["environments"].items():
+        curves = validated(environment)
+        for outcome in OUTCOMES:
+            earned = {name: getattr(curve, outcome) for name, curve in curves.items()}
+            found.setdefault(environment, {})[outcome] = {
+                name: {label: alignment(fitness(entry, label), earned) for label in LABELS}
+                for name, entry in regimes.items()
+                if entry["fitness"].keys() == curves.keys()
+            }
+    return found
+
+
+def kind(objective: str) -> str:
+    """The one of `KINDS` that an objective is of."""
+    clips, dpo, learned = KINDS
+    return {"none": clips, "ppo": clips, "dpo": dpo}.get(objective.split("-")[0], learned)
+
+
+def facts(report: Report) -> dict[str, Any]:
+    """The correlations as tables, regimes from the best on, and what the objectives earned in the environments."""
+    found = aligned(report)
+    earned = {
+        environment: {
+            name: {of: float(iqm(getattr(curve, of))) for of in OUTCOMES} | {"n": len(curve.seeds)}
+            for name, curve in validated(environment).items()
+        }
+        for environment in found
+    }
+    tables = {
+        environment: {
+            outcome: {
+                name: [_text(row[label]) for label in LABELS] for name, row in regimes.items()
+            }
+            for outcome, regimes in of.items()
+        }
+        for environment, of in found.items()
+    }
+    # By what a search judges candidates by, against the whole training.
+    ranked = {
+        environment: sorted(
+            ((name, row[FITNESS]) for name, row in of["area"].items()),
+            key=lambda pair: pair[1].spearman or 0.0,
+            reverse=True,
+        )
+        for environment, of in found.items()
+    }
+    return {
+        "tables": tables,
+        "best": {
+            environment: (pairs[0][0], _text(pairs[0][1]), len(pairs))
+            for environment, pairs in ranked.items()
+            if pairs
+        },
+        "shown": {
+            environment: [name for name, x in pairs if x.low > 0.0]
+            for environment, pairs in ranked.items()
+        },
+        "earned": earned,
+        "labels": LABELS,
+        "judged_by": FITNESS,
+        "outcomes": OUTCOMES,
+    }
+
+
+def _text(found: Alignment) -> str:
+    return correlation_text(asdict(found)).replace("-", "\N{MINUS SIGN}")
+
+
+def draw(report: Mapping[str, Any]) -> dict[str, Figure]:
+    """Of each environment, a panel a regime: an objective's return there against that in the environment."""
+    drawn = {}
+    for environment, regimes in report["environments"].items():
+        curves = validated(environment)
+        figure = Figure(figsize=(8, 2.9 * -(-len(regimes) // 2) + 0.8))
+        for axes, (name, entry) in zip(
+            plotting.panels(figure, len(regimes)), regimes.items(), strict=True
+        ):
+            for objective, earned in fitness(entry, FITNESS).items():
+                x, y = earned.mean(), float(iqm(curves[objective].area))
+                axes.plot([x], [y], "o", color=KINDS[kind(objective)])
+                axes.annotate(objective, (x, y), (3, 3), textcoords="offset points", fontsize=6)
+            axes.margins(x=0.2, y=0.1)  # room for the names
+            axes.set_title(f"bandit: {name}")
+            axes.set_xlabel("return in the bandit")
+            axes.set_ylabel(f"return on {environment}")
+        dot = {"marker": "o", "linestyle": ""}
+        plotting.legend_of(figure, {name: {"color": x, **dot} for name, x in KINDS.items()}, 3)
+        plotting.figure_title(
+            figure, f"Objectives in bandits, and on {environment} over the training"
+        )
+        drawn[f"locomotion_alignment_{environment}"] = figure
+    return drawn
+
+
+EXPERIMENT = Experiment(
+    "locomotion_alignment",
+    "Which bandit ranks objectives as Hopper does?",
+    InParts(parts),
+    facts=facts,
+    draw=draw,
+    options=Options,
+    keys=("environments",),
+)

@@ -1,0 +1,104 @@
+"""Regimes of bandits are held against what objectives earn in an environment of Brax."""
+
+import json
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from experiments import locomotion_alignment as module
+from lpo.fitness import LABELS
+from scb.plotting import BLUE, GREY, VERMILLION
+
+EARNED = {"ppo": 3.0, "ppo-0.1": 1.0, "dpo": 4.0, "lpo-pendulum": 2.0}
+
+
+def curve(level):
+    agents = level + np.linspace(-0.1, 0.1, 4)
+    return SimpleNamespace(area=agents, late=-agents, seeds=range(4))
+
+
+@pytest.fixture
+def environment(monkeypatch):
+    """Objectives with agents in it: the levels over the training, and the reverse over the last quarter."""
+    known = {name: curve(level) for name, level in EARNED.items()}
+    monkeypatch.setattr(module, "validated", lambda name: known if name == "hopper" else {})
+    return known
+
+
+@pytest.fixture
+def trained(monkeypatch):
+    """What regimes were asked for; the environment's own rank as it does, the others the other way round."""
+    asked = []
+
+    def fitness(regime, objectives, seeds, backend):
+        asked.append((regime, [o.name for o in objectives], seeds, backend))
+        sign = 1 if regime.bandit == "Synthetic-hopper" else -1
+        return {
+            o.name: {
+                label: sign * EARNED.get(o.name, 9.0) + np.linspace(-0.1, 0.1, len(seeds))
+                for label in LABELS
+            }
+            for o in objectives
+        }
+
+    monkeypatch.setattr(module, "regime_fitness", fitness)
+    return asked
+
+
+def run(folder, *flags):
+    out = folder / "report.json"
+    assert module.EXPERIMENT.main([*flags, "--out", str(out)]) == 0
+    return json.loads(out.read_text()), (folder / "locomotion_alignment.md").read_text()
+
+
+def test_a_regime_that_ranks_as_the_environment_is_told_from_one_that_does_not(
+    tmp_path, environment, trained
+):
+    report, page = run(tmp_path)
+    found = module.aligned(report)["hopper"]
+    for outcome, sign in (("area", 1), ("late", -1)):
+        assert found[outcome]["its own"][module.FITNESS].spearman == pytest.approx(sign)
+        assert found[outcome]["Pendulum's"][module.FITNESS].spearman == pytest.approx(-sign)
+    assert "Of 6 regimes 4 are shown to rank 4 objectives" in page
+    assert "its own, a tenth of the batches" in page.split("\n")[2]
+    assert "| dpo | 4 | 4 | \N{MINUS SIGN}4 |" in page
+    regimes = [regime for regime, *_ in trained]
+    assert [r.reward_noise for r in regimes] == [5.0, 0.0, 10.0, 5.0, 5.0, 0.0]
+    assert all(x[1:] == (list(EARNED), list(range(700, 708)), "generalized") for x in trained)
+
+
+def test_only_objectives_that_are_new_in_the_environment_are_measured(
+    tmp_path, environment, trained
+):
+    run(tmp_path)
+    before = len(trained)
+    environment["none"] = curve(0.0)
+    report, page = run(tmp_path)
+    assert [names for _, names, *_ in trained[before:]] == [["none"]] * len(module.REGIMES)
+    # Where it was trained it earns most, and in the environment least.
+    assert module.aligned(report)["hopper"]["area"]["its own"][module.FITNESS].spearman == 0.0
+    assert "rank 5 objectives" in page
+
+
+def test_a_regime_that_lacks_an_objective_is_not_in_the_table(tmp_path, environment, trained):
+    report, _ = run(tmp_path)
+    del report["environments"]["hopper"]["its own"]["fitness"]["dpo"]
+    assert "its own" not in module.aligned(report)["hopper"]["area"]
+    assert "Pendulum's" in module.aligned(report)["hopper"]["area"]
+
+
+def test_an_environment_without_agents_says_what_trains_some(
+    tmp_path, environment, trained, capsys
+):
+    flags = ["--environments", "swimmer", "--out", str(tmp_path / "report.json")]
+    assert module.EXPERIMENT.main(flags) != 0
+    said = capsys.readouterr().err
+    assert "on swimmer 0 objectives have agents" in said
+    assert "--environments swimmer --tuning-agents 4" in said and not trained
+
+
+def test_objectives_are_drawn_by_their_kind():
+    kinds = ("ppo", "ppo-0.3", "none", "dpo", "dpo-4-1.2", "lpo-pendulum", "ta-lpo")
+    colors = [module.KINDS[module.kind(name)] for name in kinds]
+    assert colors == [GREY] * 3 + [BLUE] * 2 + [VERMILLION] * 2
