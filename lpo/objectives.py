@@ -79,6 +79,11 @@ def load_objective(name: str | Path) -> Objective:
         return closed_form(text, ClipDrift(float(clip.group(1))))
     if constants := _DPO_NAME.match(text):
         return closed_form(text, DPODrift(*map(float, constants.groups())))
+    if text.startswith(("ppo-", "dpo-")) and not (text.endswith(".npz") or Path(text).exists()):
+        raise UserError(
+            f"objective {text!r} is no clip of PPO, such as ppo-0.3, and no alpha and beta of DPO, such as dpo-4-1.2: "
+            "give one of these, or ppo or dpo alone."
+        )
     return _from_file(artefacts.named(text, _ZOO, "objective", tuple(KNOWN)))
 
 

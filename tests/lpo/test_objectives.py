@@ -80,9 +80,17 @@ def test_closed_forms_load_by_name():
     assert load_objective("none").drift == NoDrift()
 
 
-@pytest.mark.parametrize("name", ["dpo-4", "dpo-4-1.2-1", "dpo-0-0.6", "dpo-1--2"])
-def test_what_is_no_pair_of_positive_constants_is_no_dpo(name):
-    with pytest.raises(UserError, match=r"dpo|positive"):
+@pytest.mark.parametrize("name", ["dpo-4", "dpo-4-1.2-1", "dpo-1--2", "ppo-x", "ppo-"])
+def test_a_name_without_its_constants_says_what_they_are(name):
+    with pytest.raises(UserError, match=r"ppo-0\.3.*dpo-4-1\.2"):
+        load_objective(name)
+
+
+@pytest.mark.parametrize(
+    ("name", "wrong"), [("dpo-0-0.6", "alpha"), ("dpo-2-0", "beta"), ("ppo-0", "clip")]
+)
+def test_constants_are_positive(name, wrong):
+    with pytest.raises(UserError, match=f"{wrong} is 0.0: it must be positive"):
         load_objective(name)
 
 
