@@ -35,7 +35,6 @@ FIRST_SEED = 700  # as where Pendulum's regimes are confirmed: no search sees th
 REGIMES: dict[str, dict[str, Any]] = {
     "its own": {},
     "its own, without noise": {"reward_noise": 0.0},
-    "its own, noise of 10": {"reward_noise": 10.0},
     "its own, a tenth of the batches": {"iterations": 512},
     "Pendulum's": {"bandit": environment_spec(PENDULUM).bandit},
     "Pendulum's, without noise": {
