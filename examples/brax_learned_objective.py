@@ -84,8 +84,8 @@ def main(
     """Train Brax's PPO with an objective, and print the return along the training.
 
     Args:
-      objective: ppo, ppo-0.3, dpo, a name of the zoo (lpo-pendulum) or path/to/objective.npz; one that changes
-        with the training is refused.
+      objective: ppo, ppo-0.3, dpo, dpo-4-1.2, a name of the zoo (lpo-pendulum) or path/to/objective.npz; one that
+        changes with the training is refused.
       environment: of Brax.
       backend: its physics: generalized, positional or spring.
       steps: of the training.

@@ -25,7 +25,7 @@ class Args:
     """Train PPO with an objective of choice, then evaluate its most likely actions.
 
     Attributes:
-      objective: ppo, ppo-0.3, dpo, none, a name of the zoo (lpo-pendulum) or path/to/objective.npz.
+      objective: ppo, ppo-0.3, dpo, dpo-4-1.2, none, a name of the zoo (lpo-pendulum) or path/to/objective.npz.
       env_id: a Gymnasium environment with flat observations and continuous actions.
       seed: of networks, environments and actions.
       total_steps: environment steps, rounded up to whole batches.

@@ -171,7 +171,7 @@ def main(
     """Train PPO with an objective, then judge each agent by the most likely actions of 100 episodes.
 
     Args:
-      objective: ppo, ppo-0.3, dpo, a name of the zoo (lpo-pendulum) or path/to/objective.npz.
+      objective: ppo, ppo-0.3, dpo, dpo-4-1.2, a name of the zoo (lpo-pendulum) or path/to/objective.npz.
       agents: that train side by side.
       steps: of each agent's training.
       seed: of all of them.

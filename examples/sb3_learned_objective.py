@@ -63,7 +63,7 @@ def main(
     """Train PPO with an objective, then evaluate it. Hyperparameters are those of SB3's zoo for Pendulum, but for gSDE.
 
     Args:
-      objective: ppo, ppo-0.3, dpo, a name of the zoo (lpo-pendulum) or path/to/objective.npz.
+      objective: ppo, ppo-0.3, dpo, dpo-4-1.2, a name of the zoo (lpo-pendulum) or path/to/objective.npz.
       environment: of Gymnasium.
       steps: of the training.
       seed: of the agent.

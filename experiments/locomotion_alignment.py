@@ -2,10 +2,10 @@
 
     python -m experiments locomotion_alignment
 
-What agents earn in the environment is known from `python -m experiments locomotion --validated`, on seeds that report
-nothing. Here each of the objectives trains agents in a few regimes of bandits, and Spearman's correlation between what
-they earn there and in the environment says how well a regime ranks them. With more agents of further objectives in the
-environment the same command measures those in the bandits too.
+What agents earn in the environment is known from agents of `python -m experiments locomotion --tuning-agents 4
+--validated NAMES`, on seeds that report nothing. Here each of the objectives trains agents in a few regimes of bandits;
+Spearman's correlation between what they earn there and in the environment says how well a regime ranks them. With
+agents of further objectives in the environment the same command measures those in the bandits too.
 """
 
 from collections.abc import Iterator, Mapping
@@ -17,9 +17,11 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from experiments.alignment import CONFIRMATION_SEED
 from experiments.harness import Experiment, Report, bandit_of, packed, settled, unpacked
 from experiments.parts import InParts, Keys, Part, lacking
 from lpo.alignment import Alignment, Regime, alignment, correlation_text, regime_fitness
+from lpo.comparison import LearningCurves
 from lpo.fitness import FITNESSES, LABELS
 from lpo.full_size import validated
 from lpo.objectives import load_objective
@@ -30,7 +32,7 @@ from scb.statistics import iqm
 
 BACKEND = "generalized"
 PENDULUM = "Pendulum-v1"
-FIRST_SEED = 700  # as where Pendulum's regimes are confirmed: no search sees them, and nothing is reported on them
+FIRST_SEED = CONFIRMATION_SEED  # on which no regime was chosen
 # One thing changed at a time; what is not said is the default's of a search for an objective.
 REGIMES: dict[str, dict[str, Any]] = {
     "its own": {},
@@ -85,6 +87,11 @@ def parts(options: Options, report: dict[str, Any]) -> Iterator[Part]:
             of_it = regime(environment, name)
             _, digest = bandit_of(environment_spec(of_it.bandit).evaluation_environment)
             path = ("environments", environment, name)
+            regimes = report.get("environments", {}).get(environment, {})
+            if (
+                regimes.get(name, {}).get("sha256", digest) != digest
+            ):  # the zoo has another bandit now
+                del regimes[name]
             places: dict[Keys, str] = {
                 ("fitness", objective): objective for objective in objectives
             }
@@ -111,17 +118,30 @@ def fitness(entry: Mapping[str, Any], label: str) -> dict[str, NDArray[np.floati
     return {name: unpacked([of_it[label]])[0] for name, of_it in entry["fitness"].items()}
 
 
+def ranked(environment: str, regimes: Mapping[str, Any]) -> dict[str, LearningCurves]:
+    """{objective: its agents in the environment} of those that every regime has."""
+    return {
+        name: curve
+        for name, curve in validated(environment).items()
+        if all(name in entry["fitness"] for entry in regimes.values())
+    }
+
+
 def aligned(report: Report) -> dict[str, dict[str, dict[str, dict[str, Alignment]]]]:
-    """{environment: {outcome: {regime: {fitness: alignment}}}} of the regimes that have every objective."""
+    """{environment: {outcome: {regime: {fitness: alignment}}}} over the objectives that all have, three at least."""
     found: dict[str, Any] = {}
     for environment, regimes in report["environments"].items():
-        curves = validated(environment)
+        curves = ranked(environment, regimes)
+        if len(curves) < 3:
+            continue
         for outcome in OUTCOMES:
             earned = {name: getattr(curve, outcome) for name, curve in curves.items()}
             found.setdefault(environment, {})[outcome] = {
-                name: {label: alignment(fitness(entry, label), earned) for label in LABELS}
+                name: {
+                    label: alignment({x: fitness(entry, label)[x] for x in curves}, earned)
+                    for label in LABELS
+                }
                 for name, entry in regimes.items()
-                if entry["fitness"].keys() == curves.keys()
             }
     return found
 
@@ -138,7 +158,7 @@ def facts(report: Report) -> dict[str, Any]:
     earned = {
         environment: {
             name: {of: float(iqm(getattr(curve, of))) for of in OUTCOMES} | {"n": len(curve.seeds)}
-            for name, curve in validated(environment).items()
+            for name, curve in ranked(environment, report["environments"][environment]).items()
         }
         for environment in found
     }
@@ -152,7 +172,7 @@ def facts(report: Report) -> dict[str, Any]:
         for environment, of in found.items()
     }
     # By what a search judges candidates by, against the whole training.
-    ranked = {
+    in_order = {
         environment: sorted(
             ((name, row[FITNESS]) for name, row in of["area"].items()),
             key=lambda pair: pair[1].spearman or 0.0,
@@ -164,12 +184,12 @@ def facts(report: Report) -> dict[str, Any]:
         "tables": tables,
         "best": {
             environment: (pairs[0][0], _text(pairs[0][1]), len(pairs))
-            for environment, pairs in ranked.items()
+            for environment, pairs in in_order.items()
             if pairs
         },
         "shown": {
             environment: [name for name, x in pairs if x.low > 0.0]
-            for environment, pairs in ranked.items()
+            for environment, pairs in in_order.items()
         },
         "earned": earned,
         "labels": LABELS,
@@ -186,13 +206,14 @@ def draw(report: Mapping[str, Any]) -> dict[str, Figure]:
     """Of each environment, a panel a regime: an objective's return there against that in the environment."""
     drawn = {}
     for environment, regimes in report["environments"].items():
-        curves = validated(environment)
+        curves = ranked(environment, regimes)
         figure = Figure(figsize=(8, 2.9 * -(-len(regimes) // 2) + 0.8))
         for axes, (name, entry) in zip(
             plotting.panels(figure, len(regimes)), regimes.items(), strict=True
         ):
-            for objective, earned in fitness(entry, FITNESS).items():
-                x, y = earned.mean(), float(iqm(curves[objective].area))
+            earned = fitness(entry, FITNESS)
+            for objective, curve in curves.items():
+                x, y = earned[objective].mean(), float(iqm(curve.area))
                 axes.plot([x], [y], "o", color=KINDS[kind(objective)])
                 axes.annotate(objective, (x, y), (3, 3), textcoords="offset points", fontsize=6)
             axes.margins(x=0.2, y=0.1)  # room for the names

@@ -14,7 +14,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.stats import rankdata
 
 from lpo.comparison import compare, ppo_spec
 from lpo.drifts import ClipDrift, DPODrift, Drift, NoDrift
@@ -33,7 +32,7 @@ from scb.measurement import Judge, check_seeds, train_and_judge
 from scb.objectives import families
 from scb.rows import Rows
 from scb.runs import Stopwatch
-from scb.statistics import iqm, spearman
+from scb.statistics import iqm, rank_correlations, spearman
 
 RESAMPLES = 1000
 
@@ -272,16 +271,8 @@ def alignment(fitness: Mapping[str, np.ndarray], outcome: Mapping[str, np.ndarra
 
     means = np.stack([np.mean(with_resamples(fitness[n]), axis=1) for n in names], axis=1)
     iqms = np.stack([iqm(with_resamples(outcome[n]), axis=1) for n in names], axis=1)
-    low, high = np.percentile(_rank_correlations(means[1:], iqms[1:]), [2.5, 97.5])
+    low, high = np.percentile(rank_correlations(means[1:], iqms[1:]), [2.5, 97.5])
     return Alignment(spearman(means[0], iqms[0]), float(low), float(high))
-
-
-def _rank_correlations(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """[R] Spearman's, of the rows of two [R, N] arrays; 0 where it is undefined."""
-    first, second = (rankdata(x, axis=1) - (x.shape[1] + 1) / 2 for x in (a, b))
-    spread = np.sqrt(np.sum(first**2, axis=1) * np.sum(second**2, axis=1))
-    products = np.sum(first * second, axis=1)
-    return np.divide(products, spread, out=np.zeros_like(products), where=spread > 0)
 
 
 def measure_alignment(

@@ -178,7 +178,7 @@ def certify_command(objective: tyro.conf.Positional[str]) -> None:
     slope and kink. Exits with 1 where a condition fails, or where the kink may hold a policy still.
 
     Args:
-      objective: ppo, ppo-0.3, dpo, none, a zoo name, or path.npz.
+      objective: ppo, ppo-0.3, dpo, dpo-4-1.2, none, a zoo name, or path.npz.
     """
     loaded = load_objective(objective)
     certificate = certify(loaded.drift, loaded.parameters)

@@ -69,12 +69,12 @@ def looks(names: Sequence[str]) -> dict[str, Look]:
     """{objective: its look}, the same in every figure.
 
     "ppo", "dpo" and "none" have their own, the first other name is taken for the learned one.
-    Further names ("ppo-0.3", a second learned objective) take the remaining colours in turn.
+    Further names ("ppo-0.3", "dpo-4-1.2", a second learned objective) take the remaining colours in turn.
     """
     chosen = {name: _LOOKS[name] for name in names if name in _LOOKS}
     others = [name for name in dict.fromkeys(names) if name not in _LOOKS]
-    # A clip by value is a variant of PPO, and must not take the learned objective's look.
-    learned = [name for name in others if not name.startswith("ppo-")]
+    # Constants by value make a variant of PPO or DPO, which must not take the learned objective's look.
+    learned = [name for name in others if not name.startswith(("ppo-", "dpo-"))]
     if learned:
         chosen[learned[0]] = _LEARNED
     further = [name for name in others if name not in chosen]

@@ -1,4 +1,4 @@
-"""Learning curves of full-size trainings that ship with the library, for a short run to be seen beside.
+"""Learning curves of full-size trainings that ship with the library, for a short run or a bandit to be held against.
 
 `python -m experiments locomotion` measures them and writes measured/locomotion.json.
 """

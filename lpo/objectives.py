@@ -20,6 +20,7 @@ from scb.keys import root_key
 KIND = "drift"
 KNOWN: dict[str, Drift] = {"ppo": ClipDrift(), "dpo": DPODrift(), "none": NoDrift()}
 CLIPS = ("ppo-0.1", "ppo", "ppo-0.3", "ppo-0.5", "ppo-1")  # among which a tuned one is looked for
+_SUGGESTED = (*KNOWN, *CLIPS, "dpo-4-1.2")  # to who mistypes a name
 _ZOO = Path(__file__).parent / "zoo"
 _NUMBER = r"(\d*\.?\d+)"
 _CLIP_NAME = re.compile(f"ppo-{_NUMBER}$")
@@ -32,7 +33,8 @@ class Objective:
 
     Attributes:
       name: as on the command line; a file's is its own, or of the objective.npz of a run its folder's.
-      drift: the family, passed to `PPO(env, config, drift)`; its settings do not count where parameters say the same.
+      drift: the family, passed to `PPO(env, config, drift)`; of a clip or DPO it has the default settings, and the
+        parameters say which it is.
       parameters: traced, passed as `PPOHyperparameters.drift`.
       metadata: of a learned objective, what its artefact says.
     """
@@ -79,12 +81,7 @@ def load_objective(name: str | Path) -> Objective:
         return closed_form(text, ClipDrift(float(clip.group(1))))
     if constants := _DPO_NAME.match(text):
         return closed_form(text, DPODrift(*map(float, constants.groups())))
-    if text.startswith(("ppo-", "dpo-")) and not (text.endswith(".npz") or Path(text).exists()):
-        raise UserError(
-            f"objective {text!r} is no clip of PPO, such as ppo-0.3, and no alpha and beta of DPO, such as dpo-4-1.2: "
-            "give one of these, or ppo or dpo alone."
-        )
-    return _from_file(artefacts.named(text, _ZOO, "objective", tuple(KNOWN)))
+    return _from_file(artefacts.named(text, _ZOO, "objective", _SUGGESTED))
 
 
 def check_names(objectives: Sequence[Objective]) -> None:

@@ -103,7 +103,7 @@ def _descend(
 ) -> tuple[Any, jax.Array]:
     """(weights, mean of the last losses) after Adam on minibatches of the samples, [S, ...] each.
 
-    Data are arguments, not constants of the program, so that a program is compiled once for all datasets of a size.
+    Data are arguments, not constants of the program, so that a bandit has one program for all datasets of a size.
     """
     optimizer = optax.adam(optax.cosine_decay_schedule(5e-3, steps))
     num_states = jax.tree.leaves(samples)[0].shape[0]

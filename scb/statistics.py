@@ -285,7 +285,15 @@ def spearman(a: ArrayLike, b: ArrayLike) -> float | None:
         )
     if np.ptp(first) == 0 or np.ptp(second) == 0:
         return None
-    return float(scipy.stats.spearmanr(first, second).statistic)
+    return float(rank_correlations(first[None], second[None])[0])
+
+
+def rank_correlations(a: NDArray[np.floating], b: NDArray[np.floating]) -> NDArray[np.floating]:
+    """[R] Spearman's, of the rows of two [R, N] arrays; 0 where it is undefined."""
+    first, second = (scipy.stats.rankdata(x, axis=1) - (x.shape[1] + 1) / 2 for x in (a, b))
+    spread = np.sqrt(np.sum(first**2, axis=1) * np.sum(second**2, axis=1))
+    products = np.sum(first * second, axis=1)
+    return np.divide(products, spread, out=np.zeros_like(products), where=spread > 0)
 
 
 def _check_confidence(confidence: float) -> None:

@@ -81,11 +81,26 @@ def test_only_objectives_that_are_new_in_the_environment_are_measured(
     assert "rank 5 objectives" in page
 
 
-def test_a_regime_that_lacks_an_objective_is_not_in_the_table(tmp_path, environment, trained):
+def test_regimes_are_compared_over_the_objectives_that_all_have(tmp_path, environment, trained):
     report, _ = run(tmp_path)
     del report["environments"]["hopper"]["its own"]["fitness"]["dpo"]
-    assert "its own" not in module.aligned(report)["hopper"]["area"]
-    assert "Pendulum's" in module.aligned(report)["hopper"]["area"]
+    facts = module.facts(report)
+    assert facts["earned"]["hopper"].keys() == EARNED.keys() - {"dpo"}
+    assert facts["best"]["hopper"][2] == len(module.REGIMES)
+    del report["environments"]["hopper"]["Pendulum's"]["fitness"]["ppo"]
+    assert module.facts(report)["best"] == {}  # two objectives rank nothing
+
+
+def test_what_was_measured_of_a_bandit_that_was_replaced_is_measured_again(
+    tmp_path, environment, trained
+):
+    report, _ = run(tmp_path)
+    before = len(trained)
+    report["environments"]["hopper"]["Pendulum's"]["sha256"] = "of another"
+    (tmp_path / "report.json").write_text(json.dumps(report))
+    again, _ = run(tmp_path)
+    assert [regime.bandit for regime, *_ in trained[before:]] == ["Synthetic-Pendulum-v1"]
+    assert again["environments"]["hopper"]["Pendulum's"]["sha256"] != "of another"
 
 
 def test_an_environment_without_agents_says_what_trains_some(

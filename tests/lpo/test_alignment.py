@@ -12,7 +12,6 @@ from lpo import alignment as module
 from lpo import figures
 from lpo.alignment import (
     Regime,
-    _rank_correlations,
     alignment,
     correlation_text,
     known_drifts,
@@ -31,7 +30,6 @@ from scb.environments.zoo import save_bandit
 from scb.errors import UserError
 from scb.evolution import map_population
 from scb.keys import root_key
-from scb.statistics import spearman
 
 TINY = Regime(reward_noise=0.0, contexts=10, iterations=4, epochs=1, minibatches=1)
 
@@ -316,13 +314,3 @@ def test_a_regime_says_its_bandit_where_that_is_another_environments():
     assert figures.regime_label(noisy, "Acrobot-v1").endswith("-v1, reward noise 1.0")
     own = {"name": "bandit Synthetic-Acrobot-v1", "bandit": "Synthetic-Acrobot-v1"}
     assert figures.regime_label(own, "Acrobot-v1") == own["name"]
-
-
-def test_correlations_of_many_rows_are_those_of_each():
-    generator = np.random.default_rng(0)
-    a = generator.integers(0, 4, (50, 7)).astype(float)  # with ties
-    b = generator.normal(size=(50, 7))
-    a[3] = 1.0  # undefined
-    each = [spearman(*pair) or 0.0 for pair in zip(a, b, strict=True)]
-    np.testing.assert_allclose(_rank_correlations(a, b), each, atol=1e-12)
-    assert each[3] == 0.0

@@ -152,7 +152,7 @@ def test_nothing_to_draw_is_refused():
 def test_an_objective_looks_the_same_whatever_it_is_drawn_with():
     together = figures.looks(["ppo", "dpo", "mine", "none", "ppo-0.3"])
     assert figures.looks(["none", "dpo"]) == {k: together[k] for k in ("none", "dpo")}
-    assert figures.looks(["ppo-0.3", "mine", "ppo"])["mine"] == together["mine"]
+    assert figures.looks(["ppo-0.3", "dpo-4-1.2", "mine", "ppo"])["mine"] == together["mine"]
 
 
 def test_objectives_are_told_apart_without_colour():

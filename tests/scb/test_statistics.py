@@ -14,6 +14,7 @@ from scb.statistics import (
     normalized_score,
     paired_difference,
     pooled_estimate,
+    rank_correlations,
     spearman,
     stratified_estimate,
     worst_decile,
@@ -155,6 +156,18 @@ def test_spearman_sees_order_only():
     assert spearman([1.0, 2.0, 3.0], [5.0, 4.0, -3.0]) == pytest.approx(-1.0)
     # Ranks (1, 2, 3, 4) and (2, 1, 4, 3): 1 - 6 * (1 + 1 + 1 + 1) / (4 * 15) = 0.6.
     assert spearman([1.0, 2.0, 3.0, 4.0], [2.0, 1.0, 4.0, 3.0]) == pytest.approx(0.6)
+
+
+def test_correlations_of_many_rows_are_those_of_each():
+    generator = np.random.default_rng(0)
+    a = generator.integers(0, 4, (50, 7)).astype(float)  # with ties
+    b = generator.normal(size=(50, 7))
+    a[3] = 1.0  # undefined
+    each = [
+        scipy.stats.spearmanr(*pair).statistic if np.ptp(pair[0]) else 0.0
+        for pair in zip(a, b, strict=True)
+    ]
+    np.testing.assert_allclose(rank_correlations(a, b), each, atol=1e-12)
 
 
 def test_spearman_of_a_constant_is_undefined():

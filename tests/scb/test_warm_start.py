@@ -449,7 +449,7 @@ def test_another_dataset_of_the_size_needs_no_new_program(fitted, bandit_dataset
     def traced_again(*_):
         raise AssertionError("the program is made anew")
 
-    monkeypatch.setattr(fitting, "energy_distance", traced_again)
+    monkeypatch.setattr(fitting.optax, "adam", traced_again)
     bandit, _, before = fitted
     other = bandit_dataset._replace(observation=bandit_dataset.observation[::-1])
     _, report = fit_bandit(bandit, other, jax.random.key(3), "q", 1000)
