@@ -2,7 +2,9 @@
 
 import json
 
-from lpo.full_size import PATH, as_comparison, full_size
+from lpo.full_size import PATH, as_comparison, full_size, validated
+from lpo.objectives import load_objective
+from scb.seeds import VALIDATING
 
 
 def test_what_ships_can_be_shown_beside_a_short_run():
@@ -38,3 +40,13 @@ def test_objectives_are_compared_on_the_seeds_that_both_have():
     differences = found.as_dict()["paired_differences"]
     assert (differences["a"]["value"], differences["a"]["n"]) == (3.0, 2)
     assert "b" not in differences
+
+
+def test_agents_that_report_nothing_are_apart_from_those_that_do():
+    found = validated("hopper")
+    assert len(found) >= 3 and {"ppo", "ppo-1", "none"} <= found.keys()
+    for name, curve in found.items():
+        assert load_objective(name).name == name
+        assert curve.seeds and set(curve.seeds) <= set(VALIDATING), name
+        assert curve.returns.shape == (len(curve.seeds), len(full_size("hopper").curves[0].steps))
+    assert validated("walker2d") == {} and validated("Pendulum-v1") == {}
