@@ -88,9 +88,8 @@ def parts(options: Options, report: dict[str, Any]) -> Iterator[Part]:
             _, digest = bandit_of(environment_spec(of_it.bandit).evaluation_environment)
             path = ("environments", environment, name)
             regimes = report.get("environments", {}).get(environment, {})
-            if (
-                regimes.get(name, {}).get("sha256", digest) != digest
-            ):  # the zoo has another bandit now
+            # What was measured of a bandit that the zoo has replaced is measured again.
+            if regimes.get(name, {}).get("sha256", digest) != digest:
                 del regimes[name]
             places: dict[Keys, str] = {
                 ("fitness", objective): objective for objective in objectives
@@ -153,7 +152,7 @@ def kind(objective: str) -> str:
 
 
 def facts(report: Report) -> dict[str, Any]:
-    """The correlations as tables, regimes from the best on, and what the objectives earned in the environments."""
+    """The correlations as tables, the best regime, those shown to rank, and what objectives earn in the environments."""
     found = aligned(report)
     earned = {
         environment: {

@@ -103,6 +103,8 @@ def _descend(
 ) -> tuple[Any, jax.Array]:
     """(weights, mean of the last losses) after Adam on minibatches of the samples, [S, ...] each.
 
+    The loss takes (weights, bandit, minibatch, fixed, key).
+
     Data are arguments, not constants of the program, so that a bandit has one program for all datasets of a size.
     """
     optimizer = optax.adam(optax.cosine_decay_schedule(5e-3, steps))
