@@ -152,7 +152,7 @@ def kind(objective: str) -> str:
 
 
 def facts(report: Report) -> dict[str, Any]:
-    """The correlations as tables, the best regime, those shown to rank, and what objectives earn in the environments."""
+    """The correlations as tables, the best regime, those shown to rank, what objectives earn in the environments."""
     found = aligned(report)
     earned = {
         environment: {
