@@ -366,6 +366,12 @@ def forget_replaced(report: dict[str, Any]) -> None:
     forget(report)
 
 
+def forget_other(entries: dict[str, Any], name: str, digest: str) -> None:
+    """Takes out an entry that is of another bandit than the one with this checksum, so that it is measured again."""
+    if name in entries and entries[name].get("sha256") != digest:
+        del entries[name]
+
+
 def packed(rows: Any) -> list[str]:
     """[N, M] numbers as a line of JSON a row; one number a line would make a report unreadable."""
     return [" ".join(f"{x:.4g}" for x in row) for row in rows]

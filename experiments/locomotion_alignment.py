@@ -8,7 +8,7 @@ Spearman's correlation between what they earn there and in the environment says 
 agents of further objectives in the environment the same command measures those in the bandits too.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from functools import partial
 from typing import Any
@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from experiments.alignment import CONFIRMATION_SEED
-from experiments.harness import Experiment, Report, bandit_of, packed, settled, unpacked
+from experiments.harness import Experiment, Report, forget_other, packed, settled, unpacked
 from experiments.parts import InParts, Keys, Part, lacking
 from lpo.alignment import Alignment, Regime, alignment, correlation_text, regime_fitness
 from lpo.comparison import LearningCurves
@@ -27,6 +27,7 @@ from lpo.full_size import validated
 from lpo.objectives import load_objective
 from scb import plotting
 from scb.environments.registry import environment_spec
+from scb.environments.zoo import bandit_metadata
 from scb.errors import UserError, at_least
 from scb.statistics import iqm
 
@@ -85,12 +86,9 @@ def parts(options: Options, report: dict[str, Any]) -> Iterator[Part]:
             )
         for name in REGIMES:
             of_it = regime(environment, name)
-            _, digest = bandit_of(environment_spec(of_it.bandit).evaluation_environment)
+            digest = bandit_metadata(of_it.bandit)["sha256"]
             path = ("environments", environment, name)
-            regimes = report.get("environments", {}).get(environment, {})
-            # What was measured of a bandit that the zoo has replaced is measured again.
-            if regimes.get(name, {}).get("sha256", digest) != digest:
-                del regimes[name]
+            forget_other(report.get("environments", {}).get(environment, {}), name, digest)
             places: dict[Keys, str] = {
                 ("fitness", objective): objective for objective in objectives
             }
@@ -112,9 +110,11 @@ def _trained(of_it: Regime, digest: str, names: list[str], options: Options) -> 
     }
 
 
-def fitness(entry: Mapping[str, Any], label: str) -> dict[str, NDArray[np.floating]]:
-    """{objective: [S]} what agents earned in a regime."""
-    return {name: unpacked([of_it[label]])[0] for name, of_it in entry["fitness"].items()}
+def fitness(
+    entry: Mapping[str, Any], label: str, names: Iterable[str]
+) -> dict[str, NDArray[np.floating]]:
+    """{objective: [S]} what agents of these earned in a regime."""
+    return {name: unpacked([entry["fitness"][name][label]])[0] for name in names}
 
 
 def ranked(environment: str, regimes: Mapping[str, Any]) -> dict[str, LearningCurves]:
@@ -133,14 +133,15 @@ def aligned(report: Report) -> dict[str, dict[str, dict[str, dict[str, Alignment
         curves = ranked(environment, regimes)
         if len(curves) < 3:
             continue
+        in_bandits = {
+            name: {label: fitness(entry, label, curves) for label in LABELS}
+            for name, entry in regimes.items()
+        }
         for outcome in OUTCOMES:
             earned = {name: getattr(curve, outcome) for name, curve in curves.items()}
             found.setdefault(environment, {})[outcome] = {
-                name: {
-                    label: alignment({x: fitness(entry, label)[x] for x in curves}, earned)
-                    for label in LABELS
-                }
-                for name, entry in regimes.items()
+                name: {label: alignment(of_it, earned) for label, of_it in of_labels.items()}
+                for name, of_labels in in_bandits.items()
             }
     return found
 
@@ -210,7 +211,7 @@ def draw(report: Mapping[str, Any]) -> dict[str, Figure]:
         for axes, (name, entry) in zip(
             plotting.panels(figure, len(regimes)), regimes.items(), strict=True
         ):
-            earned = fitness(entry, FITNESS)
+            earned = fitness(entry, FITNESS, curves)
             for objective, curve in curves.items():
                 x, y = earned[objective].mean(), float(iqm(curve.area))
                 axes.plot([x], [y], "o", color=KINDS[kind(objective)])

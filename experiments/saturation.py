@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from matplotlib.figure import Figure
 
-from experiments.harness import Experiment, Report, finite, packed, settled, unpacked
+from experiments.harness import Experiment, Report, finite, forget_other, packed, settled, unpacked
 from experiments.parts import InParts, Part
 from experiments.zoo_table import Candidate, bandits
 from experiments.zoo_table_page import BANDITS
@@ -120,8 +120,7 @@ def parts(options: Options, report: dict[str, Any]) -> Iterator[Part]:
     for environment in options.environments:
         entry = report.setdefault("environments", {}).setdefault(environment, {})
         for kind, candidate in bandits(environment, options.published).items():
-            if entry.get(kind, {}).get("sha256") != candidate.sha256:
-                entry.pop(kind, None)
+            forget_other(entry, kind, candidate.sha256)
             yield Part(("environments", environment, kind), partial(measured, candidate, options))
 
 

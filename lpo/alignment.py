@@ -16,10 +16,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from lpo.comparison import compare, ppo_spec
-from lpo.drifts import ClipDrift, DPODrift, Drift, NoDrift
+from lpo.drifts import Drift
 from lpo.fitness import FITNESSES, LABELS
 from lpo.inner_loop import MetaTrainingConfig, TaskTraining, task_agent
-from lpo.objectives import Objective, check_names, closed_form
+from lpo.objectives import Objective, check_names, load_objective
 from scb.agents.ppo import PPOHyperparameters
 from scb.agents.spec import AgentSpec
 from scb.artefacts import machine_description, package_versions
@@ -112,27 +112,15 @@ class Regime:
 
 def known_drifts() -> list[Objective]:
     """Clips from 0.05 to 1, no drift, and DPO over alpha and beta: a family that spans the scale."""
-    return [
-        *_clips(0.05, 0.1, 0.2, 0.3, 0.5, 1.0),
-        closed_form("none", NoDrift()),
-        *_dpo((1.0, 0.3), (2.0, 0.6), (4.0, 1.2)),
-    ]
+    clips = ("ppo-0.05", "ppo-0.1", "ppo-0.2", "ppo-0.3", "ppo-0.5", "ppo-1")
+    return [*map(load_objective, (*clips, "none", "dpo-1-0.3", "dpo-2-0.6", "dpo-4-1.2"))]
 
 
 def other_drifts() -> list[Objective]:
     """Closed forms that are not among `known_drifts` and span the scale as well: to confirm what those chose."""
-    between = ((0.5, 0.15), (1.0, 0.6), (2.0, 0.3), (2.0, 1.2), (4.0, 0.6), (8.0, 2.4))
-    return [*_clips(0.03, 0.07, 0.15, 0.25, 0.4, 0.7), *_dpo(*between)]
-
-
-def _clips(*clips: float) -> list[Objective]:
-    return [closed_form(f"ppo-{clip:g}", ClipDrift(clip)) for clip in clips]
-
-
-def _dpo(*parameters: tuple[float, float]) -> list[Objective]:
-    return [
-        closed_form(f"dpo-{alpha:g}-{beta:g}", DPODrift(alpha, beta)) for alpha, beta in parameters
-    ]
+    clips = ("ppo-0.03", "ppo-0.07", "ppo-0.15", "ppo-0.25", "ppo-0.4", "ppo-0.7")
+    between = ("dpo-0.5-0.15", "dpo-1-0.6", "dpo-2-0.3", "dpo-2-1.2", "dpo-4-0.6", "dpo-8-2.4")
+    return [*map(load_objective, (*clips, *between))]
 
 
 def regime_fitness(
