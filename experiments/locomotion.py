@@ -36,10 +36,10 @@ BACKEND = "generalized"
 MARGIN = 0.05  # of what the reference earns: what is not worse by more is as good
 # What is asked of an objective, by the measure that decides it.
 ASKED = {
-    "final": "ends no lower than PPO",
-    "late": "earns no less over the last quarter than PPO",
-    "early": "earns more over the first half than PPO",
-    "area": "earns more over the training than PPO",
+    "final": "ends no lower than {}",
+    "late": "earns no less over the last quarter than {}",
+    "early": "earns more over the first half than {}",
+    "area": "earns more over the training than {}",
 }
 
 
@@ -193,12 +193,20 @@ def claims(report: Report) -> list[Claim]:
 
 
 def _claim(curves: LearningCurves, reference: LearningCurves, of: str) -> Claim:
-    text = f"{curves.environment}: {curves.objective} {ASKED[of]}"
+    text = f"{curves.environment}: {curves.objective} {_asked(of, reference.objective)}"
     if of in ("early", "area"):
         return Claim(text, paired(curves, reference, of), places=0)
     margin = float(f"{MARGIN * abs(float(getattr(reference, of).mean())):.4g}")
-    reason = "a twentieth of what PPO's clip earns"
+    reason = f"a twentieth of what {_called(reference.objective)} earns"
     return Claim(text, paired(curves, reference, of), 0.0, margin, reason, places=0)
+
+
+def _asked(of: str, reference: str = REFERENCE) -> str:
+    return ASKED[of].format(_called(reference))
+
+
+def _called(reference: str) -> str:
+    return "PPO" if reference == REFERENCE else reference
 
 
 def confirmed(report: Report) -> list[tuple[Confirmation, int, Judged | None]]:
@@ -208,7 +216,7 @@ def confirmed(report: Report) -> list[tuple[Confirmation, int, Judged | None]]:
         judged = None
         if len(seeds) == len(asked.seeds):
             entry = report["environments"][asked.environment]
-            names = (REFERENCE, asked.objective)
+            names = (asked.reference, asked.objective)
             fresh = {name: {s: entry["agents"][name][s] for s in seeds} for name in names}
             reference, curves = as_comparison(asked.environment, {**entry, "agents": fresh}).curves
             (judged,) = judge([_claim(curves, reference, asked.of)])
@@ -224,7 +232,7 @@ def _since(report: Report, asked: Confirmation) -> tuple[list[int], Estimate] | 
         name: {
             seed: agent for seed, agent in entry["agents"].get(name, {}).items() if int(seed) > last
         }
-        for name in (REFERENCE, asked.objective)
+        for name in (asked.reference, asked.objective)
     }
     shared = sorted(set.intersection(*map(set, later.values())), key=int)
     if len(shared) < DECIDING:
@@ -245,12 +253,18 @@ def facts(report: Report) -> dict[str, Any]:
         "deciding": DECIDING,
         "learned_here": _learned_here(comparisons),
         "confirmations": [
-            (asked, ASKED[asked.of], pairs, judged, judged and _since(report, asked))
+            (
+                asked,
+                _asked(asked.of, asked.reference),
+                pairs,
+                judged,
+                judged and _since(report, asked),
+            )
             for asked, pairs, judged in found
         ],
         # What all pairs together may show, and those that were trained to confirm it do not.
         "unconfirmed": {x.claim.text for x in decided if x.outcome != HOLDS},
-        "asked": ASKED,
+        "asked": {of: _asked(of) for of in ASKED},
         "sweeps": {
             name: (sweep, len(entry["sweep"][REFERENCE]), tuned(sweep))
             for name, entry in report["environments"].items()

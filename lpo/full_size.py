@@ -22,30 +22,36 @@ REFERENCE = "ppo"
 
 @dataclass(frozen=True)
 class Confirmation:
-    """One claim, stated before the objective's agents of its seeds were trained, and decided when all have been.
+    """One claim, stated before agents of its seeds were trained, and decided when all have been.
 
     Attributes:
       environment, objective: whose it is.
-      seeds: of its agents, none of which suggested the claim.
+      seeds: of its pairs of agents, none of which suggested the claim.
       of: what is said of them, "final", "early", "late" or "area".
-      reference_known: whether PPO's agents of these seeds had been trained, and seen, before.
+      reference: which objective its agents are compared with.
+      known: the one of both whose agents of these seeds had been trained, and seen, before.
     """
 
     environment: str
     objective: str
     seeds: Sequence[int]
     of: str = "final"
-    reference_known: bool = False
+    reference: str = REFERENCE
+    known: str | None = None
+
+    @property
+    def trained(self) -> list[str]:
+        """Of which objectives agents are trained for it."""
+        return [name for name in (self.reference, self.objective) if name != self.known]
 
 
 CONFIRMATIONS = (
     Confirmation("hopper", "ta-lpo", reporting(30, offset=20)),
-    Confirmation("hopper", "lpo-pendulum", reporting(40, offset=10), "late", reference_known=True),
+    Confirmation("hopper", "lpo-pendulum", reporting(40, offset=10), "late", known=REFERENCE),
     Confirmation("hopper", "ta-lpo", reporting(60, offset=50), "area"),
     Confirmation("hopper", "ta-lpo", reporting(40, offset=110), "early"),
-    Confirmation(
-        "hopper", "lpo-pendulum-ee", reporting(40, offset=10), "area", reference_known=True
-    ),
+    Confirmation("hopper", "lpo-pendulum-ee", reporting(40, offset=10), "area", known=REFERENCE),
+    Confirmation("hopper", "ta-lpo", reporting(40, offset=30), "area", "dpo", known="ta-lpo"),
 )
 
 
@@ -68,8 +74,8 @@ def with_pairs(report: Mapping[str, Any]) -> Iterator[tuple[Confirmation, list[s
     """Every confirmation of what a report has agents of, and its seeds of which both agents are there."""
     for asked in CONFIRMATIONS:
         agents = report["environments"].get(asked.environment, {}).get("agents", {})
-        if REFERENCE in agents and asked.objective in agents:
-            both = agents[REFERENCE].keys() & agents[asked.objective].keys()
+        if asked.reference in agents and asked.objective in agents:
+            both = agents[asked.reference].keys() & agents[asked.objective].keys()
             yield asked, [str(s) for s in asked.seeds if str(s) in both]
 
 
@@ -83,7 +89,7 @@ def looked_at(report: Mapping[str, Any]) -> dict[str, Any]:
     for environment, entry in report["environments"].items():
         agents = {name: dict(of_it) for name, of_it in entry["agents"].items()}
         for asked in pending:
-            names = [asked.objective] if asked.reference_known else list(agents)
+            names = asked.trained if asked.known else list(agents)
             for name in names if asked.environment == environment else ():
                 for seed in asked.seeds:
                     agents[name].pop(str(seed), None)

@@ -265,12 +265,36 @@ def test_what_only_all_pairs_together_show_is_not_said_to_be_shown(monkeypatch):
 def test_of_a_pending_confirmation_whose_reference_was_known_the_objective_alone_is_left_out(
     monkeypatch,
 ):
-    asked = full_size.Confirmation("hopper", "dpo", range(4, 14), "late", reference_known=True)
+    asked = full_size.Confirmation("hopper", "dpo", range(4, 14), "late", known="ppo")
     monkeypatch.setattr(full_size, "CONFIRMATIONS", (asked,))
     made = report(13)
     counts = {c.objective: len(c.seeds) for c in module.facts(made)["comparisons"]["hopper"].curves}
     assert counts == {"ppo": 13, "dpo": 4, "lpo-pendulum": 13}
-    said = "before the objective's agents of its 10 pairs (seeds 4 to 13) were trained; PPO's were known."
+    said = "before the agents of dpo in its 10 pairs (seeds 4 to 13) were trained; those of ppo were known."
+    assert said in module.EXPERIMENT.page(made)
+
+
+def test_a_confirmation_has_a_reference_of_its_own(monkeypatch):
+    asked = full_size.Confirmation(
+        "hopper", "lpo-pendulum", range(4, 14), "late", "dpo", "lpo-pendulum"
+    )
+    monkeypatch.setattr(full_size, "CONFIRMATIONS", (asked,))
+    made = report(13)
+    counts = {c.objective: len(c.seeds) for c in module.facts(made)["comparisons"]["hopper"].curves}
+    assert counts == {"ppo": 13, "dpo": 4, "lpo-pendulum": 13}
+    made = report(14)
+    ((_, pairs, judged),) = module.confirmed(made)
+    agents = made["environments"]["hopper"]["agents"]
+    ours, theirs = (
+        [float(agents[name][str(seed)]["returns"].split()[-1]) for seed in asked.seeds]
+        for name in ("lpo-pendulum", "dpo")
+    )
+    assert pairs == 10 and judged.claim.text == (
+        "hopper: lpo-pendulum earns no less over the last quarter than dpo"
+    )
+    assert judged.estimate.value == pytest.approx(np.subtract(ours, theirs).mean())
+    assert "a twentieth of what dpo earns" in judged.claim.reason
+    said = "stated before the agents of dpo in its 10 pairs (seeds 4 to 13) were trained; those of lpo-pendulum"
     assert said in module.EXPERIMENT.page(made)
 
 
