@@ -238,7 +238,7 @@ def test_a_confirmation_is_decided_by_its_own_agents_when_all_are_there(monkeypa
         agents["13"] = more[name]["13"]
     ((_, pairs, judged),) = module.confirmed(made)
     assert (pairs, judged.outcome) == (10, claims.HOLDS)
-    assert "Their difference is +100 [100, 100]" in module.EXPERIMENT.page(made)
+    assert "| none | +100 [100, 100] | −5 | confirmed |" in module.EXPERIMENT.page(made)
     made["environments"]["hopper"]["agents"].pop("dpo")
     assert module.confirmed(made) == []
 
@@ -258,8 +258,8 @@ def test_what_only_all_pairs_together_show_is_not_said_to_be_shown(monkeypatch):
     page = module.EXPERIMENT.page(made)
     assert "Shown to earn more over the training: none" in page
     assert f"though all pairs together have an interval above: hopper: {row} than PPO." in page
-    (line,) = [x for x in page.splitlines() if x.startswith(f"| hopper: {row}")]
-    assert line.endswith("| holds, not confirmed |")
+    line, stated = [x for x in page.splitlines() if x.startswith(f"| hopper: {row}")]
+    assert line.endswith("| holds, not confirmed |") and "| not confirmed: " in stated
 
 
 def test_of_a_pending_confirmation_whose_reference_was_known_the_objective_alone_is_left_out(
@@ -270,8 +270,8 @@ def test_of_a_pending_confirmation_whose_reference_was_known_the_objective_alone
     made = report(13)
     counts = {c.objective: len(c.seeds) for c in module.facts(made)["comparisons"]["hopper"].curves}
     assert counts == {"ppo": 13, "dpo": 4, "lpo-pendulum": 13}
-    said = "before the agents of dpo in its 10 pairs (seeds 4 to 13) were trained; those of ppo were known."
-    assert said in module.EXPERIMENT.page(made)
+    row = "| hopper: dpo earns no less over the last quarter than PPO | 10, seeds 4 to 13 | ppo | "
+    assert row in module.EXPERIMENT.page(made)
 
 
 def test_a_confirmation_has_a_reference_of_its_own(monkeypatch):
@@ -294,8 +294,8 @@ def test_a_confirmation_has_a_reference_of_its_own(monkeypatch):
     )
     assert judged.estimate.value == pytest.approx(np.subtract(ours, theirs).mean())
     assert "a twentieth of what dpo earns" in judged.claim.reason
-    said = "stated before the agents of dpo in its 10 pairs (seeds 4 to 13) were trained; those of lpo-pendulum"
-    assert said in module.EXPERIMENT.page(made)
+    row = "than dpo | 10, seeds 4 to 13 | lpo-pendulum | "
+    assert row in module.EXPERIMENT.page(made)
 
 
 def test_the_shipped_curves_are_of_the_full_size_and_stand_beside_shorter_trainings():
