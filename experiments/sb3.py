@@ -25,7 +25,6 @@ from matplotlib.ticker import EngFormatter
 from experiments.claims import Claim, judge, of_agents
 from experiments.harness import Experiment, Report, bandit_of, packed, settled, unpacked
 from experiments.parts import InParts, Part
-from experiments.rendering import number
 from scb import plotting
 from scb.environments.registry import environment_spec
 from scb.environments.zoo import bandit_metadata, load_bandit
@@ -209,7 +208,6 @@ def facts(report: Report) -> dict[str, Any]:
         "tables": tables,
         "every": sorted({n for x in report["steps"].values() for n in x}),
         "counts": sorted(counts),
-        "ends": {name: ends for name, x in tables.items() if (ends := _ends(x, report["steps"]))},
         "number": Counter(_outcomes(report)),
         "short": [x for x, n in report["steps"].items() if x in trained and n[-1] < longest],
         "deciding": DECIDING,
@@ -217,19 +215,6 @@ def facts(report: Report) -> dict[str, Any]:
         "random": {name: environment_spec(name).random_return() for name in tables},
         "seed": REPORTING.start,
     }
-
-
-def _ends(
-    algorithms: Mapping[str, Mapping[str, list[Estimate]]], steps: Mapping[str, Sequence[int]]
-) -> list[str]:
-    """Of each algorithm of an environment that has enough agents there what it ends with, in words."""
-    found = []
-    for algorithm, places in algorithms.items():
-        if len(places) == len(PLACES) and min(row[-1].n for row in places.values()) >= DECIDING:
-            here, there = (number(places[place][-1].value, 0) for place in PLACES)
-            after = thousands(steps[algorithm][-1])
-            found.append(f"{algorithm.upper()} {here} and {there} after {after} steps")
-    return found
 
 
 def _outcomes(report: Report) -> list[str]:

@@ -156,7 +156,6 @@ def facts(report: Report) -> dict[str, Any]:
         "better": those(HOLDS),
         "worse": those(FAILS),
         "behind": those(FAILS, lambda name: name not in REFERENCES),
-        "few": [row["name"] for row in rows if 0 < row["searches"] < ENOUGH],
         "enough": ENOUGH,
         "number": number,
         "places": places,

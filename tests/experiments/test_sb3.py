@@ -80,12 +80,11 @@ def test_an_algorithm_is_judged_by_agents_of_the_same_seeds(tmp_path, peer):
         claims.HOLDS
     ] * 3  # PPO after the fewest and the most steps, TD3
     assert all(x.estimate.value == pytest.approx(100.0, abs=0.1) for x in judged)
-    both = "- Pendulum-v1, trained in the bandit and in itself: PPO 250 and 150 after 150"
     page = sb3.EXPERIMENT.page(report)
-    assert both in page and "itself in 2 of 2 pairs" in page and "and less in 0.**" in page
+    assert "itself in 2 of 2 pairs" in page and "and less in 0.**" in page
     del report["agents"]["Pendulum-v1"]["ppo"]["environment"][str(REPORTING[0])]
     page = sb3.EXPERIMENT.page(report)
-    assert "itself: TD3 110 and 10 after 10" in page and "itself in 1 of 1 pairs" in page
+    assert "itself in 1 of 1 pairs" in page
     assert "Of others there are fewer than 10" in page
     (ppo, *_) = claims.judge(sb3.claims(report))
     assert ppo.estimate.n == 9 and ppo.outcome == claims.UNDECIDED
