@@ -68,11 +68,10 @@ def read_comparison(path: Path) -> dict[str, Any]:
     try:
         whole = json.loads(path.read_text())
         curves, first = whole["curves"], whole["curves"][0]
-        names = ("environment", "backend", "seeds", "episodes", "mode_actions")
+        names = ("environment", "backend", "seeds", "episodes", "mode_actions", "hyperparameters")
         return {
             **{name: first[name] for name in names},
             "steps": first["steps"][-1],
-            "policy_output_scale": first.get("policy_output_scale", 1.0),
             "reference": whole["reference"],
             "final_iqm": {c["objective"]: c["final_iqm"] for c in curves},
             "area_iqm": {c["objective"]: c["area_iqm"] for c in curves},

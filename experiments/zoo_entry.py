@@ -49,9 +49,9 @@ def measure(options: Options, report: dict[str, Any], save: Save) -> None:
     reporting_seeds = {}
     for path in options.comparisons:
         found = read_comparison(path)
-        environment, scale = found["environment"], found["policy_output_scale"]
-        if scale != 1.0:
-            environment += f", policy_output_scale {scale:g}"
+        environment = found["environment"]
+        for name, value in found["hyperparameters"].items():
+            environment += f", {name} {value}"
         if environment in reporting_seeds:
             raise UserError(f"two of the comparisons are of {environment}: give one.")
         reporting_seeds[environment] = found["seeds"]

@@ -305,7 +305,7 @@ def measure_alignment(
     }
     report: dict[str, Any] = dict(done or {})
     if not report:
-        spec = ppo_spec(environment, steps, policy_output_scale)
+        spec = ppo_spec(environment, steps).with_values(policy_output_scale=policy_output_scale)
         found = compare(environment, objectives, seeds, spec, backend, points=1, rows=rows).curves
         report = {
             **asked,

@@ -5,16 +5,18 @@ episodes, so that differences are paired. Final scores are interquartile means w
 intervals.
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
 from lpo.objectives import Objective, check_names, load_objective
 from scb.agents.ppo import DIAGNOSIS
-from scb.agents.spec import AgentSpec, environment_agent
+from scb.agents.spec import AgentSpec, check_value, environment_agent
 from scb.environments.registry import environment_spec
+from scb.errors import one_of
 from scb.files import plain
 from scb.measurement import MODE, SAMPLED, Place, as_random, measure
 from scb.rows import Rows, pivot
@@ -34,7 +36,7 @@ class LearningCurves:
       steps: [P] environment steps at each evaluation, the first 0.
       returns: [S, P] mean return of `episodes` episodes, per seed.
       mode_actions: whether evaluation took the most likely actions or sampled ones.
-      policy_output_scale: factor on the policy's last layer at initialisation.
+      hyperparameters: {name: value} of what is other than in PPO's setting for that environment.
       lengths: [S, P] mean steps of those episodes; None of curves that were made elsewhere.
       speeds: [S, P] their mean forward velocity, NaN where the environment has none; None likewise.
       diagnosis: {name: [S, P]} of what an iteration does to the policy (`scb.agents.ppo.PPO.diagnose`); None where
@@ -50,7 +52,7 @@ class LearningCurves:
     seeds: list[int]
     episodes: int
     mode_actions: bool
-    policy_output_scale: float = 1.0
+    hyperparameters: Mapping[str, Any] = field(default_factory=dict)
     lengths: np.ndarray | None = None
     speeds: np.ndarray | None = None
     diagnosis: dict[str, np.ndarray] | None = None
@@ -167,12 +169,48 @@ class Comparison:
         }
 
 
+# Of PPO's fields those that are no hyperparameters of a comparison: it has the objective and the steps apart.
+_APART = ("drift", "horizon", "total_steps")
+
+
 def ppo_spec(
-    environment: str, steps: int | None = None, policy_output_scale: float | None = None
+    environment: str,
+    steps: int | None = None,
+    hyperparameters: Mapping[str, Any] = MappingProxyType({}),
 ) -> AgentSpec:
-    """PPO as the environment has it, but for steps and for the policy's last layer at initialisation where given."""
+    """PPO as the environment has it, but for steps and hyperparameters where given.
+
+    Args:
+      environment: a name that `scb.make` takes.
+      steps: environment steps of a training, rounded up to whole batches.
+      hyperparameters: {name: value} of `scb.PPOHyperparameters` and `scb.PPOConfig`, such as a learning_rate,
+        num_envs or a policy_output_scale.
+
+    Raises:
+      UserError: there is no such hyperparameter, or it cannot have the value.
+    """
     spec = environment_agent("ppo", environment).with_steps(steps)
-    return spec.with_values(policy_output_scale=policy_output_scale)
+    traced = [f.name for f in fields(spec.hyperparameters)]
+    for name, value in hyperparameters.items():
+        one_of("hyperparameter of PPO", name, _values(spec))
+        if name in traced:
+            check_value(name, value)
+    return spec.with_values(**hyperparameters)
+
+
+def changed(spec: AgentSpec, environment: str) -> dict[str, Any]:
+    """{hyperparameter: value} of what a specification has other than PPO's own for the environment."""
+    own = _values(ppo_spec(environment))
+    return {name: value for name, value in _values(spec).items() if value != own[name]}
+
+
+def _values(spec: AgentSpec) -> dict[str, Any]:
+    return {
+        f.name: getattr(of, f.name)
+        for of in (spec.hyperparameters, spec.config)
+        for f in fields(of)
+        if f.name not in _APART
+    }
 
 
 def compare(
@@ -238,7 +276,7 @@ def compare(
                 list(seeds),
                 episodes,
                 mode_actions,
-                float(spec.hyperparameters.policy_output_scale),
+                changed(spec, environment),
                 measured["length"][i],
                 measured["speed"][i],
                 {name: measured[name][i] for name in DIAGNOSIS} if diagnose else None,

@@ -324,9 +324,8 @@ def _place(curve: "LearningCurves") -> str:
 
 def _protocol(curve: "LearningCurves") -> str:
     actions = "mode" if curve.mode_actions else "sampled"
-    scale = curve.policy_output_scale
-    start = "" if scale == 1.0 else f", policy's last layer x {scale:g}"
-    return f"{_place(curve)}{start}: {actions} actions, {curve.episodes} episodes"
+    values = "".join(f", {name} {value}" for name, value in curve.hyperparameters.items())
+    return f"{_place(curve)}{values}: {actions} actions, {curve.episodes} episodes"
 
 
 def _number(counts: Sequence[int], of: str) -> str:

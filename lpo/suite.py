@@ -7,6 +7,7 @@ from a bootstrap that resamples seeds within every environment.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -196,7 +197,7 @@ def run_suite(
     tell: Callable[[str], None] = print,
     rows: Rows | None = None,
     steps: int | None = None,
-    policy_output_scale: float | None = None,
+    hyperparameters: Mapping[str, Any] = MappingProxyType({}),
     points: int = 5,
     **arguments: Any,
 ) -> tuple[SuiteScores, dict[str, Comparison]]:
@@ -209,7 +210,7 @@ def run_suite(
       backend: Brax physics, for the suite's Brax environments.
       tell: takes a line when an environment is done.
       rows: where results are kept, and found; what is there is not measured again.
-      steps, policy_output_scale: of every training; each environment's own setting where None.
+      steps, hyperparameters: of every training (`ppo_spec`); each environment's own setting where left out.
       points: about how many evaluations along a training. Only the last one is scored, and with
         episodes of a thousand steps fifteen take longer than the training itself.
       arguments: further ones of `compare`.
@@ -225,7 +226,7 @@ def run_suite(
             environment_name,
             objectives,
             seeds,
-            spec=ppo_spec(environment_name, steps, policy_output_scale),
+            spec=ppo_spec(environment_name, steps, hyperparameters),
             backend=physics,
             points=points,
             rows=rows,

@@ -3,11 +3,11 @@
 import itertools
 import json
 import sys
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from types import MappingProxyType
-from typing import Annotated, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 import tyro
@@ -22,11 +22,12 @@ from lpo.suite import SuiteScores, run_suite
 from lpo.suite import suite as suite_environments
 from scb import plotting
 from scb.artefacts import package_versions
-from scb.command_line import Measuring
+from scb.command_line import Measuring, text
 from scb.console import console
 from scb.environments.registry import check_backend, environment_spec
 from scb.errors import UserError, at_least
 from scb.files import write_json
+from scb.lists import read_settings, write_settings
 from scb.measurement import Place, check_seeds
 from scb.runs import config_dict
 from scb.statistics import estimate
@@ -44,15 +45,12 @@ class Agents:
       environment: Pendulum-v1, CartPole-v1, hopper, Synthetic-Pendulum-v1, ..., or one's own as
         package.module:factory; Pendulum-v1 where nothing says another.
       steps: environment steps, rounded up to whole batches; the environment's own setting where left out.
-      policy_output_scale: factor on the policy's last layer at initialisation; many public PPOs take
-        0.01.
       seed: the first of the agents' seeds.
       backend: Brax physics: generalized, positional, spring or mjx.
     """
 
     environment: str | None = None
     steps: int | None = None
-    policy_output_scale: float | None = None
     seed: int = 0
     backend: str | None = None
 
@@ -74,10 +72,15 @@ class JudgedConfig(Agents):
 
     Attributes:
       seeds: agents of each objective.
+      hyperparameters: of PPO, where they are other than the environment's own setting (such as learning_rate=0.0003
+        num_envs=8 policy_output_scale=0.01): those of the PPO that an objective is to be used in.
       sampled_actions: evaluate sampled actions rather than the most likely ones.
     """
 
     seeds: int = 1
+    hyperparameters: Annotated[
+        Mapping[str, Any], text(read_settings, write_settings, "'NAME=A NAME=B'")
+    ] = field(default_factory=dict)
     sampled_actions: bool = False
 
 
@@ -129,7 +132,7 @@ class Comparing(Measuring):
         """Trains with the objectives, and leaves rows, comparison.json and curves.png where a folder is named."""
         config: JudgedConfig = self.config
         environment, seeds = config.environment or "Pendulum-v1", config.seed_list()
-        spec = ppo_spec(environment, config.steps, config.policy_output_scale)
+        spec = ppo_spec(environment, config.steps, config.hyperparameters)
         Place.named(environment, config.backend)  # a mistake must not leave a folder behind
         folder, rows = self.opened()
         comparison = compare(
@@ -220,7 +223,7 @@ class Evaluate(Comparing):
         environments = suite_environments(name)
         check_backend(config.backend, environments)
         for environment in environments:
-            ppo_spec(environment, config.steps, config.policy_output_scale)
+            ppo_spec(environment, config.steps, config.hyperparameters)
         homes = learned_in(objectives)
         (folder, rows), printer = self.opened(), console()
         scores, comparisons = run_suite(
@@ -231,7 +234,7 @@ class Evaluate(Comparing):
             tell=printer.print,
             rows=rows,
             steps=config.steps,
-            policy_output_scale=config.policy_output_scale,
+            hyperparameters=config.hyperparameters,
             mode_actions=not config.sampled_actions,
         )
         title, caption = "final return, IQM [95 %]", f"suite: {name}"
@@ -278,6 +281,7 @@ class AlignConfig(Agents):
       learning_rates: of the inner agents.
       epochs: passes over a batch.
       minibatches: of a batch.
+      policy_output_scale: factor on the policy's last layer at initialisation, in the environment as well.
       agents: of each objective, in the environment and in each regime.
     """
 
@@ -289,6 +293,7 @@ class AlignConfig(Agents):
     learning_rates: tuple[float, ...] = ()
     epochs: tuple[int, ...] = ()
     minibatches: tuple[int, ...] = ()
+    policy_output_scale: float | None = None
     agents: int = 16
     seed: int = 500
 
@@ -340,7 +345,7 @@ class Align(Measuring):
         target = config.environment or environment_spec(regimes[0].bandit).evaluation_environment
         # A mistake must not leave a folder behind.
         Place.named(target, config.backend)
-        ppo_spec(target, config.steps, config.policy_output_scale)
+        ppo_spec(target, config.steps)
         folder, rows = self.opened()
         stored = None if folder is None else folder / "alignment.json"
         printer = console()

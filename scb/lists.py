@@ -1,7 +1,7 @@
 """What agents are trained with, as the command line writes it: lists to draw from, and static configurations."""
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -72,21 +72,43 @@ def write_lists(lists: Mapping[str, Mapping[str, Any]]) -> str:
 
 def read_values(words: str) -> dict[str, tuple[float, ...]]:
     """{hyperparameter: values} from "learning_rate=0.0003,0.001 policy_output_scale=1,0.01"."""
-    values = {}
-    for part in words.split():
-        name, equals, listed = part.partition("=")
-        if not equals:
-            raise UserError(
-                f"hyperparameters {words!r} have the part {part!r}, which is no NAME=VALUE,VALUE: write such as "
-                "learning_rate=0.0003,0.001."
-            )
-        values[name] = numbers(listed, name)
-    return values
+    parts = _parts(words, "NAME=VALUE,VALUE", "learning_rate=0.0003,0.001")
+    return {name: numbers(listed, name) for name, listed in parts}
 
 
 def write_values(values: Mapping[str, Sequence[float]]) -> str:
     """What `read_values` reads."""
     return " ".join(f"{name}={','.join(map(str, listed))}" for name, listed in values.items())
+
+
+def read_settings(words: str) -> dict[str, Any]:
+    """{field of an agent: value} from "learning_rate=0.001 num_envs=16 activation=relu hidden_sizes=[64,64]"."""
+    values: dict[str, Any] = {}
+    for name, value in _parts(words, "NAME=VALUE", "learning_rate=0.001"):
+        try:
+            values[name] = strict_json(value)
+        except ValueError:  # a word
+            values[name] = value
+    return values
+
+
+def write_settings(values: Mapping[str, Any]) -> str:
+    """What `read_settings` reads."""
+    written = {
+        name: value if isinstance(value, str) else json.dumps(value, separators=(",", ":"))
+        for name, value in values.items()
+    }
+    return " ".join(f"{name}={value}" for name, value in written.items())
+
+
+def _parts(words: str, form: str, example: str) -> Iterator[tuple[str, str]]:
+    for part in words.split():
+        name, equals, value = part.partition("=")
+        if not equals:
+            raise UserError(
+                f"hyperparameters {words!r} have the part {part!r}, which is no {form}: write such as {example}."
+            )
+        yield name, value
 
 
 def _is_filled(values: Any) -> bool:

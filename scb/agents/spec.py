@@ -124,7 +124,7 @@ class AgentSpec:
                 check_value(name, value)
         return replace(
             self,
-            config=replace(self.config, **{k: v for k, v in values.items() if k in static}),
+            config=configured(self.config, {k: v for k, v in values.items() if k in static}),
             hyperparameters=replace(
                 self.hyperparameters, **{k: v for k, v in values.items() if k in traced}
             ),

@@ -56,7 +56,9 @@ def test_the_page_says_returns_and_differences(report):
     assert row.count("(\u2212500)") == 2 and row.count("(\u2212500.00)") == 1
     assert row.endswith("| 2 | 1.5 |")
     assert "- no reward noise: `lpo meta-train --reward-noise=0.0`" in page
-    assert "| shown to be worse, references included | none | none |" in page  # of two searches of the default
+    assert (
+        "| shown to be worse, references included | none | none |" in page
+    )  # of two searches of the default
     (figure,) = module.EXPERIMENT.figures(report).values()
     assert len(figure.axes) == len(module.EVALUATIONS)
 

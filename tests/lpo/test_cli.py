@@ -507,6 +507,54 @@ def test_inner_agents_hyperparameters_are_read_from_one_line(one_sentence):
         assert message in one_sentence(str(error.value))
 
 
+def test_objectives_are_compared_with_the_hyperparameters_that_are_given(
+    capsys, monkeypatch, working_folder, one_sentence
+):
+    monkeypatch.undo()  # it trains
+    monkeypatch.chdir(working_folder)
+    flags = [
+        "evaluate",
+        "--environment=Pendulum-v1",
+        "--steps=400",
+        "--seeds=2",
+        "--objectives=ppo",
+    ]
+    given = "learning_rate=0.5 num_envs=2 num_steps=50 num_minibatches=2 activation=tanh hidden_sizes=[8]"
+    assert cli.main([*flags, f"--hyperparameters={given}", "--out=mine"]) == 0
+    assert cli.main(["evaluate", "--resume=mine"]) == 0
+    told = json.loads((working_folder / "mine" / "comparison.json").read_text())["curves"][0]
+    assert told["steps"][-1] == 400 and told["hyperparameters"] == {
+        "learning_rate": 0.5,
+        "num_envs": 2,
+        "num_steps": 50,
+        "num_minibatches": 2,
+        "activation": "tanh",
+        "hidden_sizes": [8],
+    }
+    capsys.readouterr()
+    assert cli.main(["evaluate", "--resume=mine", "--hyperparameters=learning_rate=0.1"]) == 2
+    assert "hyperparameters" in one_sentence(capsys.readouterr().err.removesuffix("\n"))
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ("learning_rate", "the part 'learning_rate', which is no NAME=VALUE: write such as"),
+        ("learning_rat=0.1", "unknown hyperparameter of PPO 'learning_rat': did you mean"),
+        ("learning_rate=fast", "learning_rate has the value 'fast', which is no number"),
+        ("learning_rate=NaN", "learning_rate has the value 'NaN', which is no number"),
+        ("num_envs=1.5", "num_envs is 1.5: it must be a whole number"),
+        ("activation=sine", "unknown activation 'sine'"),
+        ("anneal_learning_rate=1", "anneal_learning_rate is 1: it must be true or false"),
+        ("drift=0.3", "unknown hyperparameter of PPO 'drift'"),
+        ("num_minibatches=3", "num_minibatches is 3, which does not divide a batch"),
+    ],
+)
+def test_hyperparameters_that_ppo_cannot_have_are_refused(given, message, refused):
+    for where in ("--environment=Pendulum-v1", "--suite=classic"):
+        assert message in refused("evaluate", where, f"--hyperparameters={given}", "--out=o")
+
+
 def test_objectives_are_listed_with_what_ppo_earns_with_them(capsys):
     assert cli.main(["list"]) == 0
     rows = [line.strip(" │").split("│") for line in capsys.readouterr().out.splitlines()]
