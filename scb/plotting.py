@@ -5,6 +5,7 @@ can be made in a library, a server or a test alike. Colours are those of Okabe a
 stay apart for colour-blind readers.
 """
 
+import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -27,6 +28,7 @@ GREY = "#555555"
 
 WIDTH = 9.0  # inches; a page shows them at about 100 px an inch, so 10 pt are 14 px
 DPI = 200
+CHARACTERS = 10  # of a figure's title, an inch
 
 _STYLE: dict[str, Any] = {
     "axes.axisbelow": True,
@@ -153,8 +155,9 @@ def figure_style() -> Iterator[None]:
 
 
 def figure_title(figure: Figure, text: str) -> None:
-    """The title of the whole figure, on the left."""
-    figure.suptitle(text, x=0.01, ha="left", fontsize=11, fontweight="bold")
+    """The title of the whole figure, on the left, in as many lines as it takes."""
+    wrapped = textwrap.fill(text, round(CHARACTERS * figure.get_figwidth()))
+    figure.suptitle(wrapped, x=0.01, ha="left", fontsize=11, fontweight="bold")
 
 
 def legend_below(figure: Figure, entries: tuple[list[Any], list[Any]], columns: int) -> None:

@@ -114,6 +114,12 @@ def test_the_figure_says_under_which_protocol_it_was_measured():
     title = figures.learning_curves([made]).get_suptitle()
     for said in ("hopper", "spring physics", "sampled actions", "20 episodes", "n = 4 seeds"):
         assert said in title
+    made = curve(
+        hyperparameters={"learning_rate": 0.0005, "num_minibatches": 32, "gae_lambda": 0.8}
+    )
+    title = figures.learning_curves([made]).get_suptitle()
+    assert "learning_rate 0.0005, num_minibatches 32, gae_lambda 0.8" in title.replace("\n", " ")
+    assert max(map(len, title.splitlines())) <= 90 and "\n" in title
 
 
 def test_only_diagnosed_agents_are_drawn_and_an_objective_without_any_is_refused():
@@ -133,7 +139,13 @@ def test_only_diagnosed_agents_are_drawn_and_an_objective_without_any_is_refused
 
 @pytest.mark.parametrize(
     "change",
-    [{"environment": "hopper"}, {"backend": "spring"}, {"mode_actions": False}, {"episodes": 5}],
+    [
+        {"environment": "hopper"},
+        {"backend": "spring"},
+        {"mode_actions": False},
+        {"episodes": 5},
+        {"hyperparameters": {"learning_rate": 0.1}},
+    ],
 )
 def test_curves_of_different_protocols_are_refused(change):
     with pytest.raises(UserError, match="one figure compares objectives under one protocol"):
