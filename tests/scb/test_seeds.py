@@ -49,6 +49,7 @@ REPORTERS = {
             "episode_lengths",
             "experts",
             "generality",
+            "learning_rates",
             "linear_fits",
             "locomotion",
             "lpo_on_bandits",
