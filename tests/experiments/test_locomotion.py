@@ -296,6 +296,11 @@ def test_a_confirmation_has_a_reference_of_its_own(monkeypatch):
     assert "a twentieth of what dpo earns" in judged.claim.reason
     row = "than dpo | 10, seeds 4 to 13 | lpo-pendulum | "
     assert row in module.EXPERIMENT.page(made)
+    for agents in made["environments"]["hopper"]["agents"]["lpo-pendulum"].values():
+        agents["returns"] = "0 50 9000"
+    page = module.EXPERIMENT.page(made)
+    said = "Confirmed beside another: on hopper, lpo-pendulum earns no less over the last quarter than dpo."
+    assert f"{said}** PPO has" in page
 
 
 def test_the_shipped_curves_are_of_the_full_size_and_stand_beside_shorter_trainings():
