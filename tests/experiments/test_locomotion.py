@@ -299,7 +299,7 @@ def test_a_confirmation_has_a_reference_of_its_own(monkeypatch):
     for agents in made["environments"]["hopper"]["agents"]["lpo-pendulum"].values():
         agents["returns"] = "0 50 9000"
     page = module.EXPERIMENT.page(made)
-    said = "Confirmed beside another: on hopper, lpo-pendulum earns no less over the last quarter than dpo."
+    said = "Confirmed: on hopper, lpo-pendulum earns no less over the last quarter than dpo."
     assert f"{said}** PPO has" in page
 
 
