@@ -29,7 +29,7 @@ from scb import plotting
 from scb.environments.registry import environment_spec
 from scb.environments.zoo import bandit_metadata
 from scb.errors import UserError, at_least
-from scb.statistics import iqm
+from scb.statistics import halves_agree, iqm
 
 BACKEND = "generalized"
 PENDULUM = "Pendulum-v1"
@@ -192,10 +192,25 @@ def facts(report: Report) -> dict[str, Any]:
             for environment, pairs in in_order.items()
         },
         "earned": earned,
+        "agree": {
+            environment: {
+                outcome: _agree(ranked(environment, report["environments"][environment]), outcome)
+                for outcome in OUTCOMES
+            }
+            for environment in found
+        },
         "labels": LABELS,
         "judged_by": FITNESS,
         "outcomes": OUTCOMES,
     }
+
+
+def _agree(curves: Mapping[str, LearningCurves], outcome: str) -> float | None:
+    """How far halves of the environment's own agents rank the objectives alike; None where they are too few."""
+    number = min(len(curve.seeds) for curve in curves.values())
+    if number < 2:
+        return None
+    return halves_agree([getattr(curve, outcome)[:number] for curve in curves.values()])
 
 
 def _text(found: Alignment) -> str:

@@ -296,6 +296,33 @@ def rank_correlations(a: NDArray[np.floating], b: NDArray[np.floating]) -> NDArr
     return np.divide(products, spread, out=np.zeros_like(products), where=spread > 0)
 
 
+def halves_agree(x: ArrayLike, splits: int = 1000) -> float:
+    """How far the means of one half of the runs rank groups as those of the other half do.
+
+    That bounds what anything else can rank them by: all runs together agree with as many others by about
+    2 r / (1 + r) (Spearman and Brown, 1910), and with what has no scatter by the root of that.
+
+    Args:
+      x: [N, S] of N groups, S runs of each.
+      splits: drawn, of which the result is the mean rank correlation.
+
+    Raises:
+      UserError: fewer than two groups, or than two runs of each.
+    """
+    runs = np.asarray(x, np.float64)
+    if runs.ndim != 2 or min(runs.shape) < 2:
+        raise UserError(
+            f"halves of runs of the shape {runs.shape} rank nothing: give 2 groups or more, of 2 runs or more each."
+        )
+    generator = np.random.default_rng(0)
+    orders = generator.permuted(np.tile(np.arange(runs.shape[1]), (splits, 1)), axis=1)
+    half = runs.shape[1] // 2
+    one, other = (
+        runs[:, of].mean(axis=2).T for of in (orders[:, :half], orders[:, half : 2 * half])
+    )
+    return float(rank_correlations(one, other).mean())
+
+
 def _check_confidence(confidence: float) -> None:
     if not 0 < confidence < 1:
         raise UserError(f"confidence is {confidence}: give a number between 0 and 1, such as 0.95.")

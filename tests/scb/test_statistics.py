@@ -9,6 +9,7 @@ from scb.statistics import (
     Estimate,
     estimate,
     few_groups_difference,
+    halves_agree,
     iqm,
     median,
     normalized_score,
@@ -397,3 +398,23 @@ def test_few_groups_that_differ_in_nothing_have_no_width():
 def test_few_groups_that_cannot_be_compared_are_refused(groups, minus, paired, message):
     with pytest.raises(UserError, match=message):
         few_groups_difference(groups, minus, paired)
+
+
+def test_halves_of_runs_agree_as_far_as_groups_are_apart():
+    generator = np.random.default_rng(1)
+    groups, noise = np.arange(40.0)[:, None], generator.normal(size=(40, 6))
+    assert halves_agree(groups + 0.001 * noise) == pytest.approx(1.0)
+    assert abs(halves_agree(noise)) < 0.3
+    # Two runs of each have one split: the correlation of the one with the other.
+    pair = groups + 20 * noise[:, :2]
+    assert halves_agree(pair) == pytest.approx(spearman(pair[:, 0], pair[:, 1]))
+    # Of three runs a half is one, and a third stays out each time: the mean of the three pairs.
+    three = groups + 20 * noise[:, :3]
+    pairs = [spearman(three[:, i], three[:, j]) for i, j in ((0, 1), (0, 2), (1, 2))]
+    assert halves_agree(three) == pytest.approx(np.mean(pairs), abs=0.02)
+
+
+@pytest.mark.parametrize("runs", [[[1.0, 2.0]], [[1.0], [2.0]], [1.0, 2.0]])
+def test_one_group_or_one_run_of_each_has_no_halves(runs):
+    with pytest.raises(UserError, match="2 groups or more, of 2 runs or more each"):
+        halves_agree(runs)
