@@ -1,14 +1,14 @@
-"""At which learning rates of PPO does an objective matter, and does tuning the rate do as much as a learned objective?
+"""At which learning rates of PPO does an objective earn more than PPO's clip, and does it where each has its best rate?
 
     python -m experiments learning_rates
 
 PPO has each environment's own setting but for the learning rate. For every objective apart agents on seeds that report
 nothing choose the rate, and others are reported. What --out holds is not measured again: the same command goes on
-where it was, and with other environments, objectives or rates adds to it.
+where it was, and with other environments or objectives adds to it.
 """
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -18,25 +18,29 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from experiments.claims import Claim
-from experiments.harness import Experiment, Report, packed, settled, unpacked
-from experiments.parts import InParts, Keys, Part
+from experiments.claims import FAILS, HOLDS, Claim, Judged, judge, of_agents
+from experiments.harness import Experiment, Report, learned_for, packed, settled, unpacked
+from experiments.parts import InParts, Part
 from lpo.comparison import compare, ppo_spec
 from lpo.figures import looks
-from lpo.objectives import learned_in, load_objective
+from lpo.objectives import check_names, learned_in, load_objective
 from lpo.suite import suite
 from scb import plotting
+from scb.agents.spec import AgentSpec
 from scb.environments.registry import environment_spec
 from scb.errors import UserError, at_least
 from scb.rows import Rows
 from scb.seeds import reporting, validation
-from scb.statistics import Estimate, estimate, normalized_score, stratified_estimate
+from scb.statistics import Estimate, normalized_score, stratified_estimate
 
 REFERENCE = "ppo"
 REFERENCES = (REFERENCE, "dpo")
-FIRST = 15_000  # of the seeds that report
-LARGE, SMALL = 0.003, 0.0003  # from the one on, and up to the other
+OFFSET = 15_000  # of the first seed, among those that report
+LARGE, SMALL = 0.003, 0.0003  # a rate of at least, and of at most, so much
 CHOOSING, REPORTED = "choosing", "reported"
+
+Scores = dict[str, dict[str, dict[float, NDArray[np.floating]]]]
+Rates = Mapping[str, Mapping[str, Sequence[float]]]
 
 
 @dataclass(frozen=True)
@@ -58,6 +62,8 @@ class Options:
 
     def __post_init__(self) -> None:
         at_least(2, self, "agents", "choosing")
+        if not self.environments or not self.rates:
+            raise UserError("no environments or no learning rates: give at least one of each.")
         for environment in self.environments:
             if environment_spec(environment).reference() is None:
                 raise UserError(
@@ -67,36 +73,42 @@ class Options:
 
 def parts(options: Options, report: dict[str, Any]) -> Iterator[Part]:
     """The agents of one objective at one rate in one environment, first those that choose."""
-    settled(report, agents=options.agents, choosing=options.choosing)
-    names = tuple(dict.fromkeys((REFERENCE, *options.objectives)))
-    for name in names:
-        load_objective(name)  # that nobody waits for a name that is none
+    settled(report, agents=options.agents, choosing=options.choosing, rates=options.rates)
+    names = tuple(dict.fromkeys((*REFERENCES, *options.objectives)))
+    check_names([load_objective(name) for name in names])  # that nobody waits for a mistake
     seeds = {
         CHOOSING: validation(options.choosing),
-        REPORTED: reporting(options.agents, offset=FIRST),
+        REPORTED: reporting(options.agents, offset=OFFSET),
     }
-    for environment in options.environments:
-        for rate in options.rates:
-            for name in names:
-                path: Keys = ("environments", environment)
-                keys = tuple((role, name, f"{rate:g}") for role in seeds)
-                yield Part(
-                    path, partial(_trained, environment, name, rate, seeds, options.runs), keys
-                )
+    specs = {
+        (environment, rate): ppo_spec(environment, hyperparameters={"learning_rate": rate})
+        for environment in options.environments
+        for rate in options.rates
+    }
+    for (environment, rate), spec in specs.items():
+        for name in names:
+            places = tuple((role, name, str(rate)) for role in seeds)
+            trained = partial(_trained, environment, name, spec, rate, seeds, options.runs)
+            yield Part(("environments", environment), trained, places)
 
 
 def _trained(
-    environment: str, name: str, rate: float, seeds: Mapping[str, Sequence[int]], runs: Path
+    environment: str,
+    name: str,
+    spec: AgentSpec,
+    rate: float,
+    seeds: Mapping[str, Sequence[int]],
+    runs: Path,
 ) -> dict[str, Any]:
     objective = load_objective(name)
-    safe = re.sub(r"[^\w.-]", "_", f"{name}-{rate:g}")
+    file = re.sub(r"[^\w.-]", "_", f"{name}-{rate}")  # a path's parts are no folders here
     (found,) = compare(
         environment,
         [objective],
         [seed for of_it in seeds.values() for seed in of_it],
-        ppo_spec(environment, hyperparameters={"learning_rate": rate}),
+        spec,
         points=1,
-        rows=Rows(runs / environment / f"{safe}.rows.jsonl"),
+        rows=Rows(runs / environment / f"{file}.rows.jsonl"),
         tell=print,
     ).curves
     earned = dict(zip(found.seeds, found.final, strict=True))
@@ -105,151 +117,172 @@ def _trained(
         "own": float(ppo_spec(environment).hyperparameters.learning_rate),
         "steps": int(found.steps[-1]),
         "learned_on": {name: learned_in([objective])},
-        "failed": {name: {f"{rate:g}": found.failed}},
+        "failed": {name: {str(rate): found.failed}},
         **{
-            role: {name: {f"{rate:g}": packed([[earned[seed] for seed in of_it]])[0]}}
+            role: {name: {str(rate): packed([[earned[seed] for seed in of_it]])[0]}}
             for role, of_it in seeds.items()
         },
     }
 
 
-Scores = dict[str, dict[str, dict[float, NDArray[np.floating]]]]
-
-
 def scores(report: Report, role: str = REPORTED) -> Scores:
-    """{environment: {objective: {rate: [agents]}}}, 0 for random actions and 1 for a published expert.
-
-    Only rates that all objectives of an environment have.
-    """
-    found: Scores = {}
-    for environment, entry in report["environments"].items():
-        expert = environment_spec(environment).reference_return()
-        returns = entry[role]
-        shared = set.intersection(*(set(of_it) for of_it in returns.values()))
-        found[environment] = {
-            name: {
-                float(rate): normalized_score(unpacked([of_it[rate]])[0], entry["random"], expert)
-                for rate in sorted(shared, key=float)
-            }
-            for name, of_it in returns.items()
-        }
-    return found
-
-
-def chosen(report: Report) -> dict[str, dict[str, float]]:
-    """{environment: {objective: the rate with the highest mean score of the agents that choose}}."""
+    """{environment: {objective: {rate: [agents]}}}, 0 for random actions and 1 for a published expert."""
     return {
         environment: {
-            name: max(of_it, key=lambda rate: float(of_it[rate].mean()))
+            name: {
+                float(rate): normalized_score(
+                    unpacked([of_it[rate]])[0],
+                    entry["random"],
+                    environment_spec(environment).reference_return(),
+                )
+                for rate in sorted(of_it, key=float)
+            }
+            for name, of_it in entry[role].items()
+        }
+        for environment, entry in report["environments"].items()
+    }
+
+
+def chosen(report: Report) -> dict[str, dict[str, list[float]]]:
+    """{environment: {objective: [the rate with the highest mean score of the agents that choose]}}.
+
+    Of equal ones the smallest.
+    """
+    return {
+        environment: {
+            name: [max(of_it, key=lambda rate: float(of_it[rate].mean()))]
             for name, of_it in objectives.items()
         }
         for environment, objectives in scores(report, CHOOSING).items()
     }
 
 
-def claims(report: Report) -> list[Claim]:
-    """Of every objective but PPO's clip: more at large rates, at small ones, and each at its best.
+def _asked(report: Report) -> dict[str, Rates]:
+    """{in words: {environment: {objective: rates}}}: where objectives are compared."""
+    scored = scores(report)
 
-    Environments that it was learned for are apart.
-    """
-    scored, best = scores(report), chosen(report)
-    found = []
-    for name in dict.fromkeys(name for of_it in scored.values() for name in of_it):
-        if name == REFERENCE:
-            continue
-        homes = {
-            home
-            for entry in report["environments"].values()
-            for home in entry["learned_on"].get(name, ())
+    def those(wanted: Callable[[float], bool]) -> Rates:
+        # The same for all objectives.
+        return {
+            place: dict.fromkeys(
+                of_it, tuple(filter(wanted, sorted(set.intersection(*map(set, of_it.values())))))
+            )
+            for place, of_it in scored.items()
         }
-        unseen = [place for place, of_it in scored.items() if name in of_it and place not in homes]
-        for words, wanted in _ranges(scored).items():
-            text = f"{name} earns more than {REFERENCE} at {words}"
-            found.append(Claim(text, _more(scored, unseen, name, REFERENCE, wanted)))
-        for other in REFERENCES if name not in REFERENCES else (REFERENCE,):
-            text = f"{name} earns more than {other}, each at its best rate"
-            found.append(Claim(text, _more(scored, unseen, name, other, best)))
-            for home in sorted(homes & scored.keys()):
-                found.append(Claim(f"{home}: {text}", _more(scored, [home], name, other, best)))
+
+    return {
+        f"at rates of {LARGE} and more": those(lambda rate: rate >= LARGE),
+        f"at rates of {SMALL} and less": those(lambda rate: rate <= SMALL),
+        "each at the rate chosen for it": chosen(report),
+    }
+
+
+def compared(report: Report) -> list[tuple[str, str, str, Claim]]:
+    """(objective, the other, in words where, claim), over the environments that it was not learned for.
+
+    Every objective is compared with PPO's clip, and learned ones with DPO where each has its best rate, there also
+    in each environment that they were learned for.
+    """
+    scored, found = scores(report), []
+    for words, rates in _asked(report).items():
+        for name in _names(scored):
+            homes = learned_for(report, name)
+            at_best = words.startswith("each")
+            for other in REFERENCES if at_best and name not in REFERENCES else (REFERENCE,):
+                both = [place for place, of_it in scored.items() if {name, other} <= of_it.keys()]
+                text = f"{name} earns more than {other}, {words}"
+                unseen = [place for place in both if place not in homes]
+                sets = {f"over {len(unseen)} environments": unseen} if unseen else {}
+                sets |= {place: [place] for place in both if at_best and place in homes}
+                for where, places in sets.items() if name != other else ():
+                    evidence = _more(scored, places, name, other, rates)
+                    claim = Claim(f"{text}, {where}", evidence)
+                    found.append((name, other, f"{words}, {where}", claim))
     return found
 
 
-Rates = Mapping[str, Mapping[str, Sequence[float] | float]]
+def _names(scored: Scores) -> list[str]:
+    return list(dict.fromkeys(name for of_it in scored.values() for name in of_it))
 
 
-def _ranges(scored: Scores) -> dict[str, Rates]:
-    """{in words: {environment: {objective: rates}}}."""
-    asked = {
-        f"rates of {LARGE:g} and more": lambda rate: rate >= LARGE,
-        f"rates of {SMALL:g} and less": lambda rate: rate <= SMALL,
-    }
-    return {
-        words: {
-            place: {
-                name: [rate for rate in of_it if is_asked(rate)] for name, of_it in found.items()
-            }
-            for place, found in scored.items()
-        }
-        for words, is_asked in asked.items()
-    }
-
-
-def _more(scored: Scores, places: Sequence[str], name: str, other: str, rates: Rates) -> Any:
-    """The difference of mean scores over environments, between agents of the same seeds; None where there are none."""
+def _more(
+    scored: Scores, places: Sequence[str], name: str, other: str, rates: Rates
+) -> Callable[..., Estimate] | Estimate | None:
+    """The difference of mean scores over environments, between agents of the same seeds; None without such rates."""
 
     def groups(of: str) -> list[NDArray[np.floating]]:
         return [
-            np.mean([scored[place][of][rate] for rate in np.atleast_1d(rates[place][of])], axis=0)
+            np.mean([scored[place][of][rate] for rate in rates[place][of]], axis=0)
             for place in places
         ]
 
-    if not places or not all(np.size(rates[place][of]) for place in places for of in (name, other)):
+    if not all(rates[place][of] for place in places for of in (name, other)):
         return None
-    return partial(stratified_estimate, groups(name), groups(other), statistic=np.mean)
+    ours, theirs = groups(name), groups(other)
+    more = partial(stratified_estimate, ours, theirs, statistic=np.mean)
+    return of_agents(more, min(map(len, ours)))
+
+
+def claims(report: Report) -> list[Claim]:
+    """Those of `compared`."""
+    return [claim for *_, claim in compared(report)]
 
 
 def facts(report: Report) -> dict[str, Any]:
-    """A row for each objective: its best rate in each environment, and what it earns there and over all."""
+    """What is shown, in words; and a row for each objective: its rate in each environment, and what it earns there."""
     scored, best = scores(report), chosen(report)
-    names = list(dict.fromkeys(name for of_it in scored.values() for name in of_it))
-    rows = [
-        {
-            "name": name,
-            "best": {place: best[place][name] for place in scored if name in best[place]},
-            "in": {
-                place: float(scored[place][name][best[place][name]].mean())
-                for place in scored
-                if name in scored[place]
-            },
-            "mean": stratified_estimate(
-                [
-                    of_it[name][best[place][name]]
-                    for place, of_it in scored.items()
-                    if name in of_it
-                ],
-                statistic=np.mean,
-            ),
+    entries = report["environments"]
+    rows = []
+    for name in _names(scored):
+        found = {
+            place: of_it[name][best[place][name][0]]
+            for place, of_it in scored.items()
+            if name in of_it
         }
-        for name in names
-    ]
+        rows.append(
+            {
+                "name": name,
+                "learned_for": learned_for(report, name),
+                "best": {place: best[place][name][0] for place in found},
+                "in": {place: float(x.mean()) for place, x in found.items()},
+                # Over fewer it were no mean of the same.
+                "mean": stratified_estimate(list(found.values()), statistic=np.mean)
+                if len(found) == len(scored)
+                else None,
+            }
+        )
+    pairs = list(zip(compared(report), judge(claims(report)), strict=True))
     return {
         "rows": rows,
-        "own": {place: entry["own"] for place, entry in report["environments"].items()},
-        "steps": {place: entry["steps"] for place, entry in report["environments"].items()},
+        "more": _shown(pairs, HOLDS),
+        "less": _shown(pairs, FAILS),
+        "own": {place: entry["own"] for place, entry in entries.items()},
+        "steps": {place: entry["steps"] for place, entry in entries.items()},
         "failed": sum(
             number
-            for entry in report["environments"].values()
+            for entry in entries.values()
             for of_it in entry["failed"].values()
             for number in of_it.values()
         ),
-        "seeds": (reporting(1, offset=FIRST)[0], validation()[0]),
+        "seeds": (reporting(1, offset=OFFSET)[0], validation()[0]),
     }
+
+
+def _shown(
+    pairs: Sequence[tuple[tuple[str, str, str, Claim], Judged]], outcome: str
+) -> dict[str, list[str]]:
+    """{where, in words: objectives} of the comparisons with PPO's clip that end so."""
+    found: dict[str, list[str]] = {}
+    for (name, other, words, _), judged in pairs:
+        if other == REFERENCE and judged.outcome == outcome:
+            found.setdefault(words, []).append(name)
+    return found
 
 
 def draw(report: Mapping[str, Any]) -> Figure:
     """Scores against the learning rate: over all environments, then in each."""
     scored = scores(report)
-    style = looks(list(dict.fromkeys(name for of_it in scored.values() for name in of_it)))
+    style = looks(_names(scored))
     figure = Figure(figsize=(plotting.WIDTH, 2.7 * -(-(len(scored) + 1) // 3)))
     panels = iter(figure.subplots(-(-(len(scored) + 1) // 3), 3, squeeze=False).flat)
     for title, places in {"all of them": list(scored), **{p: [p] for p in scored}}.items():
@@ -258,27 +291,25 @@ def draw(report: Mapping[str, Any]) -> Figure:
             if not all(name in scored[place] for place in places):
                 continue
             rates = sorted(set.intersection(*(set(scored[place][name]) for place in places)))
-            found = [_mean([scored[place][name][rate] for place in places]) for rate in rates]
+            found = [
+                stratified_estimate(
+                    [scored[place][name][rate] for place in places], statistic=np.mean
+                )
+                for rate in rates
+            ]
             plotting.estimate_curve(
-                axes, rates, found, look.color, look.linestyle, name, look.marker
+                axes, rates, found, look.color, look.linestyle, marker=look.marker
             )
         axes.set(title=title, xscale="log", xlabel="learning rate", ylabel="score")
     for unused in panels:
         unused.set_visible(False)
-    handles, labels = figure.axes[0].get_legend_handles_labels()
-    plotting.legend_below(figure, (handles, labels), len(labels))
+    plotting.legend_of(figure, {name: vars(look) for name, look in style.items()}, len(style))
     return figure
-
-
-def _mean(groups: list[NDArray[np.floating]]) -> Estimate:
-    if len(groups) == 1:
-        return estimate(groups[0], np.mean)
-    return stratified_estimate(groups, statistic=np.mean)
 
 
 EXPERIMENT = Experiment(
     "learning_rates",
-    "At which learning rates does an objective matter?",
+    "At which learning rates does an objective earn more?",
     InParts(parts),
     draw=draw,
     claims=claims,

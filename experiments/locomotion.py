@@ -185,11 +185,15 @@ def claims(report: Report) -> list[Claim]:
     """Of every objective but the reference, by each of `ASKED`."""
     found = []
     for environment, entry in looked_at(report).items():
-        curves = {x.objective: x for x in as_comparison(environment, entry).curves}
+        curves = _by_name(environment, entry)
         reference = curves.pop(REFERENCE)
         for of_it in curves.values():
             found += [_claim(of_it, reference, of) for of in ASKED]
     return found
+
+
+def _by_name(environment: str, entry: Report) -> dict[str, LearningCurves]:
+    return {curve.objective: curve for curve in as_comparison(environment, entry).curves}
 
 
 def _claim(curves: LearningCurves, reference: LearningCurves, of: str) -> Claim:
@@ -218,8 +222,9 @@ def confirmed(report: Report) -> list[tuple[Confirmation, int, Judged | None]]:
             entry = report["environments"][asked.environment]
             names = (asked.reference, asked.objective)
             fresh = {name: {s: entry["agents"][name][s] for s in seeds} for name in names}
-            reference, curves = as_comparison(asked.environment, {**entry, "agents": fresh}).curves
-            (judged,) = judge([_claim(curves, reference, asked.of)])
+            curves = _by_name(asked.environment, {**entry, "agents": fresh})
+            claim = _claim(curves[asked.objective], curves[asked.reference], asked.of)
+            (judged,) = judge([claim])
         found.append((asked, len(seeds), judged))
     return found
 
@@ -237,8 +242,8 @@ def _since(report: Report, asked: Confirmation) -> tuple[list[int], Estimate] | 
     shared = sorted(set.intersection(*map(set, later.values())), key=int)
     if len(shared) < DECIDING:
         return None
-    reference, curves = as_comparison(asked.environment, {**entry, "agents": later}).curves
-    found = paired(curves, reference, asked.of)
+    curves = _by_name(asked.environment, {**entry, "agents": later})
+    found = paired(curves[asked.objective], curves[asked.reference], asked.of)
     assert callable(found)
     return [int(seed) for seed in shared], found()
 

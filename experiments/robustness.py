@@ -21,7 +21,16 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from experiments.claims import TENTH, Claim
-from experiments.harness import Experiment, Report, finite, packed, plan_of, settled, unpacked
+from experiments.harness import (
+    Experiment,
+    Report,
+    finite,
+    learned_for,
+    packed,
+    plan_of,
+    settled,
+    unpacked,
+)
 from experiments.parts import InParts, Part
 from lpo.comparison import ppo_spec
 from lpo.objectives import Objective, check_names, learned_in, load_objective
@@ -178,12 +187,8 @@ def claims(report: Report) -> list[Claim]:
     for name in named(scored):
         if name in REFERENCES:
             continue
-        learned_on = {
-            place
-            for entry in report["environments"].values()
-            for place in entry["learned_on"].get(name, ())
-        }
-        unseen = {place: x for place, x in scored.items() if place not in learned_on}
+        homes = learned_for(report, name)
+        unseen = {place: x for place, x in scored.items() if place not in homes}
         for other in (REFERENCE, "dpo"):
             ours, theirs = groups(unseen, name, other)
             if not ours:

@@ -68,10 +68,12 @@ def read_comparison(path: Path) -> dict[str, Any]:
     try:
         whole = json.loads(path.read_text())
         curves, first = whole["curves"], whole["curves"][0]
-        names = ("environment", "backend", "seeds", "episodes", "mode_actions", "hyperparameters")
+        names = ("environment", "backend", "seeds", "episodes", "mode_actions")
         return {
             **{name: first[name] for name in names},
             "steps": first["steps"][-1],
+            # Those of earlier versions say the one that could be other.
+            "hyperparameters": first.get("hyperparameters", _of_earlier(first)),
             "reference": whole["reference"],
             "final_iqm": {c["objective"]: c["final_iqm"] for c in curves},
             "area_iqm": {c["objective"]: c["area_iqm"] for c in curves},
@@ -82,6 +84,11 @@ def read_comparison(path: Path) -> dict[str, Any]:
         raise UserError(
             f"{path} is no comparison ({error}): give a comparison.json of lpo evaluate."
         ) from error
+
+
+def _of_earlier(curve: Mapping[str, Any]) -> dict[str, Any]:
+    scale = curve.get("policy_output_scale", 1.0)
+    return {} if scale == 1.0 else {"policy_output_scale": scale}
 
 
 def compared(path: Path, formulas: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

@@ -14,9 +14,9 @@ import numpy as np
 
 from lpo.objectives import Objective, check_names, load_objective
 from scb.agents.ppo import DIAGNOSIS
-from scb.agents.spec import AgentSpec, check_value, environment_agent
+from scb.agents.spec import AgentSpec, environment_agent
 from scb.environments.registry import environment_spec
-from scb.errors import one_of
+from scb.errors import UserError, one_of
 from scb.files import plain
 from scb.measurement import MODE, SAMPLED, Place, as_random, measure
 from scb.rows import Rows, pivot
@@ -190,11 +190,12 @@ def ppo_spec(
       UserError: there is no such hyperparameter, or it cannot have the value.
     """
     spec = environment_agent("ppo", environment).with_steps(steps)
-    traced = [f.name for f in fields(spec.hyperparameters)]
     for name, value in hyperparameters.items():
         one_of("hyperparameter of PPO", name, _values(spec))
-        if name in traced:
-            check_value(name, value)
+        if value is None:
+            raise UserError(
+                f"{name} has no value: give one, or leave it out for the environment's own."
+            )
     return spec.with_values(**hyperparameters)
 
 
@@ -204,9 +205,14 @@ def changed(spec: AgentSpec, environment: str) -> dict[str, Any]:
     return {name: value for name, value in _values(spec).items() if value != own[name]}
 
 
+def _as_json(value: Any) -> Any:
+    """A number of NumPy or JAX as Python's."""
+    return value.item() if hasattr(value, "item") else value
+
+
 def _values(spec: AgentSpec) -> dict[str, Any]:
     return {
-        f.name: getattr(of, f.name)
+        f.name: _as_json(getattr(of, f.name))
         for of in (spec.hyperparameters, spec.config)
         for f in fields(of)
         if f.name not in _APART
@@ -262,6 +268,7 @@ def compare(
         tell=tell,
     )
     steps = np.asarray(list(dict.fromkeys(row["step"] for row in found)))
+    other = changed(spec, environment)
     columns = ("return", "length", "speed", *(DIAGNOSIS if diagnose else ()))
     measured = {value: pivot(found, "objective", "seed", "step", value=value) for value in columns}
     measured["return"], failed = as_random(measured["return"], place)
@@ -276,7 +283,7 @@ def compare(
                 list(seeds),
                 episodes,
                 mode_actions,
-                changed(spec, environment),
+                other,
                 measured["length"][i],
                 measured["speed"][i],
                 {name: measured[name][i] for name in DIAGNOSIS} if diagnose else None,

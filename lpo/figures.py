@@ -324,7 +324,8 @@ def _place(curve: "LearningCurves") -> str:
 
 def _protocol(curve: "LearningCurves") -> str:
     actions = "mode" if curve.mode_actions else "sampled"
-    values = "".join(f", {name} {value}" for name, value in curve.hyperparameters.items())
+    words = {"policy_output_scale": "policy's last layer x"}
+    values = "".join(f", {words.get(k, k)} {value}" for k, value in curve.hyperparameters.items())
     return f"{_place(curve)}{values}: {actions} actions, {curve.episodes} episodes"
 
 

@@ -39,6 +39,10 @@ class Confirmation:
     reference: str = REFERENCE
     known: str | None = None
 
+    def __post_init__(self) -> None:
+        if self.known not in (None, self.reference, self.objective):
+            raise ValueError(f"known is one of both objectives, or None: {self}.")
+
     @property
     def trained(self) -> list[str]:
         """Of which objectives agents are trained for it."""
@@ -80,7 +84,7 @@ def with_pairs(report: Mapping[str, Any]) -> Iterator[tuple[Confirmation, list[s
 
 
 def looked_at(report: Mapping[str, Any]) -> dict[str, Any]:
-    """{environment: its entry} without the agents of confirmations that are not complete.
+    """{environment: its entry} without the agents that are trained for confirmations which are not complete.
 
     Who looks at a difference while it grows sees it pass its margin sooner or later.
     """
@@ -89,8 +93,7 @@ def looked_at(report: Mapping[str, Any]) -> dict[str, Any]:
     for environment, entry in report["environments"].items():
         agents = {name: dict(of_it) for name, of_it in entry["agents"].items()}
         for asked in pending:
-            names = asked.trained if asked.known else list(agents)
-            for name in names if asked.environment == environment else ():
+            for name in asked.trained if asked.environment == environment else ():
                 for seed in asked.seeds:
                     agents[name].pop(str(seed), None)
         found[environment] = {**entry, "agents": {k: of_it for k, of_it in agents.items() if of_it}}

@@ -31,7 +31,7 @@ ADVANTAGES = (-3.0, 3.0)
 # In the order in which tables and figures show them.
 REGIONS = {
     "rolls back": "the ratio has moved in the advantage's direction and the gradient moves it back: h < -0.05",
-    "flat": "it has moved in the advantage's direction and the gradient is gone: |h| <= 0.05",
+    "flat": "it has moved in the advantage's direction and the gradient is gone: -0.05 <= h <= 0.05",
     "cautious": "it has moved so inside PPO's clip, and the gradient is damped: 0.05 < h < 0.95",
     "free": "the surrogate's own gradient, 0.95 <= h <= 1.05, inside PPO's clip or on the way back to 1",
     "optimistic": "it has moved so beyond PPO's clip, where PPO stops, and still goes on: h > 0.05",

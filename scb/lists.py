@@ -83,13 +83,17 @@ def write_values(values: Mapping[str, Sequence[float]]) -> str:
 
 def read_settings(words: str) -> dict[str, Any]:
     """{field of an agent: value} from "learning_rate=0.001 num_envs=16 activation=relu hidden_sizes=[64,64]"."""
-    values: dict[str, Any] = {}
-    for name, value in _parts(words, "NAME=VALUE", "learning_rate=0.001"):
+    form = "NAME=VALUE without a space"
+    return {name: _setting(value) for name, value in _parts(words, form, "learning_rate=0.001")}
+
+
+def _setting(word: str) -> Any:
+    for read in (strict_json, float):
         try:
-            values[name] = strict_json(value)
-        except ValueError:  # a word
-            values[name] = value
-    return values
+            return read(word)
+        except ValueError:
+            continue
+    return {"True": True, "False": False}.get(word, word)
 
 
 def write_settings(values: Mapping[str, Any]) -> str:
@@ -102,12 +106,16 @@ def write_settings(values: Mapping[str, Any]) -> str:
 
 
 def _parts(words: str, form: str, example: str) -> Iterator[tuple[str, str]]:
+    named = set()
     for part in words.split():
         name, equals, value = part.partition("=")
         if not equals:
             raise UserError(
                 f"hyperparameters {words!r} have the part {part!r}, which is no {form}: write such as {example}."
             )
+        if name in named:
+            raise UserError(f"hyperparameters {words!r} have {name} twice: give it once.")
+        named.add(name)
         yield name, value
 
 

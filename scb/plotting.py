@@ -28,7 +28,7 @@ GREY = "#555555"
 
 WIDTH = 9.0  # inches; a page shows them at about 100 px an inch, so 10 pt are 14 px
 DPI = 200
-CHARACTERS = 10  # of a figure's title, an inch
+CHARACTERS = 10  # an inch, of a title in bold 11 pt
 
 _STYLE: dict[str, Any] = {
     "axes.axisbelow": True,

@@ -292,7 +292,8 @@ class Stopwatch:
 def first_difference(stored: Any, given: Any, growing: Collection[str] = (), path: str = "") -> str:
     """Where two trees of JSON differ first, such as "a.b (1 there, 2 now)"; empty where they don't.
 
-    Entries of `growing`, by such a path, may be more than they were (`grown`).
+    Entries of `growing`, by such a path, may be more than they were (`grown`). What one of them lacks is as good as
+    empty: a later version has settings that an earlier one had not.
     """
     if isinstance(stored, dict) and isinstance(given, dict):
         for key in sorted(stored.keys() | given.keys()):
@@ -301,7 +302,10 @@ def first_difference(stored: Any, given: Any, growing: Collection[str] = (), pat
             if difference:
                 return difference
         return ""
-    if stored == given or (path in growing and grown(stored, given)):
+    empty: tuple[Any, ...] = (None, {}, [])
+    if stored == given or (stored in empty and given in empty):
+        return ""
+    if path in growing and grown(stored, given):
         return ""
     return f"{path} ({stored!r} there, {given!r} now)"
 

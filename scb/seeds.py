@@ -31,6 +31,11 @@ def searching(seed: int) -> int:
 
 def validation(number: int = 1) -> list[int]:
     """The first seeds that judge the end of a search."""
+    if not 1 <= number <= len(VALIDATING):
+        raise UserError(
+            f"{number} validation seeds are asked for: there are {len(VALIDATING)}, give at least 1 and no more than "
+            "that."
+        )
     return list(VALIDATING[:number])
 
 

@@ -120,7 +120,7 @@ class AgentSpec:
                 raise UserError(
                     f"{self.algorithm} has no {name}: known are {', '.join((*static, *traced))}."
                 )
-            if name in traced and isinstance(value, int | float):
+            if name in traced and isinstance(value, int | float | str):
                 check_value(name, value)
         return replace(
             self,

@@ -10,99 +10,145 @@ from experiments import learning_rates as module
 from experiments.harness import packed
 from lpo.comparison import Comparison, LearningCurves
 from scb.environments.registry import environment_spec
-from scb.errors import UserError
 from scb.seeds import REPORTING, VALIDATING
 
-RATES = ("0.0003", "0.003", "0.01")
+RATES = (0.0003, 0.003, 0.01)
 
 
-def entry(environment, choosing, reported):
-    """Returns of agents whose scores are these, give or take a little: {objective: a score at each rate}."""
+def packed_scores(environment, scores, number, seed):
+    """{objective: {rate: returns}} of agents whose mean scores are these, scattered alike for all objectives."""
     spec = environment_spec(environment)
     random, best = spec.random_return(), spec.reference_return()
-    roles = {module.CHOOSING: (choosing, 10), module.REPORTED: (reported, 20)}
+    scatter = np.random.default_rng(seed).normal(scale=0.3, size=number)
+    scatter -= scatter.mean()
+    own = np.random.default_rng(seed + 1).normal(scale=0.01, size=(len(scores), number))
+    own -= own.mean(axis=1, keepdims=True)
     return {
-        "random": random,
+        name: {
+            str(rate): packed([random + (best - random) * (x + scatter + little)])[0]
+            for rate, x in zip(RATES, of_it, strict=True)
+        }
+        for (name, of_it), little in zip(scores.items(), own, strict=True)
+    }
+
+
+def entry(environment, choosing, reported, number=20):
+    return {
+        "random": environment_spec(environment).random_return(),
         "own": 0.003,
         "steps": 1000,
         "learned_on": {"lpo-pendulum": ["Pendulum-v1"]},
         "failed": {"ppo": {"0.01": 1}},
-        **{
-            role: {
-                name: {
-                    rate: packed(
-                        [random + (best - random) * (x + 0.01 * np.cos(np.arange(number)))]
-                    )[0]
-                    for rate, x in zip(RATES, of_it, strict=True)
-                }
-                for name, of_it in scores.items()
-            }
-            for role, (scores, number) in roles.items()
-        },
+        module.CHOOSING: packed_scores(environment, choosing, 10, 1),
+        module.REPORTED: packed_scores(environment, reported, number, 2),
     }
+
+
+CHOOSING = {"ppo": (0.1, 0.5, 0.2), "dpo": (0.1, 0.2, 0.6), "lpo-pendulum": (0.1, 0.2, 0.9)}
+REPORTED = {"ppo": (0.3, 0.4, 0.9), "dpo": (0.3, 0.5, 0.5), "lpo-pendulum": (0.2, 0.8, 0.8)}
 
 
 @pytest.fixture
 def report():
-    choosing = {"ppo": (0.1, 0.5, 0.2), "dpo": (0.1, 0.2, 0.6), "lpo-pendulum": (0.1, 0.2, 0.9)}
-    reported = {"ppo": (0.3, 0.4, 0.9), "dpo": (0.3, 0.4, 0.5), "lpo-pendulum": (0.2, 0.8, 0.8)}
+    at_home = {"lpo-pendulum": (0.0, 0.0, 0.2)}
+    slow = {"ppo": (0.9, 0.5, 0.2)}
     return {
         "agents": 20,
         "choosing": 10,
+        "rates": list(RATES),
         "environments": {
-            "Pendulum-v1": entry("Pendulum-v1", choosing, reported | {"lpo-pendulum": (0, 0, 0)}),
-            "Acrobot-v1": entry("Acrobot-v1", choosing, reported),
+            "Pendulum-v1": entry("Pendulum-v1", CHOOSING | slow, REPORTED | at_home),
+            "Acrobot-v1": entry("Acrobot-v1", CHOOSING, REPORTED),
+            "MountainCar-v0": entry("MountainCar-v0", CHOOSING, REPORTED),
         },
         "machine": {"cores": 2, "processor": "a processor"},
     }
 
 
-def test_others_choose_the_rate_than_those_that_are_reported(report):
-    chosen = {"ppo": 0.003, "dpo": 0.01, "lpo-pendulum": 0.01}
-    assert module.chosen(report) == dict.fromkeys(report["environments"], chosen)
+def judged(report):
+    return {
+        x.claim.text: (x.outcome, x.estimate and round(x.estimate.value, 2))
+        for x in claims.judge(module.claims(report))
+    }
+
+
+def test_others_choose_the_rate_of_an_environment_than_those_that_are_reported(report):
+    chosen = module.chosen(report)
+    assert [chosen[place]["ppo"] for place in chosen] == [[0.0003], [0.003], [0.003]]
+    assert all(chosen[place]["dpo"] == [0.01] for place in chosen)
     (row, *_) = module.facts(report)["rows"]
     # Of the reported agents the largest rate is better, which nobody may know.
-    assert row["in"]["Acrobot-v1"] == pytest.approx(0.4, abs=0.01)
+    assert [round(x, 1) for x in row["in"].values()] == [0.3, 0.4, 0.4]
+    # Of equal rates the smallest.
+    ppo = report["environments"]["Acrobot-v1"][module.CHOOSING]["ppo"]
+    ppo["0.01"] = ppo["0.0003"] = ppo["0.003"]
+    assert module.chosen(report)["Acrobot-v1"]["ppo"] == [0.0003]
 
 
-def test_objectives_are_compared_where_they_were_not_learned_at_the_same_rates_and_at_the_best(
+def test_objectives_are_compared_where_they_were_not_learned_at_the_same_rates_and_at_the_chosen(
     report,
 ):
-    judged = {x.claim.text: x for x in claims.judge(module.claims(report))}
-    assert {text: (x.outcome, round(x.estimate.value, 2)) for text, x in judged.items()} == {
-        "dpo earns more than ppo at rates of 0.003 and more": (claims.FAILS, -0.2),
-        "dpo earns more than ppo at rates of 0.0003 and less": (claims.UNDECIDED, 0.0),
-        "dpo earns more than ppo, each at its best rate": (claims.HOLDS, 0.1),
-        "lpo-pendulum earns more than ppo at rates of 0.003 and more": (claims.HOLDS, 0.15),
-        "lpo-pendulum earns more than ppo at rates of 0.0003 and less": (claims.FAILS, -0.1),
-        "lpo-pendulum earns more than ppo, each at its best rate": (claims.HOLDS, 0.4),
-        "Pendulum-v1: lpo-pendulum earns more than ppo, each at its best rate": (
+    best = "each at the rate chosen for it"
+    assert judged(report) == {
+        "dpo earns more than ppo, at rates of 0.003 and more, over 3 environments": (
             claims.FAILS,
-            -0.4,
+            -0.15,
         ),
-        "lpo-pendulum earns more than dpo, each at its best rate": (claims.HOLDS, 0.3),
-        "Pendulum-v1: lpo-pendulum earns more than dpo, each at its best rate": (
+        "dpo earns more than ppo, at rates of 0.0003 and less, over 3 environments": (
+            claims.UNDECIDED,
+            0.0,
+        ),
+        f"dpo earns more than ppo, {best}, over 3 environments": (claims.HOLDS, 0.13),
+        "lpo-pendulum earns more than ppo, at rates of 0.003 and more, over 2 environments": (
+            claims.HOLDS,
+            0.15,
+        ),
+        "lpo-pendulum earns more than ppo, at rates of 0.0003 and less, over 2 environments": (
             claims.FAILS,
-            -0.5,
+            -0.1,
         ),
+        f"lpo-pendulum earns more than ppo, {best}, over 2 environments": (claims.HOLDS, 0.4),
+        f"lpo-pendulum earns more than ppo, {best}, Pendulum-v1": (claims.FAILS, -0.1),
+        f"lpo-pendulum earns more than dpo, {best}, over 2 environments": (claims.HOLDS, 0.3),
+        f"lpo-pendulum earns more than dpo, {best}, Pendulum-v1": (claims.FAILS, -0.3),
     }
     page = module.EXPERIMENT.page(report)
     assert (
-        "**Shown: dpo earns more than ppo, each at its best rate; lpo-pendulum earns more" in page
+        "**Shown to earn more than PPO's clip, at rates of 0.003 and more, over 2 environments: lpo-pendulum; "
+        f"{best}, over 3 environments: dpo; {best}, over 2 environments: lpo-pendulum. Shown to earn less, "
+    ) in page
+    assert "| dpo |  | 0.01: 0.50 | 0.01: 0.50 | 0.01: 0.50 | 0.50 [" in page
+    assert "3 agents of all ended in NaN" in page
+    figure = module.EXPERIMENT.figures(report)["learning_rates"]
+    assert len([axes for axes in figure.axes if axes.get_visible()]) == 4
+
+
+def test_an_objective_that_an_environment_lacks_is_drawn_and_named_where_it_is(report):
+    for role in (module.CHOOSING, module.REPORTED):
+        for name in ("dpo", "lpo-pendulum"):
+            del report["environments"]["Acrobot-v1"][role][name]
+    found = judged(report)
+    assert (
+        "lpo-pendulum earns more than ppo, at rates of 0.003 and more, over 1 environments" in found
     )
-    assert "| dpo | 0.01: 0.50 | 0.01: 0.50 | 0.50 [" in page
-    assert "2 agents of all ended in NaN" in page
-    assert len(module.EXPERIMENT.figures(report)["learning_rates"].axes) == 3
+    (row,) = [x for x in module.EXPERIMENT.page(report).splitlines() if x.startswith("| dpo | ")]
+    assert row.endswith("0.01: 0.50 |  | 0.01: 0.50 |  |")
+    (legend,) = module.EXPERIMENT.figures(report)["learning_rates"].legends
+    assert [text.get_text() for text in legend.get_texts()] == ["ppo", "dpo", "lpo-pendulum"]
 
 
-def test_rates_that_not_all_objectives_have_yet_are_left_out(report):
+def test_rates_that_an_objective_lacks_yet_are_compared_for_none(report):
     for role in (module.CHOOSING, module.REPORTED):
         del report["environments"]["Acrobot-v1"][role]["dpo"]["0.0003"]
-    assert module.scores(report)["Acrobot-v1"]["ppo"].keys() == {0.003, 0.01}
-    judged = {x.claim.text: x for x in claims.judge(module.claims(report))}
-    small = judged["lpo-pendulum earns more than ppo at rates of 0.0003 and less"]
-    assert small.outcome == claims.UNTESTED
+    small = "lpo-pendulum earns more than ppo, at rates of 0.0003 and less, over 2 environments"
+    assert judged(report)[small] == (claims.UNTESTED, None)
     assert "| not tested at this size |" in module.EXPERIMENT.page(report)
+
+
+def test_few_agents_decide_nothing(report):
+    for place in report["environments"]:
+        report["environments"][place] = entry(place, CHOOSING, REPORTED, number=9)
+    assert {outcome for outcome, _ in judged(report).values()} == {claims.UNDECIDED}
 
 
 def test_a_measurement_that_was_cut_off_goes_on_and_keeps_to_its_agents(
@@ -129,7 +175,7 @@ def test_a_measurement_that_was_cut_off_goes_on_and_keeps_to_its_agents(
         module.EXPERIMENT.main(flags)
     asked.clear()
     assert module.EXPERIMENT.main(flags) == 0
-    seeds = [*VALIDATING[:2], *REPORTING[module.FIRST : module.FIRST + 3]]
+    seeds = [*VALIDATING[:2], *REPORTING[module.OFFSET : module.OFFSET + 3]]
     assert asked == [("dpo", 0.01, seeds)]
     kept = json.loads(out.read_text())["environments"]["Pendulum-v1"]
     assert kept[module.REPORTED]["dpo"]["0.01"] == " ".join(str(seed % 7) for seed in seeds[2:])
@@ -137,6 +183,19 @@ def test_a_measurement_that_was_cut_off_goes_on_and_keeps_to_its_agents(
     assert "measured with agents 3, and 4 is asked for" in capsys.readouterr().err
 
 
-def test_an_environment_without_scores_is_refused():
-    with pytest.raises(UserError, match="nobody published an expert of Breakout-MinAtar"):
-        module.Options(environments=("Breakout-MinAtar",))
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (["--environments", "Breakout-MinAtar"], "nobody published an expert of Breakout-MinAtar"),
+        (["--rates"], "no environments or no learning rates"),
+        (["--rates", "0.001", "-1"], "learning_rate has the value -1.0: it must be 0 or larger"),
+        (["--choosing=10001"], "10001 validation seeds are asked for"),
+        (["--objectives", "nothing"], "nothing"),
+    ],
+)
+def test_a_mistake_is_one_sentence_before_anybody_is_trained(
+    flags, message, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.setattr(module, "compare", None)
+    assert module.EXPERIMENT.main([*flags, f"--out={tmp_path / 'rates.json'}"]) == 2
+    assert message in capsys.readouterr().err

@@ -229,10 +229,10 @@ def test_a_confirmation_is_decided_by_its_own_agents_when_all_are_there(monkeypa
     assert module.confirmed(made) == [(asked, 9, None)]
     assert "9 of 10 pairs are trained" in module.EXPERIMENT.page(made)
     # Until then they are in nothing else: of the seeds 0 to 3 the difference is below.
-    assert [len(c.seeds) for c in module.facts(made)["comparisons"]["hopper"].curves] == [4, 4, 4]
+    assert [len(c.seeds) for c in module.facts(made)["comparisons"]["hopper"].curves] == [4, 4, 13]
     assert {x.estimate.n for x in claims.judge(module.claims(made)) if x.estimate} == {4}
     monkeypatch.setattr(full_size, "_kept", lambda: made)
-    assert [len(c.seeds) for c in full_size.full_size("hopper").curves] == [4, 4, 4]
+    assert [len(c.seeds) for c in full_size.full_size("hopper").curves] == [4, 4, 13]
     more = report(14)["environments"]["hopper"]["agents"]
     for name, agents in made["environments"]["hopper"]["agents"].items():
         agents["13"] = more[name]["13"]
@@ -272,6 +272,21 @@ def test_of_a_pending_confirmation_whose_reference_was_known_the_objective_alone
     assert counts == {"ppo": 13, "dpo": 4, "lpo-pendulum": 13}
     row = "| hopper: dpo earns no less over the last quarter than PPO | 10, seeds 4 to 13 | ppo | "
     assert row in module.EXPERIMENT.page(made)
+
+
+def test_what_was_known_before_is_one_of_both():
+    with pytest.raises(ValueError, match="known is one of both objectives, or None"):
+        full_size.Confirmation("hopper", "ta-lpo", range(4, 14), "area", "dpo", known="ppo")
+
+
+def test_a_confirmation_may_ask_of_the_clip_beside_another(monkeypatch):
+    asked = full_size.Confirmation("hopper", "ppo", range(4, 14), "area", "dpo")
+    monkeypatch.setattr(full_size, "CONFIRMATIONS", (asked,))
+    ((_, _, judged),) = module.confirmed(report(14))
+    assert judged.claim.text == "hopper: ppo earns more over the training than dpo"
+    assert (
+        judged.estimate.value < 0 and judged.outcome == claims.FAILS
+    )  # dpo has more in the report
 
 
 def test_a_confirmation_has_a_reference_of_its_own(monkeypatch):

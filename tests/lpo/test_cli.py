@@ -531,6 +531,9 @@ def test_objectives_are_compared_with_the_hyperparameters_that_are_given(
         "activation": "tanh",
         "hidden_sizes": [8],
     }
+    (who,) = json.loads((working_folder / "mine" / "rows.json").read_text()).values()
+    trained = who["agent"]["config"] | who["agent"]["hyperparameters"]
+    assert told["hyperparameters"].items() <= trained.items()
     capsys.readouterr()
     assert cli.main(["evaluate", "--resume=mine", "--hyperparameters=learning_rate=0.1"]) == 2
     assert "hyperparameters" in one_sentence(capsys.readouterr().err.removesuffix("\n"))
@@ -539,10 +542,16 @@ def test_objectives_are_compared_with_the_hyperparameters_that_are_given(
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ("learning_rate", "the part 'learning_rate', which is no NAME=VALUE: write such as"),
+        (
+            "learning_rate",
+            "the part 'learning_rate', which is no NAME=VALUE without a space: write",
+        ),
         ("learning_rat=0.1", "unknown hyperparameter of PPO 'learning_rat': did you mean"),
         ("learning_rate=fast", "learning_rate has the value 'fast', which is no number"),
-        ("learning_rate=NaN", "learning_rate has the value 'NaN', which is no number"),
+        ("learning_rate=NaN", "learning_rate has the value nan, which is no number"),
+        ("learning_rate=null", "learning_rate has no value: give one, or leave it out"),
+        ("num_envs=2 num_envs=4", "have num_envs twice: give it once"),
+        ("hidden_sizes=[8, 8]", "the part '8]', which is no NAME=VALUE without a space"),
         ("num_envs=1.5", "num_envs is 1.5: it must be a whole number"),
         ("activation=sine", "unknown activation 'sine'"),
         ("anneal_learning_rate=1", "anneal_learning_rate is 1: it must be true or false"),

@@ -79,7 +79,8 @@ def hoppers(objective: str, ends: list[float]) -> LearningCurves:
     returns = np.array([[10.0, end] for end in ends])
     place, steps, seeds = ("hopper", "spring", objective), np.array([0, 10]), list(range(len(ends)))
     speeds = np.full(returns.shape, 0.25)
-    return LearningCurves(*place, steps, returns, seeds, 5, True, 1.0, 10 * returns, speeds)
+    moving = {"lengths": 10 * returns, "speeds": speeds}
+    return LearningCurves(*place, steps, returns, seeds, 5, mode_actions=True, **moving)
 
 
 def test_where_no_agent_is_above_standing_still_it_is_said_that_nothing_can_be_told():

@@ -10,7 +10,7 @@ from scb.artefacts import machine_description
 from scb.checkpoints import Checkpoints
 from scb.errors import UserError
 from scb.files import write_json
-from scb.runs import Run, Stopwatch, held, read_config, released
+from scb.runs import Run, Stopwatch, first_difference, held, read_config, released
 from tests.locking import is_locked
 
 CONFIG = {"seed": 0, "evolution": {"sigma": 0.05, "strategy": "SNES"}, "hidden_sizes": (8, 8)}
@@ -367,3 +367,10 @@ def test_a_stopwatch_counts_from_its_last_reading(monkeypatch):
     monkeypatch.setattr("scb.runs.time.perf_counter", lambda: next(readings))
     watch = Stopwatch()
     assert (watch.lap(), watch.lap()) == (2.5, 0.5)
+
+
+def test_a_setting_that_an_earlier_version_had_not_is_as_good_as_an_empty_one():
+    assert first_difference({"a": {"b": 1}}, {"a": {"b": 1, "c": {}}, "d": []}) == ""
+    assert first_difference({"a": {}, "b": None}, {}) == ""
+    assert first_difference({}, {"a": 0}) == "a (None there, 0 now)"
+    assert first_difference({"a": {"b": 1}}, {}) == "a ({'b': 1} there, None now)"
