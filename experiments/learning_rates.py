@@ -178,7 +178,7 @@ def _asked(report: Report) -> dict[str, Rates]:
 
 
 def compared(report: Report) -> list[tuple[str, str, str, Claim]]:
-    """(objective, the other, in words where, claim), over the environments that it was not learned for.
+    """(objective, the other, in words at which rates, claim), over the environments that it was not learned for.
 
     Every objective is compared with PPO's clip, and learned ones with DPO where each has its best rate, there also
     in each environment that they were learned for.
@@ -192,12 +192,16 @@ def compared(report: Report) -> list[tuple[str, str, str, Claim]]:
                 both = [place for place, of_it in scored.items() if {name, other} <= of_it.keys()]
                 text = f"{name} earns more than {other}, {words}"
                 unseen = [place for place in both if place not in homes]
-                sets = {f"over {len(unseen)} environments": unseen} if unseen else {}
-                sets |= {place: [place] for place in both if at_best and place in homes}
-                for where, places in sets.items() if name != other else ():
+                several = f"{len(unseen)} environment{'s' * (len(unseen) > 1)}"
+                sets = {f"over {several}": (name, unseen)} if unseen else {}
+                sets |= {
+                    f"on {place}": (f"{name} on {place}", [place])
+                    for place in both
+                    if at_best and place in homes
+                }
+                for where, (who, places) in sets.items() if name != other else ():
                     evidence = _more(scored, places, name, other, rates)
-                    claim = Claim(f"{text}, {where}", evidence)
-                    found.append((name, other, f"{words}, {where}", claim))
+                    found.append((who, other, words, Claim(f"{text}, {where}", evidence)))
     return found
 
 
@@ -255,7 +259,7 @@ def facts(report: Report) -> dict[str, Any]:
     return {
         "rows": rows,
         "more": _shown(pairs, HOLDS),
-        "less": _shown(pairs, FAILS),
+        "less": {where: names for where, names in _shown(pairs, FAILS).items() if names},
         "own": {place: entry["own"] for place, entry in entries.items()},
         "steps": {place: entry["steps"] for place, entry in entries.items()},
         "failed": sum(
@@ -271,11 +275,11 @@ def facts(report: Report) -> dict[str, Any]:
 def _shown(
     pairs: Sequence[tuple[tuple[str, str, str, Claim], Judged]], outcome: str
 ) -> dict[str, list[str]]:
-    """{where, in words: objectives} of the comparisons with PPO's clip that end so."""
-    found: dict[str, list[str]] = {}
+    """{at which rates, in words: objectives} of the comparisons with PPO's clip that end so."""
+    found: dict[str, list[str]] = {words: [] for (_, _, words, _), _ in pairs}
     for (name, other, words, _), judged in pairs:
         if other == REFERENCE and judged.outcome == outcome:
-            found.setdefault(words, []).append(name)
+            found[words].append(name)
     return found
 
 

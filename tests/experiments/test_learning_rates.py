@@ -108,14 +108,15 @@ def test_objectives_are_compared_where_they_were_not_learned_at_the_same_rates_a
             -0.1,
         ),
         f"lpo-pendulum earns more than ppo, {best}, over 2 environments": (claims.HOLDS, 0.4),
-        f"lpo-pendulum earns more than ppo, {best}, Pendulum-v1": (claims.FAILS, -0.1),
+        f"lpo-pendulum earns more than ppo, {best}, on Pendulum-v1": (claims.FAILS, -0.1),
         f"lpo-pendulum earns more than dpo, {best}, over 2 environments": (claims.HOLDS, 0.3),
-        f"lpo-pendulum earns more than dpo, {best}, Pendulum-v1": (claims.FAILS, -0.3),
+        f"lpo-pendulum earns more than dpo, {best}, on Pendulum-v1": (claims.FAILS, -0.3),
     }
     page = module.EXPERIMENT.page(report)
     assert (
-        "**Shown to earn more than PPO's clip, at rates of 0.003 and more, over 2 environments: lpo-pendulum; "
-        f"{best}, over 3 environments: dpo; {best}, over 2 environments: lpo-pendulum. Shown to earn less, "
+        "**Shown to earn more than PPO's clip at rates of 0.003 and more: lpo-pendulum; at rates of 0.0003 and less: "
+        f"none; {best}: dpo, lpo-pendulum. Shown to earn less at rates of 0.003 and more: dpo; at rates of 0.0003 and "
+        f"less: lpo-pendulum; {best}: lpo-pendulum on Pendulum-v1.** PPO has"
     ) in page
     assert "| dpo |  | 0.01: 0.50 | 0.01: 0.50 | 0.01: 0.50 | 0.50 [" in page
     assert "3 agents of all ended in NaN" in page
@@ -129,7 +130,7 @@ def test_an_objective_that_an_environment_lacks_is_drawn_and_named_where_it_is(r
             del report["environments"]["Acrobot-v1"][role][name]
     found = judged(report)
     assert (
-        "lpo-pendulum earns more than ppo, at rates of 0.003 and more, over 1 environments" in found
+        "lpo-pendulum earns more than ppo, at rates of 0.003 and more, over 1 environment" in found
     )
     (row,) = [x for x in module.EXPERIMENT.page(report).splitlines() if x.startswith("| dpo | ")]
     assert row.endswith("0.01: 0.50 |  | 0.01: 0.50 |  |")
