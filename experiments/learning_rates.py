@@ -72,7 +72,7 @@ class Options:
 
 
 def parts(options: Options, report: dict[str, Any]) -> Iterator[Part]:
-    """The agents of one objective at one rate in one environment, first those that choose."""
+    """The agents of one objective at one rate in one environment: those that choose, and those that are reported."""
     settled(report, agents=options.agents, choosing=options.choosing, rates=options.rates)
     names = tuple(dict.fromkeys((*REFERENCES, *options.objectives)))
     check_names([load_objective(name) for name in names])  # that nobody waits for a mistake
@@ -178,10 +178,10 @@ def _asked(report: Report) -> dict[str, Rates]:
 
 
 def compared(report: Report) -> list[tuple[str, str, str, Claim]]:
-    """(objective, the other, in words at which rates, claim), over the environments that it was not learned for.
+    """(objective, the other, at which rates in words, claim), over the environments that it was not learned for.
 
-    Every objective is compared with PPO's clip, and learned ones with DPO where each has its best rate, there also
-    in each environment that they were learned for.
+    Every objective is compared with PPO's clip. Where each has the rate chosen for it, learned ones are compared with
+    DPO too, and also in each environment that they were learned for.
     """
     scored, found = scores(report), []
     for words, rates in _asked(report).items():

@@ -46,7 +46,7 @@ class AgentConfig(ABC):
     def __post_init__(self) -> None:
         if not isinstance(self.hidden_sizes, tuple):
             raise UserError(
-                f"hidden_sizes is {self.hidden_sizes!r}: give a tuple of one size a layer."
+                f"hidden_sizes is {self.hidden_sizes!r}: give one size a layer, as (64, 64) or [64,64]."
             )
         counts = [(f.name, getattr(self, f.name)) for f in fields(self) if f.type is int]
         counts += [(f"hidden_sizes[{i}]", size) for i, size in enumerate(self.hidden_sizes)]

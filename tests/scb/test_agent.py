@@ -64,7 +64,7 @@ def test_a_wrapper_is_refused_whose_step_an_evaluation_would_go_round():
     [
         ({"total_steps": 1e4}, r"total_steps is 10000.0: it must be a whole number"),
         ({"num_envs": np.int64(0)}, "num_envs is 0: it must be at least 1"),
-        ({"hidden_sizes": 64}, "hidden_sizes is 64: give a tuple of one size a layer"),
+        ({"hidden_sizes": 64}, "hidden_sizes is 64: give one size a layer"),
         ({"hidden_sizes": (8, 0)}, r"hidden_sizes\[1\] is 0: it must be at least 1"),
         ({"hidden_sizes": (8.0,)}, r"hidden_sizes\[0\] is 8.0: it must be a whole number"),
     ],
