@@ -38,7 +38,6 @@ FIRST_SEED = CONFIRMATION_SEED  # on which no regime was chosen
 REGIMES: dict[str, dict[str, Any]] = {
     "its own": {},
     "its own, noise of 2": {"reward_noise": 2.0},
-    "its own, noise of 1": {"reward_noise": 1.0},
     "its own, without noise": {"reward_noise": 0.0},
     "its own, a tenth of the batches": {"iterations": 512},
     "Pendulum's": {"bandit": environment_spec(PENDULUM).bandit},
