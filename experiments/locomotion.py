@@ -5,7 +5,8 @@
 Physics is `generalized`, on which agents hop: 5.24 million steps, minutes an agent. A few agents of every objective
 are trained at a time, and --out is saved after each few: the same command goes on where it was, and with more
 `--seeds` or `--objectives` adds to it. With `--tuning-agents` a clip is chosen for each environment first, by agents
-that report nothing, and compared like the others. (As jobs, the same command once more trains it.)
+that report nothing, and compared like the others. (As jobs, the same command once more trains it.) With `--rates` the
+objectives have as many agents at other learning rates too, which report nothing either.
 """
 
 import math
@@ -14,6 +15,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -26,6 +28,7 @@ from lpo import figures
 from lpo.comparison import Comparison, LearningCurves, compare, ppo_spec
 from lpo.full_size import REFERENCE, Confirmation, as_comparison, looked_at, with_pairs
 from lpo.objectives import CLIPS, learned_in, load_objective, zoo_names
+from scb.agents.spec import AgentSpec
 from scb.errors import at_least, unused
 from scb.files import plain
 from scb.rows import Rows
@@ -66,6 +69,8 @@ class Options:
     """of each of some clips, on seeds that report nothing: the best clip is compared as well"""
     validated: tuple[str, ...] = ()
     """objectives that are trained on those seeds as well, for a bandit's ranking to be held against"""
+    rates: tuple[float, ...] = ()
+    """learning rates at which the objectives are trained on those seeds as well"""
     runs: Path = Path("runs/locomotion")
     """for agents until they are saved"""
 
@@ -76,7 +81,7 @@ class Options:
             unused(
                 self,
                 "no agents are trained on seeds that report nothing",
-                ("validated",),
+                ("validated", "rates"),
                 "give tuning_agents",
             )
 
@@ -91,10 +96,13 @@ def parts(options: Options, report: dict[str, Any]) -> Iterator[Part]:
         if options.tuning_agents:
             seeds = validation(options.tuning_agents)
             judged = tuple(dict.fromkeys((*CLIPS, *options.validated)))
-            yield from _of(environment, judged, seeds, options, report, "sweep")
+            yield from _of(environment, judged, seeds, options, report, ("sweep",))
+            for rate in options.rates:
+                at_rate = partial(_of, environment, objectives, seeds, options, report)
+                yield from at_rate(("rates", str(rate)), {"learning_rate": rate})
             best = tuned(swept(report.get("environments", {}).get(environment, {})))
             names = (*names, best) if best and best not in names else names
-        yield from _of(environment, names, reporting(options.seeds), options, report, "agents")
+        yield from _of(environment, names, reporting(options.seeds), options, report, ("agents",))
 
 
 def _of(
@@ -103,16 +111,22 @@ def _of(
     seeds: Sequence[int],
     options: Options,
     report: Report,
-    place: str,
+    place: Keys,
+    hyperparameters: Mapping[str, float] = MappingProxyType({}),
 ) -> Iterator[Part]:
-    path = ("environments", environment)
+    spec, path = (
+        ppo_spec(environment, hyperparameters=hyperparameters),
+        ("environments", environment),
+    )
     for start in range(0, len(seeds), options.together):
         for name in objectives:
             few: dict[Keys, int] = {
-                (place, name, str(s)): s for s in seeds[start : start + options.together]
+                (*place, name, str(s)): s for s in seeds[start : start + options.together]
             }
             left = lacking(report, path, few)
-            trained = partial(_trained, environment, name, list(left.values()), options.runs, place)
+            trained = partial(
+                _trained, environment, name, list(left.values()), options.runs, place, spec
+            )
             yield Part(path, trained, tuple(left))
 
 
@@ -135,25 +149,34 @@ def tuned(sweep: Mapping[str, float]) -> str | None:
 
 
 def _trained(
-    environment: str, objective: str, seeds: list[int], runs: Path, place: str
+    environment: str,
+    objective: str,
+    seeds: list[int],
+    runs: Path,
+    place: Keys,
+    spec: AgentSpec,
 ) -> dict[str, Any]:
-    name = re.sub(r"[^\w.-]", "_", objective)  # a file's path is no name of another
+    # A file's path is no name of another.
+    name = re.sub(r"[^\w.-]", "_", "-".join((objective, *place[1:])))
     rows = Rows(runs / environment / f"{name}-{seeds[0]}.rows.jsonl")
     (found,) = compare(
         environment,
         [load_objective(objective)],
         seeds,
-        ppo_spec(environment),
+        spec,
         BACKEND,
         diagnose=True,
         rows=rows,
         tell=print,
     ).curves
+    agents: dict[str, Any] = {objective: kept(found)}
+    for key in reversed(place):
+        agents = {key: agents}
     return {
         "backend": BACKEND,
         "steps": found.steps.tolist(),
         "episodes": found.episodes,
-        place: {objective: kept(found)},
+        **agents,
     }
 
 
