@@ -143,6 +143,22 @@ def swept(entry: Report) -> dict[str, float]:
     return {curve.objective: float(iqm(curve.late)) for curve in curves}
 
 
+def at_rates(environment: str, entry: Report) -> dict[float, dict[str, tuple[float, float, int]]]:
+    """{learning rate: {objective: (over the training, over the last quarter, agents)}} of those that report nothing."""
+    rates = entry.get("rates", {})
+    own = float(ppo_spec(environment).hyperparameters.learning_rate)
+    there = {name for of_it in rates.values() for name in of_it}
+    found = {own: {k: x for k, x in entry.get("sweep", {}).items() if k in there}} if rates else {}
+    found |= {float(rate): of_it for rate, of_it in rates.items()}
+    return {
+        rate: {
+            curve.objective: (float(iqm(curve.area)), float(iqm(curve.late)), len(curve.seeds))
+            for curve in as_comparison(environment, {**entry, "agents": found[rate]}).curves
+        }
+        for rate in sorted(found)
+    }
+
+
 def tuned(sweep: Mapping[str, float]) -> str | None:
     """The clip that earns most; None where not all have been measured."""
     return max(sweep, key=lambda clip: sweep[clip]) if sweep else None
@@ -297,6 +313,11 @@ def facts(report: Report) -> dict[str, Any]:
             name: (sweep, len(entry["sweep"][REFERENCE]), tuned(sweep))
             for name, entry in report["environments"].items()
             if (sweep := swept(entry))
+        },
+        "at_rates": {
+            name: rates
+            for name, entry in report["environments"].items()
+            if (rates := at_rates(name, entry))
         },
         "led": {
             name: leading(curves)

@@ -11,6 +11,7 @@ from experiments import claims
 from experiments import locomotion as module
 from lpo import figures, full_size
 from lpo.comparison import Comparison, LearningCurves
+from lpo.objectives import CLIPS
 from scb.agents.ppo import DIAGNOSIS
 from scb.errors import UserError
 from scb.seeds import REPORTING, VALIDATING
@@ -260,6 +261,38 @@ def test_what_only_all_pairs_together_show_is_not_said_to_be_shown(monkeypatch):
     assert f"though all pairs together have an interval above: hopper: {row} than PPO." in page
     line, stated = [x for x in page.splitlines() if x.startswith(f"| hopper: {row}")]
     assert line.endswith("| holds, not confirmed |") and "| not confirmed: " in stated
+
+
+def test_objectives_are_trained_at_other_rates_by_agents_that_report_nothing(
+    tmp_path, compared, monkeypatch
+):
+    asked, _ = compared
+    trained_at, stub = [], module.compare
+
+    def compare(environment, objectives, seeds, spec, *others, **named):
+        trained_at.append(spec.hyperparameters.learning_rate)
+        return stub(environment, objectives, seeds, spec, *others, **named)
+
+    monkeypatch.setattr(module, "compare", compare)
+    out = tmp_path / "report.json"
+    flags = [*FLAGS, "--tuning-agents=2", "--rates", "0.001", f"--out={out}"]
+    assert module.EXPERIMENT.main(flags) == 0
+    seeds = tuple(VALIDATING[:2])
+    clips = [(name, seeds) for name in CLIPS]
+    assert [x[1:] for x in asked[: len(clips) + 2]] == [*clips, ("ppo", seeds), ("dpo", seeds)]
+    assert trained_at[len(clips) : len(clips) + 3] == [0.001, 0.001, 0.00025]
+    entry = json.loads(out.read_text())["environments"]["hopper"]
+    assert entry["rates"]["0.001"].keys() == {"ppo", "dpo"} and "ppo" in entry["sweep"]
+    assert {*entry["agents"]["ppo"]}.isdisjoint(map(str, seeds))
+    rates = module.at_rates("hopper", entry)
+    assert [*rates] == [0.00025, 0.001] and [*rates[0.001]] == ["ppo", "dpo"]
+    area, late, agents = rates[0.001]["dpo"]
+    assert (area, late, agents) == (275.25, 500.5, 2)
+    page = module.EXPERIMENT.page(json.loads(out.read_text()))
+    assert "| 0.001 | 30, 10 | 275, 500 |" in page and "| 0.00025 | 30, 10 |  |" in page
+    assert "2 or more of each, which do not decide it" in page
+    before = len(asked)
+    assert module.EXPERIMENT.main(flags) == 0 and len(asked) == before
 
 
 def test_of_a_pending_confirmation_whose_reference_was_known_the_objective_alone_is_left_out(
