@@ -5,8 +5,8 @@
 Physics is `generalized`, on which agents hop: 5.24 million steps, minutes an agent. A few agents of every objective
 are trained at a time, and --out is saved after each few: the same command goes on where it was, and with more
 `--seeds` or `--objectives` adds to it. With `--tuning-agents` a clip is chosen for each environment first, by agents
-that report nothing, and compared like the others. (As jobs, the same command once more trains it.) With `--rates` the
-objectives have as many agents at other learning rates too, which report nothing either.
+that report nothing, and compared like the others. (As jobs, the same command once more trains it.) With `--rates` as
+many agents that report nothing are trained at other learning rates too.
 """
 
 import math
@@ -28,7 +28,7 @@ from lpo import figures
 from lpo.comparison import Comparison, LearningCurves, compare, ppo_spec
 from lpo.full_size import REFERENCE, Confirmation, as_comparison, looked_at, with_pairs
 from lpo.objectives import CLIPS, learned_in, load_objective, zoo_names
-from scb.agents.spec import AgentSpec
+from scb.agents.spec import AgentSpec, check_value
 from scb.errors import at_least, unused
 from scb.files import plain
 from scb.rows import Rows
@@ -89,8 +89,11 @@ class Options:
 def parts(options: Options, report: dict[str, Any]) -> Iterator[Part]:
     """The choice of a clip, then a few seeds of every objective at a time: all have as many wherever it ends."""
     objectives = tuple(dict.fromkeys((REFERENCE, *options.objectives)))
+    # That nobody waits for a name that is none, or for a rate.
     for name in (*objectives, *options.validated):
-        load_objective(name)  # that nobody waits for a name that is none
+        load_objective(name)
+    for rate in options.rates:
+        check_value("learning_rate", rate)
     for environment in options.environments:
         names = objectives
         if options.tuning_agents:
@@ -114,10 +117,8 @@ def _of(
     place: Keys,
     hyperparameters: Mapping[str, float] = MappingProxyType({}),
 ) -> Iterator[Part]:
-    spec, path = (
-        ppo_spec(environment, hyperparameters=hyperparameters),
-        ("environments", environment),
-    )
+    spec = ppo_spec(environment, hyperparameters=hyperparameters)
+    path = ("environments", environment)
     for start in range(0, len(seeds), options.together):
         for name in objectives:
             few: dict[Keys, int] = {

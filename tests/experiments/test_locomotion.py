@@ -293,6 +293,7 @@ def test_objectives_are_trained_at_other_rates_by_agents_that_report_nothing(
     assert "2 or more of each, which do not decide it" in page
     before = len(asked)
     assert module.EXPERIMENT.main(flags) == 0 and len(asked) == before
+    assert module.EXPERIMENT.main([*flags, "--rates", "0.002", "-1"]) == 2 and len(asked) == before
 
 
 def test_of_a_pending_confirmation_whose_reference_was_known_the_objective_alone_is_left_out(

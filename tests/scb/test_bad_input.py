@@ -235,7 +235,7 @@ def test_a_wrong_file_of_hyperparameters_is_refused(tmp_path, monkeypatch, conte
             '{"ppo": {"num_envs": 1, "num_steps": 3, "num_minibatches": 2}}',
             "num_minibatches is 2, which does not divide a batch of 3",
         ),
-        ('{"ppo": {"hidden_sizes": 64}}', "hidden_sizes is 64: give a tuple"),
+        ('{"ppo": {"hidden_sizes": 64}}', "hidden_sizes is 64: give one size"),
         ('{"ppo": {"hidden_sizes": [64, "64"]}}', "hidden_sizes[1] is '64': it must be a whole"),
         ('{"ppo": {"activation": "tan"}}', "'tan': did you mean tanh"),
         ('{"ppo": {"activation": 1}}', "unknown activation 1"),
