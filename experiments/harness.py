@@ -334,17 +334,6 @@ def settled(report: dict[str, Any], **settings: Any) -> None:
             )
 
 
-def learned_for(report: Report, objective: str) -> list[str]:
-    """The environments that an objective was learned for, by the entries of a report's environments."""
-    return sorted(
-        {
-            place
-            for entry in report["environments"].values()
-            for place in entry["learned_on"].get(objective, ())
-        }
-    )
-
-
 def bandit_of(environment: str) -> tuple[SyntheticBandit, str]:
     """The zoo's bandit of an environment, and the checksum of its weights."""
     name = environment_spec(environment).bandit

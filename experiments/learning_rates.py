@@ -7,7 +7,6 @@ nothing choose the rate, and others are reported. What --out holds is not measur
 where it was, and with other environments or objectives adds to it.
 """
 
-import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -19,8 +18,9 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from experiments.claims import FAILS, HOLDS, Claim, Judged, judge, of_agents
-from experiments.harness import Experiment, Report, learned_for, packed, settled, unpacked
-from experiments.parts import InParts, Part
+from experiments.harness import Experiment, Report, packed, settled, unpacked
+from experiments.parts import InParts, Part, file_name
+from experiments.robustness import learned_for, named
 from lpo.comparison import compare, ppo_spec
 from lpo.figures import looks
 from lpo.objectives import check_names, learned_in, load_objective
@@ -38,6 +38,7 @@ REFERENCES = (REFERENCE, "dpo")
 OFFSET = 15_000  # of the first seed, among those that report
 LARGE, SMALL = 0.003, 0.0003  # a rate of at least, and of at most, so much
 CHOOSING, REPORTED = "choosing", "reported"
+CHOSEN = "each at the rate chosen for it"
 
 Scores = dict[str, dict[str, dict[float, NDArray[np.floating]]]]
 Rates = Mapping[str, Mapping[str, Sequence[float]]]
@@ -101,14 +102,13 @@ def _trained(
     runs: Path,
 ) -> dict[str, Any]:
     objective = load_objective(name)
-    file = re.sub(r"[^\w.-]", "_", f"{name}-{rate}")  # a path's parts are no folders here
     (found,) = compare(
         environment,
         [objective],
         [seed for of_it in seeds.values() for seed in of_it],
         spec,
         points=1,
-        rows=Rows(runs / environment / f"{file}.rows.jsonl"),
+        rows=Rows(runs / environment / f"{file_name(name, str(rate))}.rows.jsonl"),
         tell=print,
     ).curves
     earned = dict(zip(found.seeds, found.final, strict=True))
@@ -173,7 +173,7 @@ def _asked(report: Report) -> dict[str, Rates]:
     return {
         f"at rates of {LARGE} and more": those(lambda rate: rate >= LARGE),
         f"at rates of {SMALL} and less": those(lambda rate: rate <= SMALL),
-        "each at the rate chosen for it": chosen(report),
+        CHOSEN: chosen(report),
     }
 
 
@@ -185,9 +185,9 @@ def compared(report: Report) -> list[tuple[str, str, str, Claim]]:
     """
     scored, found = scores(report), []
     for words, rates in _asked(report).items():
-        for name in _names(scored):
+        for name in named(scored):
             homes = learned_for(report, name)
-            at_best = words.startswith("each")
+            at_best = words == CHOSEN
             for other in REFERENCES if at_best and name not in REFERENCES else (REFERENCE,):
                 both = [place for place, of_it in scored.items() if {name, other} <= of_it.keys()]
                 text = f"{name} earns more than {other}, {words}"
@@ -203,10 +203,6 @@ def compared(report: Report) -> list[tuple[str, str, str, Claim]]:
                     evidence = _more(scored, places, name, other, rates)
                     found.append((who, other, words, Claim(f"{text}, {where}", evidence)))
     return found
-
-
-def _names(scored: Scores) -> list[str]:
-    return list(dict.fromkeys(name for of_it in scored.values() for name in of_it))
 
 
 def _more(
@@ -237,8 +233,8 @@ def facts(report: Report) -> dict[str, Any]:
     scored, best = scores(report), chosen(report)
     entries = report["environments"]
     rows = []
-    for name in _names(scored):
-        found = {
+    for name in named(scored):
+        at_best = {
             place: of_it[name][best[place][name][0]]
             for place, of_it in scored.items()
             if name in of_it
@@ -247,15 +243,16 @@ def facts(report: Report) -> dict[str, Any]:
             {
                 "name": name,
                 "learned_for": learned_for(report, name),
-                "best": {place: best[place][name][0] for place in found},
-                "in": {place: float(x.mean()) for place, x in found.items()},
+                "best": {place: best[place][name][0] for place in at_best},
+                "in": {place: float(x.mean()) for place, x in at_best.items()},
                 # Over fewer it were no mean of the same.
-                "mean": stratified_estimate(list(found.values()), statistic=np.mean)
-                if len(found) == len(scored)
+                "mean": stratified_estimate(list(at_best.values()), statistic=np.mean)
+                if len(at_best) == len(scored)
                 else None,
             }
         )
-    pairs = list(zip(compared(report), judge(claims(report)), strict=True))
+    found = compared(report)
+    pairs = list(zip(found, judge([claim for *_, claim in found]), strict=True))
     return {
         "rows": rows,
         "more": _shown(pairs, HOLDS),
@@ -286,11 +283,11 @@ def _shown(
 def draw(report: Mapping[str, Any]) -> Figure:
     """Scores against the learning rate: over all environments, then in each."""
     scored = scores(report)
-    style = looks(_names(scored))
-    figure = Figure(figsize=(plotting.WIDTH, 2.7 * -(-(len(scored) + 1) // 3)))
-    panels = iter(figure.subplots(-(-(len(scored) + 1) // 3), 3, squeeze=False).flat)
-    for title, places in {"all of them": list(scored), **{p: [p] for p in scored}}.items():
-        axes = next(panels)
+    style = looks(named(scored))
+    shown = {"all of them": list(scored), **{place: [place] for place in scored}}
+    figure = Figure(figsize=(plotting.WIDTH, 2.7 * -(-len(shown) // 3)))
+    axes_of = plotting.panels(figure, len(shown), columns=3)
+    for axes, (title, places) in zip(axes_of, shown.items(), strict=True):
         for name, look in style.items():
             if not all(name in scored[place] for place in places):
                 continue
@@ -305,8 +302,6 @@ def draw(report: Mapping[str, Any]) -> Figure:
                 axes, rates, found, look.color, look.linestyle, marker=look.marker
             )
         axes.set(title=title, xscale="log", xlabel="learning rate", ylabel="score")
-    for unused in panels:
-        unused.set_visible(False)
     plotting.legend_of(figure, {name: vars(look) for name, look in style.items()}, len(style))
     return figure
 

@@ -10,7 +10,6 @@ many agents that report nothing are trained at other learning rates too.
 """
 
 import math
-import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -23,7 +22,7 @@ from matplotlib.figure import Figure
 
 from experiments.claims import CONFIDENCE, HOLDS, Claim, Judged, judge, of_agents
 from experiments.harness import Experiment, Report, packed
-from experiments.parts import InParts, Keys, Part, lacking
+from experiments.parts import InParts, Keys, Part, file_name, lacking
 from lpo import figures
 from lpo.comparison import Comparison, LearningCurves, compare, ppo_spec
 from lpo.full_size import REFERENCE, Confirmation, as_comparison, looked_at, with_pairs
@@ -173,9 +172,8 @@ def _trained(
     place: Keys,
     spec: AgentSpec,
 ) -> dict[str, Any]:
-    # A file's path is no name of another.
-    name = re.sub(r"[^\w.-]", "_", "-".join((objective, *place[1:])))
-    rows = Rows(runs / environment / f"{name}-{seeds[0]}.rows.jsonl")
+    name = file_name(objective, *place[1:], str(seeds[0]))
+    rows = Rows(runs / environment / f"{name}.rows.jsonl")
     (found,) = compare(
         environment,
         [load_objective(objective)],

@@ -9,6 +9,7 @@ was: a part that was found is not measured again, and a part that is being measu
 import fcntl
 import hashlib
 import json
+import re
 import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
@@ -57,6 +58,11 @@ class Part:
             _merge(report[last], found)
         else:
             report[last] = found
+
+
+def file_name(*parts: str) -> str:
+    """For what has these names, of which an objective's may be a path."""
+    return re.sub(r"[^\w.-]", "_", "-".join(parts))
 
 
 def lacking(report: Mapping[str, Any], path: Keys, places: Mapping[Keys, T]) -> dict[Keys, T]:

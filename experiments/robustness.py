@@ -25,7 +25,6 @@ from experiments.harness import (
     Experiment,
     Report,
     finite,
-    learned_for,
     packed,
     plan_of,
     settled,
@@ -199,9 +198,20 @@ def claims(report: Report) -> list[Claim]:
     return found
 
 
-def named(scored: Scores) -> list[str]:
-    """The objectives."""
+def named(scored: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """The objectives of {environment: {objective: ...}}."""
     return list(dict.fromkeys(name for x in scored.values() for name in x))
+
+
+def learned_for(report: Report, objective: str) -> list[str]:
+    """The environments that an objective was learned for, by the entries of a report's environments."""
+    return sorted(
+        {
+            place
+            for entry in report["environments"].values()
+            for place in entry["learned_on"].get(objective, ())
+        }
+    )
 
 
 def facts(report: Report) -> dict[str, Any]:

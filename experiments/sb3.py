@@ -244,7 +244,7 @@ def draw(report: Mapping[str, Any]) -> Figure:
     figure = Figure(figsize=(plotting.WIDTH, 2.9 * max(1, -(-number // 2))))
     if not tables:
         return figure
-    panels = iter(figure.subplots(-(-number // 2), 2, squeeze=False).flat)
+    panels = iter(plotting.panels(figure, number))
     for name, algorithms in tables.items():
         curves, once = next(panels), short[name]
         for algorithm, places in algorithms.items():
@@ -262,8 +262,6 @@ def draw(report: Mapping[str, Any]) -> Figure:
         curves.xaxis.set_major_formatter(EngFormatter(sep=""))
         if once:
             _draw_once(next(panels), name, once, report, tables[name])
-    for unused in panels:
-        unused.set_visible(False)
     used = [x for x in COLORS if any(x in algorithms for algorithms in tables.values())]
     looks: dict[str, Mapping[str, Any]] = {x.upper(): {"color": COLORS[x]} for x in used}
     for place, line in LINES.items():

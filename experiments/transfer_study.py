@@ -256,7 +256,7 @@ def _earned(objective: Objective, environment: str, at: Evaluation, options: Opt
         environment,
         [objective],
         list(range(at.first_seed, at.first_seed + at.seeds)),
-        spec=ppo_spec(environment).with_values(policy_output_scale=at.policy_output_scale),
+        spec=ppo_spec(environment, hyperparameters={"policy_output_scale": at.policy_output_scale}),
         points=1,
         rows=Rows(options.runs / at.name / f"{objective.name}{digest}-{environment}.rows.jsonl"),
     ).curves

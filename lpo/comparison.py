@@ -190,8 +190,9 @@ def ppo_spec(
       UserError: there is no such hyperparameter, or it cannot have the value.
     """
     spec = environment_agent("ppo", environment).with_steps(steps)
+    known = _values(spec)
     for name, value in hyperparameters.items():
-        one_of("hyperparameter of PPO", name, _values(spec))
+        one_of("hyperparameter of PPO", name, known)
         if value is None:
             raise UserError(
                 f"{name} has no value: give one, or leave it out for the environment's own."

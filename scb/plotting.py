@@ -87,9 +87,9 @@ def error_bar(*found: Estimate) -> NDArray[np.floating]:
     return np.abs(np.transpose(ends) - values)
 
 
-def panels(figure: Figure, number: int) -> list[Axes]:
-    """As many panels, two a row; what is left of the last row stays empty."""
-    found = list(figure.subplots(-(-number // 2), 2, squeeze=False).ravel())
+def panels(figure: Figure, number: int, columns: int = 2) -> list[Axes]:
+    """As many panels, so many a row; what is left of the last row stays empty."""
+    found = list(figure.subplots(-(-number // columns), columns, squeeze=False).ravel())
     for axes in found[number:]:
         axes.axis("off")
     return found[:number]

@@ -31,20 +31,20 @@ def searching(seed: int) -> int:
 
 def validation(number: int = 1) -> list[int]:
     """The first seeds that judge the end of a search."""
-    if not 1 <= number <= len(VALIDATING):
-        raise UserError(
-            f"{number} validation seeds are asked for: there are {len(VALIDATING)}, give at least 1 and no more than "
-            "that."
-        )
-    return list(VALIDATING[:number])
+    return _consecutive(VALIDATING, "validation", number)
 
 
 def reporting(number: int = 1, offset: int = 0) -> list[int]:
     """Consecutive reporting seeds, from an offset into them on."""
-    seeds = REPORTING[offset : offset + number]
+    return _consecutive(REPORTING, "reporting", number, offset)
+
+
+def _consecutive(purpose: range, name: str, number: int, offset: int = 0) -> list[int]:
+    seeds = purpose[offset : offset + number]
     if len(seeds) != number or number < 1 or offset < 0:
+        start = f" from number {offset} on" if offset else ""
         raise UserError(
-            f"{number} reporting seeds from number {offset} on are asked for: there are {len(REPORTING)}, give at "
-            "least 1 and no more than that."
+            f"{number} {name} seeds{start} are asked for: there are {len(purpose)}, give at least 1 and no more than "
+            "that."
         )
     return list(seeds)

@@ -121,7 +121,7 @@ def test_objectives_are_compared_where_they_were_not_learned_at_the_same_rates_a
     assert "| dpo |  | 0.01: 0.50 | 0.01: 0.50 | 0.01: 0.50 | 0.50 [" in page
     assert "3 agents of all ended in NaN" in page
     figure = module.EXPERIMENT.figures(report)["learning_rates"]
-    assert len([axes for axes in figure.axes if axes.get_visible()]) == 4
+    assert len([axes for axes in figure.axes if axes.axison]) == 4
 
 
 def test_an_objective_that_an_environment_lacks_is_drawn_and_named_where_it_is(report):
