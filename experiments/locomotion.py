@@ -6,7 +6,8 @@ Physics is `generalized`, on which agents hop: 5.24 million steps, minutes an ag
 are trained at a time, and --out is saved after each few: the same command goes on where it was, and with more
 `--seeds` or `--objectives` adds to it. With `--tuning-agents` a clip is chosen for each environment first, by agents
 that report nothing, and compared like the others. (As jobs, the same command once more trains it.) With `--rates` as
-many agents that report nothing are trained at other learning rates too.
+many agents that report nothing are trained at other learning rates too; with `--learning-rate` those that report are,
+and stand apart as "hopper at 0.0005".
 """
 
 import math
@@ -24,7 +25,7 @@ from experiments.claims import CONFIDENCE, HOLDS, Claim, Judged, judge, of_agent
 from experiments.harness import Experiment, Report, packed
 from experiments.parts import InParts, Keys, Part, file_name, lacking
 from lpo import figures
-from lpo.comparison import Comparison, LearningCurves, compare, ppo_spec
+from lpo.comparison import Comparison, LearningCurves, changed, compare, ppo_spec
 from lpo.full_size import REFERENCE, Confirmation, as_comparison, looked_at, with_pairs
 from lpo.objectives import CLIPS, learned_in, load_objective, zoo_names
 from scb.agents.spec import AgentSpec, check_value
@@ -70,12 +71,21 @@ class Options:
     """objectives that are trained on those seeds as well, for a bandit's ranking to be held against"""
     rates: tuple[float, ...] = ()
     """learning rates at which the objectives are trained on those seeds as well"""
+    learning_rate: float | None = None
+    """of the agents that report; None for the environment's own"""
     runs: Path = Path("runs/locomotion")
     """for agents until they are saved"""
 
     def __post_init__(self) -> None:
         at_least(1, self, "seeds", "together")
         at_least(0, self, "tuning_agents")
+        if self.learning_rate is not None:
+            unused(
+                self,
+                "a clip is chosen at the environment's own learning rate alone",
+                ("tuning_agents",),
+                "leave learning_rate out",
+            )
         if not self.tuning_agents:
             unused(
                 self,
@@ -91,7 +101,8 @@ def parts(options: Options, report: dict[str, Any]) -> Iterator[Part]:
     # That nobody waits for a name that is none, or for a rate.
     for name in (*objectives, *options.validated):
         load_objective(name)
-    for rate in options.rates:
+    own = () if options.learning_rate is None else (options.learning_rate,)
+    for rate in (*options.rates, *own):
         check_value("learning_rate", rate)
     for environment in options.environments:
         names = objectives
@@ -104,7 +115,24 @@ def parts(options: Options, report: dict[str, Any]) -> Iterator[Part]:
                 yield from at_rate(("rates", str(rate)), {"learning_rate": rate})
             best = tuned(swept(report.get("environments", {}).get(environment, {})))
             names = (*names, best) if best and best not in names else names
-        yield from _of(environment, names, reporting(options.seeds), options, report, ("agents",))
+        yield from _of(
+            environment,
+            names,
+            reporting(options.seeds),
+            options,
+            report,
+            ("agents",),
+            {"learning_rate": rate for rate in own},
+            named(environment, options.learning_rate),
+        )
+
+
+def named(environment: str, learning_rate: float | None) -> str:
+    """The entry of what reports there, at the environment's own learning rate or another."""
+    its_own = ppo_spec(environment).hyperparameters.learning_rate
+    if learning_rate is None or learning_rate == its_own:
+        return environment
+    return f"{environment} at {learning_rate}"
 
 
 def _of(
@@ -115,9 +143,10 @@ def _of(
     report: Report,
     place: Keys,
     hyperparameters: Mapping[str, float] = MappingProxyType({}),
+    entry: str | None = None,
 ) -> Iterator[Part]:
     spec = ppo_spec(environment, hyperparameters=hyperparameters)
-    path = ("environments", environment)
+    path = ("environments", entry or environment)
     for start in range(0, len(seeds), options.together):
         for name in objectives:
             few: dict[Keys, int] = {
@@ -125,7 +154,7 @@ def _of(
             }
             left = lacking(report, path, few)
             trained = partial(
-                _trained, environment, name, list(left.values()), options.runs, place, spec
+                _trained, path[1], environment, name, list(left.values()), options.runs, place, spec
             )
             yield Part(path, trained, tuple(left))
 
@@ -145,10 +174,11 @@ def swept(entry: Report) -> dict[str, float]:
 
 def at_rates(environment: str, entry: Report) -> dict[float, dict[str, tuple[float, float, int]]]:
     """{learning rate: {objective: (over the training, over the last quarter, agents)}} of those that report nothing."""
-    rates = entry.get("rates", {})
+    if not (rates := entry.get("rates")):
+        return {}
     own = float(ppo_spec(environment).hyperparameters.learning_rate)
     there = {name for of_it in rates.values() for name in of_it}
-    found = {own: {k: x for k, x in entry.get("sweep", {}).items() if k in there}} if rates else {}
+    found = {own: {k: x for k, x in entry.get("sweep", {}).items() if k in there}}
     found |= {float(rate): of_it for rate, of_it in rates.items()}
     return {
         rate: {
@@ -165,6 +195,7 @@ def tuned(sweep: Mapping[str, float]) -> str | None:
 
 
 def _trained(
+    entry: str,
     environment: str,
     objective: str,
     seeds: list[int],
@@ -173,7 +204,7 @@ def _trained(
     spec: AgentSpec,
 ) -> dict[str, Any]:
     name = file_name(objective, *place[1:], str(seeds[0]))
-    rows = Rows(runs / environment / f"{name}.rows.jsonl")
+    rows = Rows(runs / file_name(entry) / f"{name}.rows.jsonl")
     (found,) = compare(
         environment,
         [load_objective(objective)],
@@ -187,7 +218,9 @@ def _trained(
     agents: dict[str, Any] = {objective: kept(found)}
     for key in reversed(place):
         agents = {key: agents}
+    other = {"environment": environment, "hyperparameters": changed(spec, environment)}
     return {
+        **(other if entry != environment else {}),
         "backend": BACKEND,
         "steps": found.steps.tolist(),
         "episodes": found.episodes,
@@ -293,6 +326,7 @@ def facts(report: Report) -> dict[str, Any]:
     decided = [judged for _, _, judged in found if judged]
     return {
         "comparisons": comparisons,
+        "figures": {name: figure_of(name) for name in comparisons},
         "deciding": DECIDING,
         "learned_here": _learned_here(comparisons),
         "confirmations": [
@@ -336,21 +370,28 @@ def draw(report: Mapping[str, Any]) -> dict[str, Figure]:
     drawn = {}
     for name, entry in looked_at(report).items():
         comparison = as_comparison(name, entry)
-        drawn[f"locomotion_{name}"] = figures.learning_curves(comparison.curves)
+        figure = figure_of(name)
+        drawn[figure] = figures.learning_curves(comparison.curves)
         if curves := _comparable(comparison):
-            drawn[f"locomotion_{name}_leads"] = figures.leads(curves)
+            drawn[f"{figure}_leads"] = figures.leads(curves)
         if curves := _diagnosed(comparison):
-            drawn[f"locomotion_{name}_updates"] = figures.diagnosis(curves)
+            drawn[f"{figure}_updates"] = figures.diagnosis(curves)
     return drawn
+
+
+def figure_of(name: str) -> str:
+    """The figure of an entry's curves; those of leads and updates have this before them."""
+    return "locomotion_" + file_name(name)
 
 
 def _learned_here(comparisons: Mapping[str, Comparison]) -> list[str]:
     """Objectives of the zoo among these that were learned for one of these environments."""
-    names = {curve.objective for comparison in comparisons.values() for curve in comparison.curves}
+    curves = [curve for comparison in comparisons.values() for curve in comparison.curves]
+    names, here = {x.objective for x in curves}, {x.environment for x in curves}
     return [
         name
         for name in zoo_names()
-        if name in names and {*comparisons} & {*learned_in([load_objective(name)])}
+        if name in names and here & {*learned_in([load_objective(name)])}
     ]
 
 

@@ -25,7 +25,7 @@ class Confirmation:
     """One claim, stated before agents of its seeds were trained, and decided when all have been.
 
     Attributes:
-      environment, objective: whose it is.
+      environment, objective: whose it is; "hopper at 0.0005" is Hopper with that learning rate.
       seeds: of its pairs of agents, none of which suggested the claim.
       of: what is said of them, "final", "early", "late" or "area".
       reference: which objective its agents are compared with.
@@ -56,6 +56,7 @@ CONFIRMATIONS = (
     Confirmation("hopper", "ta-lpo", reporting(40, offset=110), "early"),
     Confirmation("hopper", "lpo-pendulum-ee", reporting(40, offset=10), "area", known=REFERENCE),
     Confirmation("hopper", "ta-lpo", reporting(40, offset=30), "area", "dpo", known="ta-lpo"),
+    Confirmation("hopper at 0.0005", "ta-lpo", reporting(40), "area"),
 )
 
 
@@ -114,7 +115,9 @@ def _kept() -> dict[str, Any]:
 
 
 def as_comparison(environment: str, found: Mapping[str, Any]) -> Comparison:
-    """The curves of one environment of a report, {"agents": {objective: {seed: {"returns": "0.5 0.7", ...}}}, ...}.
+    """The curves of one entry of a report, {"agents": {objective: {seed: {"returns": "0.5 0.7", ...}}}, ...}.
+
+    An entry bears the environment's name, but where it says "environment" and the "hyperparameters" that differ there.
 
     PPO's clip comes first and agents by their seeds, in whatever order they ended. Objectives that have agents on the
     same seeds as the first are compared on these.
@@ -130,7 +133,7 @@ def as_comparison(environment: str, found: Mapping[str, Any]) -> Comparison:
         )
         curves.append(
             LearningCurves(
-                environment,
+                found.get("environment", environment),
                 found["backend"],
                 objective,
                 np.asarray(found["steps"]),
@@ -138,6 +141,7 @@ def as_comparison(environment: str, found: Mapping[str, Any]) -> Comparison:
                 [int(seed) for seed in agents],
                 found["episodes"],
                 mode_actions=True,
+                hyperparameters=found.get("hyperparameters", {}),
                 lengths=lengths,
                 speeds=speeds,
                 diagnosis={name: _lines(name, agents, found["steps"]) for name in DIAGNOSIS},
