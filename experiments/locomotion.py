@@ -101,8 +101,8 @@ def parts(options: Options, report: dict[str, Any]) -> Iterator[Part]:
     # That nobody waits for a name that is none, or for a rate.
     for name in (*objectives, *options.validated):
         load_objective(name)
-    own = () if options.learning_rate is None else (options.learning_rate,)
-    for rate in (*options.rates, *own):
+    given = options.learning_rate
+    for rate in (*options.rates, *([] if given is None else [given])):
         check_value("learning_rate", rate)
     for environment in options.environments:
         names = objectives
@@ -122,8 +122,8 @@ def parts(options: Options, report: dict[str, Any]) -> Iterator[Part]:
             options,
             report,
             ("agents",),
-            {"learning_rate": rate for rate in own},
-            named(environment, options.learning_rate),
+            {} if given is None else {"learning_rate": given},
+            named(environment, given),
         )
 
 
@@ -259,7 +259,7 @@ def claims(report: Report) -> list[Claim]:
         curves = _by_name(environment, entry)
         reference = curves.pop(REFERENCE)
         for of_it in curves.values():
-            found += [_claim(of_it, reference, of) for of in ASKED]
+            found += [_claim(environment, of_it, reference, of) for of in ASKED]
     return found
 
 
@@ -267,8 +267,8 @@ def _by_name(environment: str, entry: Report) -> dict[str, LearningCurves]:
     return {curve.objective: curve for curve in as_comparison(environment, entry).curves}
 
 
-def _claim(curves: LearningCurves, reference: LearningCurves, of: str) -> Claim:
-    text = f"{curves.environment}: {curves.objective} {_asked(of, reference.objective)}"
+def _claim(entry: str, curves: LearningCurves, reference: LearningCurves, of: str) -> Claim:
+    text = f"{entry}: {curves.objective} {_asked(of, reference.objective)}"
     if of in ("early", "area"):
         return Claim(text, paired(curves, reference, of), places=0)
     margin = float(f"{MARGIN * abs(float(getattr(reference, of).mean())):.4g}")
@@ -294,8 +294,8 @@ def confirmed(report: Report) -> list[tuple[Confirmation, int, Judged | None]]:
             names = (asked.reference, asked.objective)
             fresh = {name: {s: entry["agents"][name][s] for s in seeds} for name in names}
             curves = _by_name(asked.environment, {**entry, "agents": fresh})
-            claim = _claim(curves[asked.objective], curves[asked.reference], asked.of)
-            (judged,) = judge([claim])
+            both = curves[asked.objective], curves[asked.reference]
+            (judged,) = judge([_claim(asked.environment, *both, asked.of)])
         found.append((asked, len(seeds), judged))
     return found
 

@@ -98,7 +98,7 @@ def looked_at(report: Mapping[str, Any]) -> dict[str, Any]:
                 for seed in asked.seeds:
                     agents[name].pop(str(seed), None)
         found[environment] = {**entry, "agents": {k: of_it for k, of_it in agents.items() if of_it}}
-    return {environment: entry for environment, entry in found.items() if entry["agents"]}
+    return {name: entry for name, entry in found.items() if REFERENCE in entry["agents"]}
 
 
 def longer(comparison: Comparison) -> Comparison | None:

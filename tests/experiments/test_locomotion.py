@@ -296,6 +296,54 @@ def test_objectives_are_trained_at_other_rates_by_agents_that_report_nothing(
     assert module.EXPERIMENT.main([*flags, "--rates", "0.002", "-1"]) == 2 and len(asked) == before
 
 
+def test_agents_that_report_at_another_rate_stand_apart(tmp_path, compared, monkeypatch):
+    rates, stub = [], module.compare
+
+    def compare(environment, objectives, seeds, spec, *others, **named):
+        rates.append(spec.hyperparameters.learning_rate)
+        return stub(environment, objectives, seeds, spec, *others, **named)
+
+    monkeypatch.setattr(module, "compare", compare)
+    out = tmp_path / "report.json"
+    assert module.EXPERIMENT.main([*FLAGS, f"--out={out}"]) == 0
+    assert module.EXPERIMENT.main([*FLAGS, "--learning-rate", "0.0005", f"--out={out}"]) == 0
+    assert rates == [0.00025] * 4 + [0.0005] * 4
+    # The environment's own rate is no other.
+    assert module.EXPERIMENT.main([*FLAGS, "--learning-rate", "0.00025", f"--out={out}"]) == 0
+    assert len(rates) == 8
+    made = json.loads(out.read_text())
+    entries = made["environments"]
+    assert [*entries] == ["hopper", "hopper at 0.0005"]
+    assert entries["hopper at 0.0005"]["hyperparameters"] == {"learning_rate": 0.0005}
+    whole, other = module.facts(made)["comparisons"].values()
+    assert {c.environment for c in (*whole.curves, *other.curves)} == {"hopper"}
+    assert other.curves[0].hyperparameters == {"learning_rate": 0.0005}
+    assert {"locomotion_hopper", "locomotion_hopper_at_0.0005"} <= module.draw(made).keys()
+    page = module.EXPERIMENT.page(made)
+    assert "*Hopper at 0.0005* is hopper with a learning rate of 0.0005." in page
+    assert "(figures/locomotion_hopper_at_0.0005.png)" in page
+    assert "--environments hopper`" in page and "`--learning-rate` for those" in page
+
+
+def test_a_claim_stated_of_another_rate_is_of_its_agents_alone(monkeypatch):
+    asked = full_size.Confirmation("hopper at 0.0005", "dpo", range(10), "area")
+    monkeypatch.setattr(full_size, "CONFIRMATIONS", (asked,))
+    made = report(13)
+    assert module.confirmed(made) == []
+    entry = {**report(9)["environments"]["hopper"], "environment": "hopper"}
+    made["environments"]["hopper at 0.0005"] = {
+        **entry,
+        "hyperparameters": {"learning_rate": 0.0005},
+    }
+    assert [pairs for _, pairs, _ in module.confirmed(made)] == [9]
+    # Without PPO's agents there is nothing that others could be compared with.
+    assert [*module.facts(made)["comparisons"]] == ["hopper"]
+    entry["agents"].update(report(10)["environments"]["hopper"]["agents"])
+    ((_, pairs, judged),) = module.confirmed(made)
+    assert (pairs, judged.outcome) == (10, claims.HOLDS)
+    assert judged.claim.text == "hopper at 0.0005: dpo earns more over the training than PPO"
+
+
 def test_of_a_pending_confirmation_whose_reference_was_known_the_objective_alone_is_left_out(
     monkeypatch,
 ):
