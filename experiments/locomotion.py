@@ -11,7 +11,7 @@ and stand apart as "hopper at 0.0005".
 """
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -21,29 +21,22 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from experiments.claims import CONFIDENCE, HOLDS, Claim, Judged, judge, of_agents
+from experiments.claims import HOLDS
 from experiments.harness import Experiment, Report, packed
+from experiments.locomotion_claims import ASKED, asked_of, claims, confirmed, leading, since
 from experiments.parts import InParts, Keys, Part, file_name, lacking
 from lpo import figures
 from lpo.comparison import Comparison, LearningCurves, changed, compare, ppo_spec
-from lpo.full_size import REFERENCE, Confirmation, as_comparison, looked_at, with_pairs
+from lpo.full_size import REFERENCE, as_comparison, looked_at
 from lpo.objectives import CLIPS, learned_in, load_objective, zoo_names
 from scb.agents.spec import AgentSpec, check_value
 from scb.errors import at_least, unused
 from scb.files import plain
 from scb.rows import Rows
 from scb.seeds import reporting, validation
-from scb.statistics import DECIDING, Estimate, iqm, paired_difference
+from scb.statistics import DECIDING, iqm
 
 BACKEND = "generalized"
-MARGIN = 0.05  # of what the reference earns: what is not worse by more is as good
-# What is asked of an objective, by the measure that decides it.
-ASKED = {
-    "final": "ends no lower than {}",
-    "late": "earns no less over the last quarter than {}",
-    "early": "earns more over the first half than {}",
-    "area": "earns more over the training than {}",
-}
 
 
 @dataclass(frozen=True)
@@ -244,81 +237,6 @@ def kept(curves: LearningCurves) -> dict[str, dict[str, Any]]:
     }
 
 
-def paired(
-    curves: LearningCurves, reference: LearningCurves, of: str
-) -> Callable[..., Estimate] | Estimate | None:
-    """How much more agents of the same seeds earn, by one of `ASKED`; no interval where there are few."""
-    ours, theirs = curves.paired(reference, of)
-    return of_agents(partial(paired_difference, ours, theirs), len(ours)) if len(ours) else None
-
-
-def claims(report: Report) -> list[Claim]:
-    """Of every objective but the reference, by each of `ASKED`."""
-    found = []
-    for environment, entry in looked_at(report).items():
-        curves = _by_name(environment, entry)
-        reference = curves.pop(REFERENCE)
-        for of_it in curves.values():
-            found += [_claim(environment, of_it, reference, of) for of in ASKED]
-    return found
-
-
-def _by_name(environment: str, entry: Report) -> dict[str, LearningCurves]:
-    return {curve.objective: curve for curve in as_comparison(environment, entry).curves}
-
-
-def _claim(entry: str, curves: LearningCurves, reference: LearningCurves, of: str) -> Claim:
-    text = f"{entry}: {curves.objective} {_asked(of, reference.objective)}"
-    if of in ("early", "area"):
-        return Claim(text, paired(curves, reference, of), places=0)
-    margin = float(f"{MARGIN * abs(float(getattr(reference, of).mean())):.4g}")
-    reason = f"a twentieth of what {_called(reference.objective)} earns"
-    return Claim(text, paired(curves, reference, of), 0.0, margin, reason, places=0)
-
-
-def _asked(of: str, reference: str = REFERENCE) -> str:
-    return ASKED[of].format(_called(reference))
-
-
-def _called(reference: str) -> str:
-    return "PPO" if reference == REFERENCE else reference
-
-
-def confirmed(report: Report) -> list[tuple[Confirmation, int, Judged | None]]:
-    """Of every confirmation: how many of its pairs of agents there are, and once all are, what became of it."""
-    found: list[tuple[Confirmation, int, Judged | None]] = []
-    for asked, seeds in with_pairs(report):
-        judged = None
-        if len(seeds) == len(asked.seeds):
-            entry = report["environments"][asked.environment]
-            names = (asked.reference, asked.objective)
-            fresh = {name: {s: entry["agents"][name][s] for s in seeds} for name in names}
-            curves = _by_name(asked.environment, {**entry, "agents": fresh})
-            both = curves[asked.objective], curves[asked.reference]
-            (judged,) = judge([_claim(asked.environment, *both, asked.of)])
-        found.append((asked, len(seeds), judged))
-    return found
-
-
-def _since(report: Report, asked: Confirmation) -> tuple[list[int], Estimate] | None:
-    """(seeds, difference) of the pairs that were trained after those of a confirmation; None where they are few."""
-    entry = looked_at(report)[asked.environment]
-    last = max(asked.seeds)
-    later = {
-        name: {
-            seed: agent for seed, agent in entry["agents"].get(name, {}).items() if int(seed) > last
-        }
-        for name in (asked.reference, asked.objective)
-    }
-    shared = sorted(set.intersection(*map(set, later.values())), key=int)
-    if len(shared) < DECIDING:
-        return None
-    curves = _by_name(asked.environment, {**entry, "agents": later})
-    found = paired(curves[asked.objective], curves[asked.reference], asked.of)
-    assert callable(found)
-    return [int(seed) for seed in shared], found()
-
-
 def facts(report: Report) -> dict[str, Any]:
     """The curves by environment."""
     comparisons = {name: as_comparison(name, entry) for name, entry in looked_at(report).items()}
@@ -332,16 +250,16 @@ def facts(report: Report) -> dict[str, Any]:
         "confirmations": [
             (
                 asked,
-                _asked(asked.of, asked.reference),
+                asked_of(asked.of, asked.reference),
                 pairs,
                 judged,
-                judged and _since(report, asked),
+                judged and since(report, asked),
             )
             for asked, pairs, judged in found
         ],
         # What all pairs together may show, and those that were trained to confirm it do not.
         "unconfirmed": {x.claim.text for x in decided if x.outcome != HOLDS},
-        "asked": {of: _asked(of) for of in ASKED},
+        "asked": {of: asked_of(of) for of in ASKED},
         "sweeps": {
             name: (sweep, len(entry["sweep"][REFERENCE]), tuned(sweep))
             for name, entry in report["environments"].items()
@@ -402,29 +320,6 @@ def width(curves: LearningCurves) -> float:
     of_one = 0.5 * math.log(2 * math.pi * math.e)
     joints = round(entropy[0] / of_one)
     return math.exp(entropy[-1] / joints - of_one)
-
-
-def leading(curves: Sequence[LearningCurves]) -> tuple[int, dict[str, dict[str, list[int]]]]:
-    """Where objectives are apart from the first one along the training.
-
-    Returns:
-      (number of differences, {"ahead" or "behind": {objective: steps}}): of the points whose interval lies on one side
-      of 0, corrected for that number.
-    """
-    reference, *others = curves
-    number = len(others) * np.count_nonzero(reference.steps)
-    found: dict[str, dict[str, list[int]]] = {"ahead": {}, "behind": {}}
-    for curve in others:
-        ours, theirs = curve.paired(reference, "returns")
-        for steps, one, other in zip(reference.steps, ours.T, theirs.T, strict=True):
-            if not steps:
-                continue
-            apart = paired_difference(one, other, 1.0 - (1.0 - CONFIDENCE) / number)
-            assert apart.low is not None and apart.high is not None
-            if apart.low > 0 or apart.high < 0:
-                side = found["ahead" if apart.low > 0 else "behind"]
-                side.setdefault(curve.objective, []).append(int(steps))
-    return int(number), found
 
 
 def _comparable(comparison: Comparison) -> list[LearningCurves]:

@@ -26,7 +26,7 @@ from matplotlib.ticker import EngFormatter, LogLocator, NullFormatter, StrMethod
 from experiments import meta_training_cost
 from experiments.claims import OF_THE_WAY, Claim, of_searches, of_the_way
 from experiments.harness import Experiment, Preset, Report, Save, settled
-from experiments.locomotion import MARGIN, paired
+from experiments.locomotion_claims import MARGIN, paired
 from experiments.rendering import on
 from experiments.searches import elsewhere, judgements, machines, objective_of_run, ran_on, read_log
 from lpo import figures

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments import claims
+from experiments import claims, locomotion_claims
 from experiments import locomotion as module
 from lpo import figures, full_size
 from lpo.comparison import Comparison, LearningCurves
@@ -160,13 +160,15 @@ def report(number):
 
 
 def test_ten_agents_decide_and_fewer_do_not():
-    judged = claims.judge(module.claims(report(10)))
+    judged = claims.judge(locomotion_claims.claims(report(10)))
     assert [x.outcome for x in judged] == [
         *(claims.HOLDS, claims.HOLDS, claims.UNDECIDED, claims.HOLDS),
         *(claims.FAILS, claims.FAILS, claims.UNDECIDED, claims.FAILS),
     ]
     assert "lpo-pendulum ends no lower than PPO" in judged[4].claim.text
-    assert {x.outcome for x in claims.judge(module.claims(report(9)))} == {claims.UNDECIDED}
+    assert {x.outcome for x in claims.judge(locomotion_claims.claims(report(9)))} == {
+        claims.UNDECIDED
+    }
 
 
 def test_the_reference_is_ppo_wherever_it_stands():
@@ -174,7 +176,8 @@ def test_the_reference_is_ppo_wherever_it_stands():
     agents = other["environments"]["hopper"]["agents"]
     other["environments"]["hopper"]["agents"] = dict(reversed(agents.items()))
     texts = [
-        {x.claim.text: x.outcome for x in claims.judge(module.claims(r))} for r in (made, other)
+        {x.claim.text: x.outcome for x in claims.judge(locomotion_claims.claims(r))}
+        for r in (made, other)
     ]
     assert texts[0] == texts[1] and not any(": ppo " in text for text in texts[0])
 
@@ -189,7 +192,7 @@ def test_only_agents_of_the_same_seeds_are_compared():
     made = report(10)
     agents = made["environments"]["hopper"]["agents"]
     agents["dpo"] = module.kept(curves("dpo", range(100, 104)))
-    judged = claims.judge(module.claims(made))
+    judged = claims.judge(locomotion_claims.claims(made))
     assert [x.outcome for x in judged[:3]] == [claims.UNTESTED] * 3
 
 
@@ -200,7 +203,7 @@ def test_leads_along_the_training_are_corrected_for_all_points(tmp_path):
     far.returns[:, 1] += 40.0 + jitter[0]
     far.returns[:, 2] -= 40.0 + jitter[1]
     near.returns[:, 1] += jitter[0]
-    number, sides = module.leading([ppo, far, near])
+    number, sides = locomotion_claims.leading([ppo, far, near])
     assert number == 2 * 2  # the untrained agents are the same
     assert sides == {"ahead": {"far": [50]}, "behind": {"far": [100]}}
     figure = figures.leads([ppo, far, near])
@@ -227,21 +230,21 @@ def test_a_confirmation_is_decided_by_its_own_agents_when_all_are_there(monkeypa
     made = report(13)
     for seed in range(4):  # which say the opposite, and are not asked
         made["environments"]["hopper"]["agents"]["dpo"][str(seed)]["returns"] = "0 0 -9000"
-    assert module.confirmed(made) == [(asked, 9, None)]
+    assert locomotion_claims.confirmed(made) == [(asked, 9, None)]
     assert "9 of 10 pairs are trained" in module.EXPERIMENT.page(made)
     # Until then they are in nothing else: of the seeds 0 to 3 the difference is below.
     assert [len(c.seeds) for c in module.facts(made)["comparisons"]["hopper"].curves] == [4, 4, 13]
-    assert {x.estimate.n for x in claims.judge(module.claims(made)) if x.estimate} == {4}
+    assert {x.estimate.n for x in claims.judge(locomotion_claims.claims(made)) if x.estimate} == {4}
     monkeypatch.setattr(full_size, "_kept", lambda: made)
     assert [len(c.seeds) for c in full_size.full_size("hopper").curves] == [4, 4, 13]
     more = report(14)["environments"]["hopper"]["agents"]
     for name, agents in made["environments"]["hopper"]["agents"].items():
         agents["13"] = more[name]["13"]
-    ((_, pairs, judged),) = module.confirmed(made)
+    ((_, pairs, judged),) = locomotion_claims.confirmed(made)
     assert (pairs, judged.outcome) == (10, claims.HOLDS)
     assert "| none | +100 [100, 100] | −5 | confirmed |" in module.EXPERIMENT.page(made)
     made["environments"]["hopper"]["agents"].pop("dpo")
-    assert module.confirmed(made) == []
+    assert locomotion_claims.confirmed(made) == []
 
 
 def test_what_only_all_pairs_together_show_is_not_said_to_be_shown(monkeypatch):
@@ -329,17 +332,17 @@ def test_a_claim_stated_of_another_rate_is_of_its_agents_alone(monkeypatch):
     asked = full_size.Confirmation("hopper at 0.0005", "dpo", range(10), "area")
     monkeypatch.setattr(full_size, "CONFIRMATIONS", (asked,))
     made = report(13)
-    assert module.confirmed(made) == []
+    assert locomotion_claims.confirmed(made) == []
     entry = {**report(9)["environments"]["hopper"], "environment": "hopper"}
     made["environments"]["hopper at 0.0005"] = {
         **entry,
         "hyperparameters": {"learning_rate": 0.0005},
     }
-    assert [pairs for _, pairs, _ in module.confirmed(made)] == [9]
+    assert [pairs for _, pairs, _ in locomotion_claims.confirmed(made)] == [9]
     # Without PPO's agents there is nothing that others could be compared with.
     assert [*module.facts(made)["comparisons"]] == ["hopper"]
     entry["agents"].update(report(10)["environments"]["hopper"]["agents"])
-    ((_, pairs, judged),) = module.confirmed(made)
+    ((_, pairs, judged),) = locomotion_claims.confirmed(made)
     assert (pairs, judged.outcome) == (10, claims.HOLDS)
     assert judged.claim.text == "hopper at 0.0005: dpo earns more over the training than PPO"
 
@@ -364,7 +367,7 @@ def test_what_was_known_before_is_one_of_both():
 def test_a_confirmation_may_ask_of_the_clip_beside_another(monkeypatch):
     asked = full_size.Confirmation("hopper", "ppo", range(4, 14), "area", "dpo")
     monkeypatch.setattr(full_size, "CONFIRMATIONS", (asked,))
-    ((_, _, judged),) = module.confirmed(report(14))
+    ((_, _, judged),) = locomotion_claims.confirmed(report(14))
     assert judged.claim.text == "hopper: ppo earns more over the training than dpo"
     assert (
         judged.estimate.value < 0 and judged.outcome == claims.FAILS
@@ -380,7 +383,7 @@ def test_a_confirmation_has_a_reference_of_its_own(monkeypatch):
     counts = {c.objective: len(c.seeds) for c in module.facts(made)["comparisons"]["hopper"].curves}
     assert counts == {"ppo": 13, "dpo": 4, "lpo-pendulum": 13}
     made = report(14)
-    ((_, pairs, judged),) = module.confirmed(made)
+    ((_, pairs, judged),) = locomotion_claims.confirmed(made)
     agents = made["environments"]["hopper"]["agents"]
     ours, theirs = (
         [float(agents[name][str(seed)]["returns"].split()[-1]) for seed in asked.seeds]

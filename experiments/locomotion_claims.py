@@ -1,0 +1,120 @@
+"""What is asked of objectives on locomotion, and what became of the claims that were stated first."""
+
+from collections.abc import Callable, Sequence
+from functools import partial
+
+import numpy as np
+
+from experiments.claims import CONFIDENCE, Claim, Judged, judge, of_agents
+from experiments.harness import Report
+from lpo.comparison import LearningCurves
+from lpo.full_size import REFERENCE, Confirmation, as_comparison, looked_at, with_pairs
+from scb.statistics import DECIDING, Estimate, paired_difference
+
+MARGIN = 0.05  # of what the reference earns: what is not worse by more is as good
+# What is asked of an objective, by the measure that decides it.
+ASKED = {
+    "final": "ends no lower than {}",
+    "late": "earns no less over the last quarter than {}",
+    "early": "earns more over the first half than {}",
+    "area": "earns more over the training than {}",
+}
+
+
+def asked_of(of: str, reference: str = REFERENCE) -> str:
+    """One of `ASKED` in words, beside that reference."""
+    return ASKED[of].format(_called(reference))
+
+
+def paired(
+    curves: LearningCurves, reference: LearningCurves, of: str
+) -> Callable[..., Estimate] | Estimate | None:
+    """How much more agents of the same seeds earn, by one of `ASKED`; no interval where there are few."""
+    ours, theirs = curves.paired(reference, of)
+    return of_agents(partial(paired_difference, ours, theirs), len(ours)) if len(ours) else None
+
+
+def claims(report: Report) -> list[Claim]:
+    """Of every objective but the reference, by each of `ASKED`."""
+    found = []
+    for environment, entry in looked_at(report).items():
+        curves = _by_name(environment, entry)
+        reference = curves.pop(REFERENCE)
+        for of_it in curves.values():
+            found += [_claim(environment, of_it, reference, of) for of in ASKED]
+    return found
+
+
+def confirmed(report: Report) -> list[tuple[Confirmation, int, Judged | None]]:
+    """Of every confirmation: how many of its pairs of agents there are, and once all are, what became of it."""
+    found: list[tuple[Confirmation, int, Judged | None]] = []
+    for asked, seeds in with_pairs(report):
+        judged = None
+        if len(seeds) == len(asked.seeds):
+            entry = report["environments"][asked.environment]
+            names = (asked.reference, asked.objective)
+            fresh = {name: {s: entry["agents"][name][s] for s in seeds} for name in names}
+            curves = _by_name(asked.environment, {**entry, "agents": fresh})
+            both = curves[asked.objective], curves[asked.reference]
+            (judged,) = judge([_claim(asked.environment, *both, asked.of)])
+        found.append((asked, len(seeds), judged))
+    return found
+
+
+def since(report: Report, asked: Confirmation) -> tuple[list[int], Estimate] | None:
+    """(seeds, difference) of the pairs that were trained after those of a confirmation; None where they are few."""
+    entry = looked_at(report)[asked.environment]
+    last = max(asked.seeds)
+    later = {
+        name: {
+            seed: agent for seed, agent in entry["agents"].get(name, {}).items() if int(seed) > last
+        }
+        for name in (asked.reference, asked.objective)
+    }
+    shared = sorted(set.intersection(*map(set, later.values())), key=int)
+    if len(shared) < DECIDING:
+        return None
+    curves = _by_name(asked.environment, {**entry, "agents": later})
+    found = paired(curves[asked.objective], curves[asked.reference], asked.of)
+    assert callable(found)
+    return [int(seed) for seed in shared], found()
+
+
+def leading(curves: Sequence[LearningCurves]) -> tuple[int, dict[str, dict[str, list[int]]]]:
+    """Where objectives are apart from the first one along the training.
+
+    Returns:
+      (number of differences, {"ahead" or "behind": {objective: steps}}): of the points whose interval lies on one side
+      of 0, corrected for that number.
+    """
+    reference, *others = curves
+    number = len(others) * np.count_nonzero(reference.steps)
+    found: dict[str, dict[str, list[int]]] = {"ahead": {}, "behind": {}}
+    for curve in others:
+        ours, theirs = curve.paired(reference, "returns")
+        for steps, one, other in zip(reference.steps, ours.T, theirs.T, strict=True):
+            if not steps:
+                continue
+            apart = paired_difference(one, other, 1.0 - (1.0 - CONFIDENCE) / number)
+            assert apart.low is not None and apart.high is not None
+            if apart.low > 0 or apart.high < 0:
+                side = found["ahead" if apart.low > 0 else "behind"]
+                side.setdefault(curve.objective, []).append(int(steps))
+    return int(number), found
+
+
+def _by_name(environment: str, entry: Report) -> dict[str, LearningCurves]:
+    return {curve.objective: curve for curve in as_comparison(environment, entry).curves}
+
+
+def _claim(entry: str, curves: LearningCurves, reference: LearningCurves, of: str) -> Claim:
+    text = f"{entry}: {curves.objective} {asked_of(of, reference.objective)}"
+    if of in ("early", "area"):
+        return Claim(text, paired(curves, reference, of), places=0)
+    margin = float(f"{MARGIN * abs(float(getattr(reference, of).mean())):.4g}")
+    reason = f"a twentieth of what {_called(reference.objective)} earns"
+    return Claim(text, paired(curves, reference, of), 0.0, margin, reason, places=0)
+
+
+def _called(reference: str) -> str:
+    return "PPO" if reference == REFERENCE else reference
