@@ -45,6 +45,16 @@ def claims(report: Report) -> list[Claim]:
     return found
 
 
+def texts(report: Report) -> dict[tuple[str, str], dict[str, str]]:
+    """{(entry, objective): {one of `ASKED`: text of the claim}}."""
+    return {
+        (entry, objective): {of: _text(entry, objective, of) for of in ASKED}
+        for entry, found in looked_at(report).items()
+        for objective in _by_name(entry, found)
+        if objective != REFERENCE
+    }
+
+
 def confirmed(report: Report) -> list[tuple[Confirmation, int, Judged | None]]:
     """Of every confirmation: how many of its pairs of agents there are, and once all are, what became of it."""
     found: list[tuple[Confirmation, int, Judged | None]] = []
@@ -107,8 +117,12 @@ def _by_name(environment: str, entry: Report) -> dict[str, LearningCurves]:
     return {curve.objective: curve for curve in as_comparison(environment, entry).curves}
 
 
+def _text(entry: str, objective: str, of: str, reference: str = REFERENCE) -> str:
+    return f"{entry}: {objective} {asked_of(of, reference)}"
+
+
 def _claim(entry: str, curves: LearningCurves, reference: LearningCurves, of: str) -> Claim:
-    text = f"{entry}: {curves.objective} {asked_of(of, reference.objective)}"
+    text = _text(entry, curves.objective, of, reference.objective)
     if of in ("early", "area"):
         return Claim(text, paired(curves, reference, of), places=0)
     margin = float(f"{MARGIN * abs(float(getattr(reference, of).mean())):.4g}")

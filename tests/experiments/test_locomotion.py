@@ -171,6 +171,20 @@ def test_ten_agents_decide_and_fewer_do_not():
     }
 
 
+def test_the_page_has_a_row_of_differences_an_objective():
+    page = module.EXPERIMENT.page(report(10))
+    whole = "+100 [100, 100]"
+    assert (
+        f"| hopper: dpo | 10 | **{whole}** | **{whole}** | +0 [0, 0] | **+50 [50, 50]** |" in page
+    )
+    not_so = "−50 [−50, −50] not so"
+    assert (
+        f"| hopper: lpo-pendulum | 10 | {not_so} | {not_so} | +0 [0, 0] | −25 [−25, −25] not so |"
+        in page
+    )
+    assert "(hopper: −5 and −5). The others are undecided, or not so where that is said." in page
+
+
 def test_the_reference_is_ppo_wherever_it_stands():
     made, other = report(10), report(10)
     agents = other["environments"]["hopper"]["agents"]
@@ -262,8 +276,10 @@ def test_what_only_all_pairs_together_show_is_not_said_to_be_shown(monkeypatch):
     page = module.EXPERIMENT.page(made)
     assert "Shown to earn more over the training: none" in page
     assert f"though all pairs together have an interval above: hopper: {row} than PPO." in page
-    line, stated = [x for x in page.splitlines() if x.startswith(f"| hopper: {row}")]
-    assert line.endswith("| holds, not confirmed |") and "| not confirmed: " in stated
+    (line,) = [x for x in page.splitlines() if x.startswith("| hopper: dpo | 40 |")]
+    assert line.endswith(" not confirmed |") and line.count("**") == 2 * 2
+    (stated,) = [x for x in page.splitlines() if x.startswith(f"| hopper: {row}")]
+    assert "| not confirmed: " in stated
 
 
 def test_objectives_are_trained_at_other_rates_by_agents_that_report_nothing(
