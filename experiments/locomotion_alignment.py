@@ -5,7 +5,9 @@
 What agents earn in the environment is known from agents of `python -m experiments locomotion --tuning-agents 4
 --validated NAMES`, on seeds that report nothing. Here each of the objectives trains agents in a few regimes of bandits;
 Spearman's correlation between what they earn there and in the environment says how well a regime ranks them. With
-agents of further objectives in the environment the same command measures those in the bandits too.
+agents of further objectives in the environment the same command measures those in the bandits too. And each trains
+agents in the environments of a suite, of `--others`: how well one environment ranks objectives as another does is what
+a bandit can be held to.
 """
 
 from collections.abc import Iterable, Iterator, Mapping
@@ -21,15 +23,16 @@ from experiments.alignment import CONFIRMATION_SEED
 from experiments.harness import Experiment, Report, forget_other, packed, settled, unpacked
 from experiments.parts import InParts, Keys, Part, lacking
 from lpo.alignment import Alignment, Regime, alignment, correlation_text, regime_fitness
-from lpo.comparison import LearningCurves
+from lpo.comparison import LearningCurves, compare
 from lpo.fitness import FITNESSES, LABELS
 from lpo.full_size import validated
 from lpo.objectives import load_objective
+from lpo.suite import suite
 from scb import plotting
 from scb.environments.registry import environment_spec
 from scb.environments.zoo import bandit_metadata
 from scb.errors import UserError, at_least
-from scb.statistics import halves_agree, iqm
+from scb.statistics import halves_agree, iqm, normalized_score
 
 BACKEND = "generalized"
 PENDULUM = "Pendulum-v1"
@@ -48,6 +51,7 @@ REGIMES: dict[str, dict[str, Any]] = {
 }
 # Of the agents in the environment; their end is a moment, and these are levels.
 OUTCOMES = {"area": "over the training", "late": "over the last quarter"}
+TOGETHER = "the mean score in all of them"
 KINDS = {
     "PPO's clips, and none": plotting.GREY,
     "DPO": plotting.BLUE,
@@ -64,9 +68,15 @@ class Options:
     """of Brax, with agents that report nothing"""
     agents: int = 8
     """in every regime, of each objective"""
+    others: tuple[str, ...] = suite("classic")
+    """environments whose own ranking is held against it as well, with PPO as they have it"""
 
     def __post_init__(self) -> None:
         at_least(2, self, "agents")  # a single one has no interval
+        for name in self.others:
+            if environment_spec(name).synthetic:
+                raise UserError(f"{name} is synthetic: give environments, such as Pendulum-v1.")
+            environment_spec(name).reference_return()  # which scores are made with
 
 
 def regime(environment: str, name: str) -> Regime:
@@ -97,6 +107,22 @@ def parts(options: Options, report: dict[str, Any]) -> Iterator[Part]:
             yield Part(
                 path, partial(_trained, of_it, digest, list(left.values()), options), tuple(left)
             )
+
+    names = list(dict.fromkeys(n for e in options.environments for n in validated(e)))
+    for other in options.others:
+        path, places = ("others", other), {(name,): name for name in names}
+        left = lacking(report, path, places)
+        yield Part(path, partial(_trained_in, other, list(left.values()), options), tuple(left))
+
+
+def _trained_in(environment: str, names: list[str], options: Options) -> dict[str, Any]:
+    seeds = range(FIRST_SEED, FIRST_SEED + options.agents)
+    return {
+        curve.objective: dict(
+            zip(OUTCOMES, packed(getattr(curve, of) for of in OUTCOMES), strict=True)
+        )
+        for curve in compare(environment, names, seeds).curves
+    }
 
 
 def _trained(of_it: Regime, digest: str, names: list[str], options: Options) -> dict[str, Any]:
@@ -145,6 +171,46 @@ def aligned(report: Report) -> dict[str, dict[str, dict[str, dict[str, Alignment
                 for name, of_labels in in_bandits.items()
             }
     return found
+
+
+def ranked_elsewhere(report: Report) -> dict[str, dict[str, dict[str, Alignment]]]:
+    """{environment: {other: {outcome: alignment}}}, the outcome that of both, and of all others their mean score."""
+    others, found = report.get("others", {}), {}
+    for environment, regimes in report["environments"].items():
+        curves = {
+            name: curve
+            for name, curve in ranked(environment, regimes).items()
+            if all(name in of_it for of_it in others.values())
+        }
+        if len(curves) < 3 or not others:
+            continue
+        earned: dict[str, Any] = {
+            other: {
+                of: {name: unpacked([of_it[name][of]])[0] for name in curves} for of in OUTCOMES
+            }
+            for other, of_it in others.items()
+        }
+        earned[TOGETHER] = {
+            of: {
+                name: np.mean([_scored(other, earned[other][of][name]) for other in others], axis=0)
+                for name in curves
+            }
+            for of in OUTCOMES
+        }
+        found[environment] = {
+            other: {
+                of: alignment(of_it[of], {n: getattr(curve, of) for n, curve in curves.items()})
+                for of in OUTCOMES
+            }
+            for other, of_it in earned.items()
+        }
+    return found
+
+
+def _scored(environment: str, returns: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Returns as scores: 0 is a random policy, 1 the paper's expert."""
+    spec = environment_spec(environment)
+    return normalized_score(returns, spec.random_return(), spec.reference_return())
 
 
 def kind(objective: str) -> str:
@@ -199,6 +265,16 @@ def facts(report: Report) -> dict[str, Any]:
                 for outcome in OUTCOMES
             }
             for environment in found
+        },
+        "elsewhere": {
+            environment: {
+                other: [_text(of_it[of]) for of in OUTCOMES] for other, of_it in others.items()
+            }
+            for environment, others in ranked_elsewhere(report).items()
+        },
+        "elsewhere_shown": {
+            environment: [other for other, of_it in others.items() if of_it["area"].low > 0.0]
+            for environment, others in ranked_elsewhere(report).items()
         },
         "labels": LABELS,
         "judged_by": FITNESS,

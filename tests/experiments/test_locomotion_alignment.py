@@ -26,6 +26,23 @@ def environment(monkeypatch):
     return known
 
 
+@pytest.fixture(autouse=True)
+def elsewhere(monkeypatch):
+    """What was trained in other environments: Pendulum's agents rank as hopper's do, and CartPole's the other way."""
+    asked = []
+
+    def compare(environment, objectives, seeds):
+        asked.append((environment, list(objectives), list(seeds)))
+        sign = 100 if environment == "Pendulum-v1" else -1
+        curves = [curve(sign * EARNED.get(name, 9.0)) for name in objectives]
+        for name, of_it in zip(objectives, curves, strict=True):
+            of_it.objective = name
+        return SimpleNamespace(curves=curves)
+
+    monkeypatch.setattr(module, "compare", compare)
+    return asked
+
+
 @pytest.fixture
 def trained(monkeypatch):
     """What regimes were asked for; the environment's own rank as it does, the others the other way round."""
@@ -48,6 +65,7 @@ def trained(monkeypatch):
 
 def run(folder, *flags):
     out = folder / "report.json"
+    flags = ["--others", "Pendulum-v1", "CartPole-v1", *flags]
     assert module.EXPERIMENT.main([*flags, "--out", str(out)]) == 0
     return json.loads(out.read_text()), (folder / "locomotion_alignment.md").read_text()
 
@@ -80,6 +98,44 @@ def test_only_objectives_that_are_new_in_the_environment_are_measured(
     # Where it was trained it earns most, and in the environment least.
     assert module.aligned(report)["hopper"]["area"]["its own"][module.FITNESS].spearman == 0.0
     assert "rank 5 objectives" in page
+
+
+def test_another_environment_ranks_as_it_does_or_not(tmp_path, environment, trained, elsewhere):
+    report, page = run(tmp_path)
+    seeds = list(range(700, 708))
+    assert elsewhere == [(x, list(EARNED), seeds) for x in ("Pendulum-v1", "CartPole-v1")]
+    found = module.ranked_elsewhere(report)["hopper"]
+    assert [x["area"].spearman for x in found.values()] == pytest.approx([1, -1, 1])
+    assert [x["late"].spearman for x in found.values()] == pytest.approx([1, -1, 1])
+    assert f"Shown to: Pendulum-v1; {module.TOGETHER}, over the training." in page
+    assert "| Pendulum-v1 | 1.00 [" in page and "| CartPole-v1 | −1.00 [" in page
+    environment["none"] = curve(0.0)
+    run(tmp_path)
+    assert [names for _, names, _ in elsewhere[2:]] == [["none"]] * 2
+
+
+def test_the_mean_score_weighs_tasks_by_their_experts(tmp_path, environment, trained, elsewhere):
+    report, _ = run(tmp_path)
+    # A thousand points between random actions and the expert there, and about five hundred here.
+    apart = [
+        module._scored(name, np.array([0.0, 100.0])) for name in ("Pendulum-v1", "CartPole-v1")
+    ]
+    assert [1 / (b - a) * 100 for a, b in apart] == pytest.approx([1077, 477], rel=0.05)
+    for of_it in report["others"]["CartPole-v1"].values():
+        of_it["area"] = of_it["late"] = "0 0 0 0"
+    level = module.ranked_elsewhere(report)["hopper"]
+    assert level["CartPole-v1"]["area"].spearman is None
+    assert level[module.TOGETHER]["area"].spearman == pytest.approx(1)
+
+
+def test_others_are_environments_with_an_expert(tmp_path, environment, trained, elsewhere, capsys):
+    for name, said in (
+        ("Synthetic-Pendulum-v1", "is synthetic"),
+        ("Breakout-MinAtar", "no reference return of Breakout-MinAtar"),
+    ):
+        flags = ["--others", name, "--out", str(tmp_path / "report.json")]
+        assert module.EXPERIMENT.main(flags) != 0
+        assert said in capsys.readouterr().err and not (trained or elsewhere)
 
 
 def test_regimes_are_compared_over_the_objectives_that_all_have(tmp_path, environment, trained):
