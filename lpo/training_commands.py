@@ -223,7 +223,10 @@ class Evaluate(Comparing):
         environments = suite_environments(name)
         check_backend(config.backend, environments)
         for environment in environments:
-            ppo_spec(environment, config.steps, config.hyperparameters)
+            try:
+                ppo_spec(environment, config.steps, config.hyperparameters)
+            except UserError as error:  # what fits one environment's batches need not fit another's
+                raise UserError(f"{environment}: {error}") from error
         homes = learned_in(objectives)
         (folder, rows), printer = self.opened(), console()
         scores, comparisons = run_suite(

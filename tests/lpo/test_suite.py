@@ -258,6 +258,21 @@ def test_a_suite_and_an_environment_do_not_go_together():
         training_commands.Evaluate.parse(["--suite=clasic"]).run()
 
 
+def test_a_hyperparameter_that_one_environment_cannot_have_names_it(tmp_path):
+    out = tmp_path / "suite"
+    words = [
+        "--suite=classic",
+        "--hyperparameters",
+        "num_envs=25 num_minibatches=8",
+        f"--out={out}",
+    ]
+    with pytest.raises(
+        UserError, match="^CartPole-v1: num_minibatches is 8, which does not divide"
+    ):
+        training_commands.Evaluate.parse(words).run()
+    assert not out.exists()
+
+
 def test_scores_are_drawn(tmp_path):
     scores = scores_of(np.random.default_rng(0).uniform(0.0, 1.2, (2, 5, 10)))
     assert (
