@@ -267,7 +267,7 @@ def test_a_hyperparameter_that_one_environment_cannot_have_names_it(tmp_path):
         f"--out={out}",
     ]
     with pytest.raises(
-        UserError, match="^CartPole-v1: num_minibatches is 8, which does not divide"
+        UserError, match=r"^CartPole-v1: num_minibatches is 8, which does not divide"
     ):
         training_commands.Evaluate.parse(words).run()
     assert not out.exists()
