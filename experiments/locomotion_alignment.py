@@ -35,7 +35,7 @@ from scb.errors import UserError, at_least
 from scb.statistics import halves_agree, iqm, normalized_score
 
 BACKEND = "generalized"
-PENDULUM = "Pendulum-v1"
+PENDULUM, CARTPOLE = "Pendulum-v1", "CartPole-v1"
 FIRST_SEED = CONFIRMATION_SEED  # on which no regime was chosen
 # One thing changed at a time; what is not said is the default's of a search for an objective.
 REGIMES: dict[str, dict[str, Any]] = {
@@ -46,6 +46,11 @@ REGIMES: dict[str, dict[str, Any]] = {
     "Pendulum's": {"bandit": environment_spec(PENDULUM).bandit},
     "Pendulum's, without noise": {
         "bandit": environment_spec(PENDULUM).bandit,
+        "reward_noise": 0.0,
+    },
+    "CartPole's": {"bandit": environment_spec(CARTPOLE).bandit},
+    "CartPole's, without noise": {
+        "bandit": environment_spec(CARTPOLE).bandit,
         "reward_noise": 0.0,
     },
 }

@@ -78,12 +78,12 @@ def test_a_regime_that_ranks_as_the_environment_is_told_from_one_that_does_not(
     for outcome, sign in (("area", 1), ("late", -1)):
         assert found[outcome]["its own"][module.FITNESS].spearman == pytest.approx(sign)
         assert found[outcome]["Pendulum's"][module.FITNESS].spearman == pytest.approx(-sign)
-    assert "Of 6 regimes 4 are shown to rank 4 objectives" in page
+    assert "Of 8 regimes 4 are shown to rank 4 objectives" in page
     assert "its own, a tenth of the batches" in page.split("\n")[2]
     assert "as the other half does with 1.00 over the training" in page
     assert "| dpo | 4 | 4 | \N{MINUS SIGN}4 |" in page
     regimes = [regime for regime, *_ in trained]
-    assert [r.reward_noise for r in regimes] == [5.0, 2.0, 0.0, 5.0, 5.0, 0.0]
+    assert [r.reward_noise for r in regimes] == [5.0, 2.0, 0.0, 5.0, 5.0, 0.0, 5.0, 0.0]
     assert all(x[1:] == (list(EARNED), list(range(700, 708)), "generalized") for x in trained)
 
 
@@ -107,7 +107,7 @@ def test_another_environment_ranks_as_it_does_or_not(tmp_path, environment, trai
     found = module.ranked_elsewhere(report)["hopper"]
     assert [x["area"].spearman for x in found.values()] == pytest.approx([1, -1, 1])
     assert [x["late"].spearman for x in found.values()] == pytest.approx([1, -1, 1])
-    assert f"Shown to: Pendulum-v1; {module.TOGETHER}, over the training." in page
+    assert f"Shown to over the training: Pendulum-v1; {module.TOGETHER}, of 3 rows;" in page
     assert "| Pendulum-v1 | 1.00 [" in page and "| CartPole-v1 | −1.00 [" in page
     environment["none"] = curve(0.0)
     run(tmp_path)
