@@ -25,7 +25,7 @@ from experiments.parts import InParts, Keys, Part, lacking
 from lpo.alignment import Alignment, Regime, alignment, correlation_text, regime_fitness
 from lpo.comparison import LearningCurves, compare
 from lpo.fitness import FITNESSES, LABELS
-from lpo.full_size import validated
+from lpo.full_size import full_size, validated
 from lpo.objectives import load_objective
 from lpo.suite import suite
 from scb import plotting
@@ -56,6 +56,7 @@ REGIMES: dict[str, dict[str, Any]] = {
 }
 # Of the agents in the environment; their end is a moment, and these are levels.
 OUTCOMES = {"area": "over the training", "late": "over the last quarter"}
+REPORTED = "reported"
 TOGETHER = "the mean score in all of them"
 KINDS = {
     "PPO's clips, and none": plotting.GREY,
@@ -179,15 +180,14 @@ def aligned(report: Report) -> dict[str, dict[str, dict[str, dict[str, Alignment
 
 
 def ranked_elsewhere(report: Report) -> dict[str, dict[str, dict[str, Alignment]]]:
-    """{environment: {other: {outcome: alignment}}}, the outcome that of both, and of all others their mean score."""
-    others, found = report.get("others", {}), {}
+    """{environment: {other: {outcome: alignment}}}, the outcome that of both, and of all others their mean score.
+
+    `REPORTED` is "area" by the environment's agents that report, of the objectives that have some.
+    """
+    found: dict[str, Any] = {}
     for environment, regimes in report["environments"].items():
-        curves = {
-            name: curve
-            for name, curve in ranked(environment, regimes).items()
-            if all(name in of_it for of_it in others.values())
-        }
-        if len(curves) < 3 or not others:
+        curves = _everywhere(report, ranked(environment, regimes))
+        if len(curves) < 3 or not (others := report.get("others")):
             continue
         earned: dict[str, Any] = {
             other: {
@@ -202,14 +202,33 @@ def ranked_elsewhere(report: Report) -> dict[str, dict[str, dict[str, Alignment]
             }
             for of in OUTCOMES
         }
+        judged = [(of, of, curves) for of in OUTCOMES]
+        if len(reported := reporting_there(report, environment)) >= 3:
+            judged.append((REPORTED, "area", reported))
         found[environment] = {
             other: {
-                of: alignment(of_it[of], {n: getattr(curve, of) for n, curve in curves.items()})
-                for of in OUTCOMES
+                column: alignment(
+                    {name: of_it[of][name] for name in those},
+                    {name: getattr(curve, of) for name, curve in those.items()},
+                )
+                for column, of, those in judged
             }
             for other, of_it in earned.items()
         }
     return found
+
+
+def reporting_there(report: Report, environment: str) -> dict[str, LearningCurves]:
+    """{objective: its agents that report in an environment} of those that were trained in all others as well."""
+    whole = full_size(environment)
+    curves = {} if whole is None else {curve.objective: curve for curve in whole.curves}
+    known = ranked(environment, report["environments"][environment])
+    return _everywhere(report, {name: curve for name, curve in curves.items() if name in known})
+
+
+def _everywhere(report: Report, curves: Mapping[str, LearningCurves]) -> dict[str, LearningCurves]:
+    others = report.get("others", {}).values()
+    return {name: curve for name, curve in curves.items() if all(name in x for x in others)}
 
 
 def _scored(environment: str, returns: NDArray[np.floating]) -> NDArray[np.floating]:
@@ -273,7 +292,7 @@ def facts(report: Report) -> dict[str, Any]:
         },
         "elsewhere": {
             environment: {
-                other: [_text(of_it[of]) for of in OUTCOMES] for other, of_it in others.items()
+                other: [_text(x) for x in of_it.values()] for other, of_it in others.items()
             }
             for environment, others in ranked_elsewhere(report).items()
         },
@@ -281,6 +300,7 @@ def facts(report: Report) -> dict[str, Any]:
             environment: [other for other, of_it in others.items() if of_it["area"].low > 0.0]
             for environment, others in ranked_elsewhere(report).items()
         },
+        "reporting": {x: len(reporting_there(report, x)) for x in report["environments"]},
         "labels": LABELS,
         "judged_by": FITNESS,
         "outcomes": OUTCOMES,

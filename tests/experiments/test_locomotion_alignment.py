@@ -23,6 +23,7 @@ def environment(monkeypatch):
     """Objectives with agents in it: the levels over the training, and the reverse over the last quarter."""
     known = {name: curve(level) for name, level in EARNED.items()}
     monkeypatch.setattr(module, "validated", lambda name: known if name == "hopper" else {})
+    monkeypatch.setattr(module, "full_size", lambda name: None)
     return known
 
 
@@ -112,6 +113,21 @@ def test_another_environment_ranks_as_it_does_or_not(tmp_path, environment, trai
     environment["none"] = curve(0.0)
     run(tmp_path)
     assert [names for _, names, _ in elsewhere[2:]] == [["none"]] * 2
+
+
+def test_agents_that_report_are_a_second_witness(
+    tmp_path, environment, trained, elsewhere, monkeypatch
+):
+    # Of three objectives with the opposite levels, and of one that was trained nowhere else.
+    whole = [curve(-level) for level in (*list(EARNED.values())[1:], 7.0)]
+    for of_it, name in zip(whole, (*list(EARNED)[1:], "other"), strict=True):
+        of_it.objective = name
+    monkeypatch.setattr(module, "full_size", lambda name: SimpleNamespace(curves=whole))
+    report, page = run(tmp_path)
+    assert [*module.reporting_there(report, "hopper")] == list(EARNED)[1:]
+    found = module.ranked_elsewhere(report)["hopper"]
+    assert [x[module.REPORTED].spearman for x in found.values()] == pytest.approx([-1, 1, -1])
+    assert "over the training, 3 objectives, agents that report |" in page
 
 
 def test_the_mean_score_weighs_tasks_by_their_experts(tmp_path, environment, trained, elsewhere):
