@@ -320,27 +320,39 @@ def _text(found: Alignment) -> str:
 
 
 def draw(report: Mapping[str, Any]) -> dict[str, Figure]:
-    """Of each environment, a panel a regime: an objective's return there against that in the environment."""
+    """Of each environment, a panel a regime or other environment: an objective's return there against that in it."""
     drawn = {}
     for environment, regimes in report["environments"].items():
         curves = ranked(environment, regimes)
-        figure = Figure(figsize=(8, 2.9 * -(-len(regimes) // 2) + 0.8))
-        for axes, (name, entry) in zip(
-            plotting.panels(figure, len(regimes)), regimes.items(), strict=True
+        shown = {
+            f"bandit: {name}": ("return in the bandit", fitness(entry, FITNESS, curves))
+            for name, entry in regimes.items()
+        }
+        everywhere = _everywhere(report, curves)
+        shown |= {
+            f"environment: {name}": (
+                "return over the training",
+                {objective: unpacked([of_it[objective]["area"]])[0] for objective in everywhere},
+            )
+            for name, of_it in report.get("others", {}).items()
+        }
+        figure = Figure(figsize=(13, 2.7 * -(-len(shown) // 3) + 0.8))
+        for axes, (title, (label, earned)) in zip(
+            plotting.panels(figure, len(shown), 3), shown.items(), strict=True
         ):
-            earned = fitness(entry, FITNESS, curves)
-            for objective, curve in curves.items():
-                x, y = earned[objective].mean(), float(iqm(curve.area))
+            for objective, agents in earned.items():
+                x, y = agents.mean(), float(iqm(curves[objective].area))
                 axes.plot([x], [y], "o", color=KINDS[kind(objective)])
                 axes.annotate(objective, (x, y), (3, 3), textcoords="offset points", fontsize=6)
             axes.margins(x=0.2, y=0.1)  # room for the names
-            axes.set_title(f"bandit: {name}")
-            axes.set_xlabel("return in the bandit")
+            axes.set_title(title, fontsize=10)
+            axes.set_xlabel(label)
             axes.set_ylabel(f"return on {environment}")
         dot = {"marker": "o", "linestyle": ""}
         plotting.legend_of(figure, {name: {"color": x, **dot} for name, x in KINDS.items()}, 3)
         plotting.figure_title(
-            figure, f"Objectives in bandits, and on {environment} over the training"
+            figure,
+            f"Objectives in bandits and other environments, and on {environment} over the training",
         )
         drawn[f"locomotion_alignment_{environment}"] = figure
     return drawn
