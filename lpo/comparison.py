@@ -7,12 +7,13 @@ intervals.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
+from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
-from lpo.objectives import Objective, check_names, load_objective
+from lpo.objectives import Objective, load_apart
 from scb.agents.ppo import DIAGNOSIS
 from scb.agents.spec import AgentSpec, environment_agent
 from scb.environments.registry import environment_spec
@@ -169,8 +170,12 @@ class Comparison:
         }
 
 
-# Of PPO's fields those that are no hyperparameters of a comparison: it has the objective and the steps apart.
-_APART = ("drift", "horizon", "total_steps")
+# Of PPO's fields those that are no hyperparameters of a comparison, and what they are.
+_APART = {
+    "drift": "the objective's own",
+    "horizon": "the length of the training (--steps)",
+    "total_steps": "the number of steps (--steps)",
+}
 
 
 def ppo_spec(
@@ -192,6 +197,8 @@ def ppo_spec(
     spec = environment_agent("ppo", environment).with_steps(steps)
     known = _values(spec)
     for name, value in hyperparameters.items():
+        if name in _APART:
+            raise UserError(f"{name} is no hyperparameter here: it is {_APART[name]}.")
         one_of("hyperparameter of PPO", name, known)
         if value is None:
             raise UserError(
@@ -222,7 +229,7 @@ def _values(spec: AgentSpec) -> dict[str, Any]:
 
 def compare(
     environment: str,
-    objectives: Sequence[Objective | str],
+    objectives: Sequence[Objective | str | Path],
     seeds: Sequence[int],
     spec: AgentSpec | None = None,
     backend: str | None = None,
@@ -237,8 +244,8 @@ def compare(
 
     Args:
       environment: a name that `scb.make` takes.
-      objectives: what replaces PPO's surrogate, or names as `load_objective` takes them; the first is what the
-        others are compared with.
+      objectives: what replaces PPO's surrogate, or names and files as `load_objective` takes them; the first is
+        what the others are compared with.
       seeds: one agent each; the same seeds pair agents of different objectives.
       spec: PPO's; the environment's own where None.
       backend: of an environment with a choice of physics, such as "spring" in Brax.
@@ -250,10 +257,9 @@ def compare(
       tell: takes a line when some agents are done.
 
     Raises:
-      UserError: two objectives bear one name, by which their results are told apart.
+      UserError: there are no objectives, or two bear one name, by which their results are told apart.
     """
-    loaded = [load_objective(x) if isinstance(x, str) else x for x in objectives]
-    check_names(loaded)
+    loaded = load_apart(objectives)
     spec = spec or ppo_spec(environment)
     place = Place.named(environment, backend)
     found = measure(

@@ -20,7 +20,7 @@ from scb.keys import root_key
 KIND = "drift"
 KNOWN: dict[str, Drift] = {"ppo": ClipDrift(), "dpo": DPODrift(), "none": NoDrift()}
 CLIPS = ("ppo-0.1", "ppo", "ppo-0.3", "ppo-0.5", "ppo-1")  # among which a tuned one is looked for
-_SUGGESTED = (*KNOWN, *CLIPS, "dpo-4-1.2")  # to who mistypes a name
+_SUGGESTED = tuple(dict.fromkeys((*KNOWN, *CLIPS, "dpo-4-1.2")))  # to who mistypes a name
 _ZOO = Path(__file__).parent / "zoo"
 _NUMBER = r"(\d*\.?\d+)"
 _CLIP_NAME = re.compile(f"ppo-{_NUMBER}$")
@@ -66,14 +66,21 @@ def zoo_names() -> list[str]:
     return artefacts.names_in(_ZOO)
 
 
-def load_objective(name: str | Path) -> Objective:
+def load_objective(name: "str | Path | Objective") -> Objective:
     """An objective by name ("ppo", "ppo-0.3", "dpo", "dpo-4-1.2", "none", a zoo name) or file (path.npz).
 
-    The number after PPO is its clip, those after DPO its alpha and beta.
+    The number after PPO is its clip, those after DPO its alpha and beta. An objective is itself.
 
     Raises:
-      UserError: unknown name (with near matches), or a file that is no learned objective.
+      UserError: unknown name (with near matches), a file that is no learned objective, or something else.
     """
+    if isinstance(name, Objective):
+        return name
+    if not isinstance(name, str | Path):
+        raise UserError(
+            f"something of the class {type(name).__name__} is no objective: give a name, a file, or "
+            "lpo.Objective(name, drift, parameters)."
+        )
     text = str(name)
     if text in KNOWN:
         return closed_form(text, KNOWN[text])
@@ -101,18 +108,24 @@ def same_drift(one: Objective, other: Objective) -> bool:
     )
 
 
-def load_apart(names: Sequence[str]) -> list[Objective]:
+def load_apart(names: Sequence[str | Path | Objective]) -> list[Objective]:
     """Objectives by what `load_objective` takes, with names of their own.
 
     Files of one name go by what was typed.
 
     Raises:
-      UserError: as for `load_objective`, or one stands there twice.
+      UserError: as for `load_objective`, one stands there twice, or there is none.
     """
+    if isinstance(names, str | Path | Objective):
+        raise UserError("the objectives are a single one: give a list of them.")
+    if not names:
+        raise UserError("no objectives: give at least one, such as ppo.")
     loaded = [load_objective(name) for name in names]
     known = [objective.name for objective in loaded]
     loaded = [
-        replace(objective, name=typed) if known.count(objective.name) > 1 else objective
+        objective
+        if known.count(objective.name) == 1 or isinstance(typed, Objective)
+        else replace(objective, name=str(typed))
         for objective, typed in zip(loaded, names, strict=True)
     ]
     check_names(loaded)
@@ -171,10 +184,20 @@ def save_objective(
     Raises:
       UserError: parameters of another drift, or of one that is its settings.
     """
-    if not isinstance(parameters, Mapping):
+    if not isinstance(drift, Drift):
         raise UserError(
-            f"a drift of the family {drift.name} is its settings, and its parameters are no dict to be saved: name the "
-            "objective, such as ppo-0.3."
+            f"something of the class {type(drift).__name__} is no drift: give that of the search's configuration, or "
+            "an objective's objective.drift with its objective.parameters."
+        )
+    if not isinstance(parameters, Mapping):
+        if not isinstance(drift.init(root_key(0)), Mapping):
+            raise UserError(
+                f"a drift of the family {drift.name} is its settings, and its parameters are no dict to be saved: name "
+                "the objective, such as ppo-0.3."
+            )
+        raise UserError(
+            f"the parameters of a drift of the family {drift.name} are a dict of arrays, and not of the class "
+            f"{type(parameters).__name__}: of a search give outcome.mean."
         )
     told = drift.with_parameters(parameters)
     if told != drift:  # trained on: what its text says now is what is saved

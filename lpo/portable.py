@@ -94,7 +94,7 @@ def _policy_loss(xp: Any, penalty: Any, log_ratio: Any, advantage: Any) -> Any:
 
 
 def _loaded(objective: Objective | str | Path) -> Objective:
-    return objective if isinstance(objective, Objective) else load_objective(objective)
+    return load_objective(objective)
 
 
 def _for_torch(function: "TorchFunction", objective: Objective | str | Path) -> "TorchFunction":

@@ -105,6 +105,7 @@ def named(name: str | Path, folder: Path, what: str, others: Sequence[str] = ())
     """The file of an artefact: by its name in a folder of those that ship, or itself, path.npz.
 
     Args:
+      name: also the file's without its ending.
       what: it is, for the message.
       others: names that the caller knows besides.
 
@@ -116,7 +117,9 @@ def named(name: str | Path, folder: Path, what: str, others: Sequence[str] = ())
         return folder / f"{text}.npz"
     if text.endswith(".npz"):
         return Path(text)
-    if Path(text).is_dir():
+    if os.path.isfile(f"{text}.npz"):  # as it was saved, where a name does for the file
+        return Path(f"{text}.npz")
+    if os.path.isdir(text):  # which no name is too long for
         there = names_in(Path(text))
         raise UserError(
             f"{text} is a folder: give the {what}'s file"

@@ -171,6 +171,12 @@ class Discover(LongRun):
         if processes.first():
             save_bandit(path, problem.bandit, weights, metadata)
         if self.judgement.judge_agents:
+            if config.lists or config.configs:
+                console().print(
+                    "judged now by agents of the paper's lists and steps, not by those of --hyperparameters and "
+                    "--configs, which the search's mean is of",
+                    soft_wrap=True,
+                )
             metadata["results"] = judge_all(
                 problem.bandit,
                 weights,

@@ -75,6 +75,8 @@ _Curriculum = text(read_curriculum, lambda curriculum: str(curriculum or "none")
 class DiscoveryConfig:
     """What to discover, and how.
 
+    Lists are written with commas, and tables as JSON, on the command line; in Python they are tuples and dicts.
+
     Attributes:
       environment: the evaluation environment (Pendulum-v1, CartPole-v1, hopper, ..., or one's own as
         package.module:factory, which returns a gymnax environment).
@@ -88,8 +90,8 @@ class DiscoveryConfig:
       mode: all (every algorithm trains in every candidate) or sequential (one a generation, in turn).
       fixed_hyperparameters: train with the paper's underlined values instead of drawing each agent's
         from the paper's lists.
-      lists: {"ppo": {"learning_rate": [0.001, 0.005], ...}, ...}, a JSON file or the text itself, to
-        draw from instead of the paper's.
+      lists: {"ppo": {"learning_rate": [0.001, 0.005], ...}, ...}, a JSON file or the text itself, to draw from instead
+        of all the paper's lists of that algorithm: what has none here is at its default.
       configs: {"ppo": {"num_envs": 1, "num_steps": 2048, ...}, ...}, a JSON file or the text itself, over
         the inner loop's static configurations: batches, steps, networks.
       agents_per_candidate: agents of each trained algorithm whose returns are a candidate's fitness.
@@ -109,7 +111,9 @@ class DiscoveryConfig:
       bandit: the networks and the latent.
       warm_start: how the expert is found and the bandit fitted to it.
       refinement: of the bandit that the search starts from.
-      evolution: of the candidates; without generations the fit, or what was refined, is the result.
+      evolution: of the candidates; without generations the fit, or what was refined, is the result. In Python
+        `dataclasses.replace(DiscoveryConfig().evolution, num_generations=10)` keeps the rest of the default, which an
+        EvolutionConfig made anew does not.
     """
 
     environment: str = "Pendulum-v1"
@@ -155,6 +159,16 @@ class DiscoveryConfig:
         algorithms: Any = self.algorithms
         if isinstance(algorithms, str):
             raise UserError(f"the algorithms are {algorithms!r}, a text: give a tuple of names.")
+        for name in ("lists", "configs"):
+            given: Any = getattr(self, name)
+            if not isinstance(given, Mapping) or not all(
+                isinstance(of_it, Mapping) for of_it in given.values()
+            ):
+                raise UserError(
+                    f"{name} is {given!r}: give a dict of dicts, by algorithm and name."
+                )
+        if isinstance(self.curriculum, str):
+            object.__setattr__(self, "curriculum", read_curriculum(self.curriculum))
         one_of("initialisation", self.init, INITS)
         one_of("mode", self.mode, MODES)
         one_of("selection", self.select, SELECTIONS)
@@ -241,9 +255,9 @@ class BanditDiscovery:
             "hyperparameter lists": config.lists,
             "configurations": config.configs,
         }.items():
-            if given and not set(given) & set(config.algorithms):
+            if others := sorted(set(given) - set(config.algorithms)):
                 raise UserError(
-                    f"there are {what} for {', '.join(given)}, but the inner loop trains "
+                    f"there are {what} for {', '.join(others)}, but the inner loop trains "
                     f"{', '.join(config.algorithms)}: give them for that."
                 )
         if config.fitted:

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import fields
+from dataclasses import fields, is_dataclass
 from difflib import get_close_matches
 from typing import Any
 
@@ -35,10 +35,20 @@ def _check(
     names: Iterable[str],
     values: Mapping[str, float | None],
 ) -> None:
+    whole = _counted(of) if is_dataclass(of) else ()
     for name, value in {**{name: getattr(of, name) for name in names}, **values}.items():
+        if isinstance(value, str) or (name in whole and isinstance(value, float)):
+            kind = "whole number" if name in whole else "number"
+            raise UserError(f"{name} is {value!r}: it must be a {kind}.")
         if value is not None and not holds(value):
             finite = ", and finite" if isinstance(value, float) else ""
             raise UserError(f"{name} is {value}: it must be {allowed}{finite}.")
+
+
+def _counted(of: Any) -> set[str]:
+    """The fields of a dataclass that are whole numbers, also where a flag's name is annotated."""
+    types = {f.name: getattr(f.type, "__origin__", f.type) for f in fields(of)}
+    return {name for name, of_it in types.items() if of_it in (int, int | None)}
 
 
 def first_line(error: Exception) -> str:

@@ -79,6 +79,7 @@ class EvolutionConfig:
     def __post_init__(self) -> None:
         one_of("evolution strategy", self.strategy, STRATEGIES)
         one_of("combination of tasks", self.combine, COMBINATIONS)
+        at_least(0, self, "population_size", "num_generations")
         if self.population_size < 2:
             raise UserError(
                 f"population_size is {self.population_size}: evolution compares candidates, so it needs at least 2."
@@ -92,7 +93,6 @@ class EvolutionConfig:
                 f"{self.strategy} compares fitness with that of earlier generations, which ranks among candidates of "
                 "one do not allow: combine by mean, or choose another strategy, such as SNES."
             )
-        at_least(0, self, "num_generations")
         at_least(1, self, "mean_evaluations", "evaluate_mean_every", "checkpoint_every")
         searching(self.seed)
         positive(self, "sigma", "sigma_decay", "learning_rate", "learning_rate_decay")

@@ -70,6 +70,11 @@ class Rows:
             stored = self._configurations[other]
             # What an earlier version did not write down is not compared.
             difference = first_difference(stored, {name: described.get(name) for name in stored})
+            if difference and difference.startswith("objective"):
+                raise UserError(
+                    f"{self.path or 'the rows'} are of another objective with the name {columns['objective']}: give "
+                    "this one a name of its own, or choose another file."
+                )
             if difference:
                 raise UserError(
                     f"{self.path or 'the rows'} were measured under another configuration: it differs at "

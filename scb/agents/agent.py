@@ -8,7 +8,7 @@ the caller.
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, fields
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -46,7 +46,8 @@ class AgentConfig(ABC):
     def __post_init__(self) -> None:
         if not isinstance(self.hidden_sizes, tuple):
             raise UserError(
-                f"hidden_sizes is {self.hidden_sizes!r}: give one size a layer, as (64, 64) or [64,64]."
+                f"hidden_sizes is {self.hidden_sizes!r}: give one size a layer, (64, 64) in Python, and [64,64] in "
+                "words."
             )
         counts = [(f.name, getattr(self, f.name)) for f in fields(self) if f.type is int]
         counts += [(f"hidden_sizes[{i}]", size) for i, size in enumerate(self.hidden_sizes)]
@@ -54,6 +55,9 @@ class AgentConfig(ABC):
             if not isinstance(value, int | np.integer) or isinstance(value, bool):
                 raise UserError(f"{name} is {value!r}: it must be a whole number.")
             at_least(1, **{name: int(value)})
+        for name in (f.name for f in fields(self) if f.type is bool):
+            if not isinstance(getattr(self, name), bool):
+                raise UserError(f"{name} is {getattr(self, name)!r}: it must be true or false.")
         one_of("activation", self.activation, networks.ACTIVATIONS)
 
     @property
@@ -103,6 +107,18 @@ def _check_environment(env: Any) -> None:
         )
 
 
+def _check_params(env: environment.Environment[Any, Any], params: Any) -> None:
+    try:
+        wanted = type(env.default_params)
+    except UserError:  # a synthetic one without weights, whose parameters hold some
+        return
+    if not isinstance(params, wanted):
+        raise UserError(
+            f"the environment's parameters are of the class {type(params).__name__}, and those of {env.name} of "
+            f"{wanted.__name__}: give the second of scb.make(NAME), of the same environment."
+        )
+
+
 @dataclass(frozen=True, eq=False)
 class Agent(ABC):
     """An algorithm in one environment.
@@ -112,6 +128,7 @@ class Agent(ABC):
       config: static configuration.
     """
 
+    takes: ClassVar[type] = object  # the class of its hyperparameters
     env: environment.Environment[Any, Any]
     config: AgentConfig
 
@@ -123,6 +140,15 @@ class Agent(ABC):
                 f"the configuration is a {type(self.config).__name__}, and {type(self).__name__} takes a "
                 f"{wanted.__name__}."
             )
+
+    def check_inputs(self, hyperparameters: Any, env_params: Any) -> None:
+        """Raises a UserError for hyperparameters of another algorithm, or parameters of another environment."""
+        if not isinstance(hyperparameters, self.takes):
+            raise UserError(
+                f"the hyperparameters are of the class {type(hyperparameters).__name__}: give (key, "
+                f"{self.takes.__name__}, the environment's parameters), in this order."
+            )
+        _check_params(self.env, env_params)
 
     @property
     def one_step(self) -> bool:
@@ -252,6 +278,7 @@ class Agent(ABC):
         _check_environment(env)
         at_least(1, num_episodes=num_episodes)
         env_params = env.default_params if env_params is None else env_params
+        _check_params(env, env_params)
         own_params = env_params
         if env is not self.env:
             own_params = self._default_params()

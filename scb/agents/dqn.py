@@ -61,6 +61,7 @@ class DQNHyperparameters:
 class DQN(OffPolicyAgent):
     """Deep Q-learning with epsilon-greedy exploration; evaluated greedily."""
 
+    takes = DQNHyperparameters
     config: DQNConfig
     with_targets = ("q",)
 

@@ -169,6 +169,7 @@ class OffPolicyAgent(Agent):
 
     def init(self, key: jax.Array, hyperparameters: Any, env_params: Any) -> OffPolicyState:
         """A fresh agent with its buffer prefilled by uniformly random actions."""
+        self.check_inputs(hyperparameters, env_params)
         key_learner, key_reset, key_prefill, key_train = split_key(key, 4)
         config, space = self.config, self.env.action_space(env_params)
         size = self.observation_size(env_params)

@@ -195,6 +195,7 @@ class PPO(Agent):
       drift: (parameters, log_ratio [B], advantage [B], progress [B]) -> penalty [B].
     """
 
+    takes = PPOHyperparameters
     config: PPOConfig
     drift: DriftFunction = clipped_surrogate_drift
 
@@ -236,11 +237,7 @@ class PPO(Agent):
         self, key: jax.Array, hyperparameters: PPOHyperparameters, env_params: Any
     ) -> PPOState:
         """A fresh agent, its environments at their first observation."""
-        if not isinstance(hyperparameters, PPOHyperparameters):
-            raise UserError(
-                f"the hyperparameters are a {type(hyperparameters).__name__}: give (key, PPOHyperparameters, the "
-                "environment's parameters), in this order."
-            )
+        self.check_inputs(hyperparameters, env_params)
         self._check_parameters(hyperparameters.drift)
         key_policy, key_value, key_reset, key_train = split_key(key, 4)
         policy, value = self._networks(env_params)

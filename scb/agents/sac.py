@@ -59,6 +59,7 @@ class SACHyperparameters:
 class SAC(OffPolicyAgent):
     """Soft actor-critic with two critics, which are stacked, and an adjusted temperature."""
 
+    takes = SACHyperparameters
     config: SACConfig
     with_targets = ("critics",)
 

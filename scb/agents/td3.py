@@ -72,6 +72,7 @@ def ddpg_hyperparameters(**fields: Any) -> TD3Hyperparameters:
 class TD3(OffPolicyAgent):
     """Deterministic policy gradients with clipped double Q-learning, target smoothing and delayed updates."""
 
+    takes = TD3Hyperparameters
     config: TD3Config
     with_targets = ("policy", "critics")
 

@@ -5,6 +5,7 @@ A new family of environments touches two files: a module with its `scb.environme
 settings for is trained with general ones.
 """
 
+import os
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -44,6 +45,8 @@ def environment_spec(name: str | Path) -> EnvironmentSpec:
     for family in _FAMILIES.values():
         if family.owns(name):
             return family.spec(name)
+    if os.path.isfile(f"{name}.npz"):  # as it was saved, where a name does for the file
+        return environment_spec(f"{name}.npz")
     if ":" in name or "." in name:
         raise UserError(
             f"unknown environment {name!r}: one of your own is package.module:factory, such as my_package.arms:make; a "

@@ -135,6 +135,11 @@ class SyntheticEnvironment(environment.Environment[_State, _Params]):
                 f"latent_size is {config.latent_size}, and the form linear makes the {observation_size} observations "
                 "of as many numbers: leave it out, or take the form networks."
             )
+        if not isinstance(action_space, spaces.Box | spaces.Discrete):
+            raise UserError(
+                f"the action space is a {type(action_space).__module__}.{type(action_space).__name__}: give gymnax's "
+                "Box or Discrete."
+            )
         self.config = config
         self.observation_size = observation_size
         self._action_space = action_space

@@ -143,6 +143,11 @@ def save_bandit(
       UserError: weights of other shapes than the environment's; a "T" whose evaluation environment would not come
         back the same.
     """
+    if not isinstance(weights, Mapping):
+        raise UserError(
+            f"the weights of {synthetic.name} are of the class {type(weights).__name__}: give a dict of arrays, as the "
+            "weights of its parameters are."
+        )
     kind = SYNTHETIC_MDP if isinstance(synthetic, SyntheticMDP) else BANDIT
     config = {
         **metadata.get("config", {}),

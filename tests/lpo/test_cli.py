@@ -555,7 +555,7 @@ def test_objectives_are_compared_with_the_hyperparameters_that_are_given(
         ("num_envs=1.5", "num_envs is 1.5: it must be a whole number"),
         ("activation=sine", "unknown activation 'sine'"),
         ("anneal_learning_rate=1", "anneal_learning_rate is 1: it must be true or false"),
-        ("drift=0.3", "unknown hyperparameter of PPO 'drift'"),
+        ("drift=0.3", "drift is no hyperparameter here"),
         ("num_minibatches=3", "num_minibatches is 3, which does not divide a batch"),
     ],
 )

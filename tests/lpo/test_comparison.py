@@ -13,6 +13,7 @@ from lpo.comparison import (
     LearningCurves,
     compare,
     learning_curves,
+    ppo_spec,
 )
 from lpo.objectives import Objective, load_objective
 from scb.agents.ppo import PPOHyperparameters
@@ -210,3 +211,24 @@ def test_two_objectives_of_one_name_are_refused(arguments, one_sentence):
     with pytest.raises(UserError) as error:
         compare(objectives=pair, **arguments)
     assert "objective 'ppo' is there twice" in one_sentence(str(error.value))
+
+
+@pytest.mark.parametrize(
+    ("objectives", "seeds", "message"),
+    [
+        ([], [0], "no objectives: give at least one"),
+        ("ppo", [0], "a single one: give a list"),
+        (["ppo", "ppo"], [0], "objective 'ppo' is there twice"),
+        (["ppo"], 2, r"the seeds are 2: give several, such as \[2\]"),
+        (["ppo"], "01", "the seeds are '01'"),
+    ],
+)
+def test_a_comparison_says_what_it_cannot_compare(objectives, seeds, message):
+    with pytest.raises(UserError, match=message):
+        compare("CartPole-v1", objectives, seeds)
+
+
+def test_steps_and_drift_are_no_hyperparameters_of_a_comparison():
+    for name, said in (("total_steps", "the number of steps"), ("drift", "the objective's own")):
+        with pytest.raises(UserError, match=f"{name} is no hyperparameter here: it is {said}"):
+            ppo_spec("CartPole-v1", hyperparameters={name: 1})

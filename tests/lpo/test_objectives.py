@@ -291,7 +291,7 @@ def test_a_missing_config_is_named(file, one_sentence):
 @pytest.mark.parametrize(
     ("entry", "value", "message"),
     [
-        ("hidden_size", "four", "its .json garbles config entry 'drift'"),
+        ("hidden_size", "four", "hidden_size is 'four': it must be a whole number."),
         ("clip", "0.2", "its .json garbles config entry 'drift'"),
         ("xi", None, "its .json garbles config entry 'drift'"),
         ("features", 8, "its .json garbles config entry 'drift'"),
@@ -358,3 +358,32 @@ def test_a_temporal_objective_comes_back_as_one(tmp_path):
     assert loaded.drift == drift
     assert certificate.holds
     np.testing.assert_array_equal(loaded.parameters["hidden"], parameters["hidden"])
+
+
+def test_an_objective_is_itself_and_nothing_else_is_one():
+    objective = load_objective("ppo-0.3")
+    assert load_objective(objective) is objective
+    for wrong in (DPODrift(), 3, None):
+        with pytest.raises(UserError, match=f"of the class {type(wrong).__name__} is no objective"):
+            load_objective(wrong)
+
+
+def test_a_file_is_found_by_the_name_that_it_was_saved_with(tmp_path):
+    learned = load_objective("lpo-pendulum")
+    save_objective(tmp_path / "mine", learned.drift, learned.parameters)
+    assert load_objective(tmp_path / "mine").name == "mine"
+    assert load_apart([str(tmp_path / "mine"), learned])[1] is learned
+    for unknown in (tmp_path / "other", "x" * 300):
+        with pytest.raises(UserError, match="unknown objective"):
+            load_objective(unknown)
+
+
+def test_what_is_saved_is_a_drift_with_its_parameters(tmp_path):
+    learned = load_objective("lpo-pendulum")
+    with pytest.raises(
+        UserError, match=r"not of the class Objective: of a search give outcome.mean"
+    ):
+        save_objective(tmp_path / "mine", learned.drift, learned)
+    with pytest.raises(UserError, match="of the class Objective is no drift"):
+        save_objective(tmp_path / "mine", learned, learned.parameters)
+    assert not [*tmp_path.iterdir()]

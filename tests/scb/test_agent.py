@@ -165,7 +165,7 @@ def test_an_agent_says_what_it_takes():
         PPO(env, TD3Config())
     agent = PPO(env, PPOConfig())
     with pytest.raises(
-        UserError, match=r"the hyperparameters are a CorridorParams: give \(key, PPOHyp"
+        UserError, match=r"the hyperparameters are of the class CorridorParams: give \(key, PPOHyp"
     ):
         agent.train(jax.random.key(0), params, PPOHyperparameters())
     state = agent.init(jax.random.key(0), PPOHyperparameters(), params)

@@ -188,19 +188,19 @@ def test_with_physics_different_drifts_share_a_program(bandit, monkeypatch):
 @pytest.mark.parametrize(
     ("changes", "difference"),
     [
-        ({"episodes": 6}, "episodes (5 there, 6 now)"),
+        ({"episodes": 6}, "it differs at episodes (5 there, 6 now)"),
         (
             {"spec": AgentSpec("ppo", CONFIG, PPOHyperparameters(learning_rate=0.02))},
-            "agent.hyperparameters.learning_rate (0.03 there, 0.02 now)",
+            "it differs at agent.hyperparameters.learning_rate (0.03 there, 0.02 now)",
         ),
-        ({"objectives": (Clip("ppo", 0.1),)}, "objective"),
+        ({"objectives": (Clip("ppo", 0.1),)}, "are of another objective with the name ppo: give"),
     ],
 )
 def test_rows_of_another_configuration_are_refused(copy, measured, changes, difference):
     before = copy.read_bytes()
     with pytest.raises(UserError) as error:
         measured(copy, **changes)
-    assert f"it differs at {difference}" in str(error.value)
+    assert difference in str(error.value)
     assert copy.read_bytes() == before
 
 

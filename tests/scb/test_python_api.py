@@ -1,0 +1,99 @@
+"""What a caller in Python gets wrong is told in a sentence, before anything is trained."""
+
+import gymnasium
+import gymnax
+import jax
+import pytest
+
+import scb
+from scb.discovery import BanditDiscovery, DiscoveryConfig
+from scb.errors import UserError
+from scb.evolution import EvolutionConfig
+
+KEY = jax.random.key(0)
+
+
+@pytest.fixture(scope="module")
+def bandit():
+    return gymnax.make("Synthetic-Pendulum-v1")
+
+
+def test_parameters_of_another_environment_are_refused(bandit):
+    env, params = bandit
+    pendulum, pendulum_params = gymnax.make("Pendulum-v1")
+    said = "are of the class EnvParams, and those of Synthetic-Pendulum-v1 of BanditParams"
+    for agent, hyperparameters in (
+        (scb.PPO(env, scb.PPOConfig()), scb.PPOHyperparameters()),
+        (scb.SAC(env, scb.SACConfig()), scb.SACHyperparameters()),
+    ):
+        with pytest.raises(UserError, match=said):
+            agent.train(KEY, hyperparameters, pendulum_params)
+    agent = scb.PPO(env, scb.PPOConfig(total_steps=100))
+    state = agent.init(KEY, scb.PPOHyperparameters(), params)
+    with pytest.raises(UserError, match=r"of the class BanditParams, and those of Pendulum-v1 of"):
+        agent.evaluate(state, KEY, 1, pendulum, params)
+    assert agent.evaluate(state, KEY, 2, pendulum, pendulum_params).returns.shape == (2,)
+
+
+@pytest.mark.parametrize("agent", ["SAC", "TD3"])
+def test_hyperparameters_of_another_algorithm_are_refused(bandit, agent):
+    env, params = bandit
+    made = getattr(scb, agent)(env, getattr(scb, f"{agent}Config")())
+    said = rf"are of the class PPOHyperparameters: give \(key, {agent}Hyperparameters, the env"
+    with pytest.raises(UserError, match=said):
+        made.train(KEY, scb.PPOHyperparameters(), params)
+
+
+def test_a_bandit_is_saved_with_weights_and_found_without_its_ending(bandit, tmp_path):
+    env, params = bandit
+    with pytest.raises(UserError, match="are of the class BanditParams: give a dict of arrays"):
+        scb.save_bandit(tmp_path / "mine", env, params)
+    scb.save_bandit(tmp_path / "mine", env, params.weights)
+    assert scb.make(tmp_path / "mine")[0].name == "mine"
+    assert scb.load_bandit(tmp_path / "mine").name == "mine"
+    with pytest.raises(UserError, match="unknown environment"):
+        scb.make(str(tmp_path / ("x" * 300)))
+
+
+def test_a_bandit_has_an_action_space_of_gymnax():
+    with pytest.raises(
+        UserError, match=r"gymnasium\.spaces\.discrete\.Discrete: give gymnax's Box or"
+    ):
+        scb.SyntheticBandit(3, gymnasium.spaces.Discrete(2), scb.BanditConfig())
+
+
+@pytest.mark.parametrize("value", ["no", 0, None])
+def test_what_is_true_or_false_is_neither_text_nor_number(value):
+    with pytest.raises(UserError, match=r"anneal_learning_rate is .*: it must be true or false"):
+        scb.PPOConfig(anneal_learning_rate=value)
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [("population_size", 4.0), ("num_generations", 1.5), ("mean_evaluations", "8")],
+)
+def test_what_is_counted_is_a_whole_number(field, value):
+    with pytest.raises(UserError, match=rf"{field} is .*: it must be a whole number"):
+        EvolutionConfig(**{field: value})
+
+
+def test_a_curriculum_in_words_is_the_one_that_they_say():
+    def curriculum(words, environment="MountainCar-v0"):
+        config = DiscoveryConfig(environment=environment, init="random", curriculum=words)
+        return BanditDiscovery(config).config.curriculum
+
+    assert str(curriculum("linear:100:200:0:5")) == "linear:100:200:0:5"
+    assert curriculum("none") is None
+    assert str(curriculum("paper")) != "None"
+    with pytest.raises(UserError, match="the curriculum 'rubbish' is not understood"):
+        DiscoveryConfig(curriculum="rubbish")
+
+
+def test_what_is_for_algorithms_that_are_not_trained_is_refused():
+    lists = {"ppo": {"learning_rate": [0.001]}, "SAC": {"learning_rate": [0.1]}}
+    for name in ("lists", "configs"):
+        with pytest.raises(UserError, match="for SAC, but the inner loop trains ppo"):
+            BanditDiscovery(DiscoveryConfig(init="random", **{name: lists}))
+        for wrong in ('{"ppo": {}}', {"ppo": scb.PPOConfig()}):
+            with pytest.raises(UserError, match=f"{name} is .*: give a dict of dicts"):
+                DiscoveryConfig(**{name: wrong})
