@@ -237,7 +237,7 @@ def compare(
     episodes: int = 20,
     mode_actions: bool = True,
     diagnose: bool = False,
-    rows: Rows | None = None,
+    rows: Rows | str | Path | None = None,
     tell: Callable[[str], None] = lambda line: None,
 ) -> Comparison:
     """Trains one PPO agent a seed with each objective, evaluating along the way.
@@ -253,7 +253,7 @@ def compare(
       episodes: of each evaluation.
       mode_actions: evaluate the most likely actions rather than sampled ones.
       diagnose: whether curves say also what an iteration does to the policy (`scb.PPO.diagnose`).
-      rows: where results are kept, and found, so that they are not measured again; None for memory.
+      rows: a .jsonl file in which results are kept, and found, so that they are not measured again; None for memory.
       tell: takes a line when some agents are done.
 
     Raises:
@@ -271,7 +271,7 @@ def compare(
         episodes=episodes,
         actions=(MODE if mode_actions else SAMPLED,),
         diagnose=diagnose,
-        rows=rows,
+        rows=Rows(rows) if isinstance(rows, str | Path) else rows,
         tell=tell,
     )
     steps = np.asarray(list(dict.fromkeys(row["step"] for row in found)))

@@ -25,7 +25,7 @@ from scb.environments.registry import environment_spec
 from scb.errors import UserError
 from scb.evolution import EnvironmentSteps, EvolutionConfig, Outcome, evolve
 from scb.keys import root_key, split_key
-from scb.runs import Run, config_dict
+from scb.runs import Run, config_dict, run_of
 from scb.seeds import VALIDATING
 from scb.statistics import estimate
 
@@ -105,9 +105,26 @@ def _apart(fitness: Mapping[str, jax.Array]) -> dict[str, jax.Array]:
     return {} if len(fitness) == 1 else {f"fitness/{name}": x for name, x in fitness.items()}
 
 
-def meta_train(config: MetaTrainingConfig, run: Run | None = None, quiet: bool = False) -> Outcome:
-    """Evolves a drift; the outcome's means are its weights."""
-    return evolve(MetaTraining(config), config.evolution, run, quiet)
+def meta_train(
+    config: MetaTrainingConfig, run: Run | str | Path | None = None, quiet: bool = False
+) -> Outcome:
+    """Evolves a drift.
+
+    Args:
+      config: what it is learned on, and how.
+      run: a folder for logs and checkpoints. Killed, the same call goes on from the last checkpoint, also with more
+        generations; once it has ended, it returns the outcome. None: nothing is kept.
+      quiet: no line a generation.
+
+    Returns:
+      The outcome, whose `mean` and `best_mean` are the drift's weights: what `save_objective` takes beside
+      `config.drift`.
+
+    Raises:
+      UserError: the folder holds something else, or a run of another configuration.
+    """
+    with run_of(run, config, config.checksums()) as opened:
+        return evolve(MetaTraining(config), config.evolution, opened, quiet)
 
 
 def learn_objective(

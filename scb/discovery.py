@@ -51,7 +51,7 @@ from scb.keys import named_key, root_key, split_key
 from scb.lists import read_configs, read_lists, write_lists
 from scb.measurement import Judge, Place, train_and_judge
 from scb.refinement import RefinementConfig, refined
-from scb.runs import Run, config_dict
+from scb.runs import Run, config_dict, run_of
 from scb.spaces import check_bounded, kind_of_actions
 from scb.strategies import REMEMBERING, strategy_for
 from scb.warm_start import WarmStartConfig, expert_agent, warm_start
@@ -255,9 +255,11 @@ class BanditDiscovery:
             "hyperparameter lists": config.lists,
             "configurations": config.configs,
         }.items():
-            if others := sorted(set(given) - set(config.algorithms)):
+            for name in given:
+                one_of("algorithm", name, ALGORITHMS)
+            if given and not set(given) & set(config.algorithms):
                 raise UserError(
-                    f"there are {what} for {', '.join(others)}, but the inner loop trains "
+                    f"there are {what} for {', '.join(given)}, but the inner loop trains "
                     f"{', '.join(config.algorithms)}: give them for that."
                 )
         if config.fitted:
@@ -472,8 +474,24 @@ class BanditDiscovery:
 
 
 def discover(
-    config: DiscoveryConfig, run: Run | None = None, quiet: bool = False
+    config: DiscoveryConfig, run: Run | str | Path | None = None, quiet: bool = False
 ) -> tuple[BanditDiscovery, Outcome]:
-    """Evolves a bandit. The returned problem holds the bandit's shapes, the outcome its weights."""
+    """Evolves a bandit.
+
+    Args:
+      config: for which environment, and how.
+      run: a folder for logs and checkpoints. Killed, the same call goes on from the last checkpoint, also with more
+        generations; once it has ended, it returns the outcome. None: nothing is kept.
+      quiet: no line a generation.
+
+    Returns:
+      (the problem, whose `bandit` has the shapes, the outcome, whose `mean` and `best_mean` are weights): what
+      `save_bandit` takes.
+
+    Raises:
+      UserError: the folder holds something else, or a run of another configuration.
+    """
     problem = BanditDiscovery(config)
-    return problem, problem.search(run, quiet)
+    inputs = {} if config.start is None else {config.start: bandit_metadata(config.start)["sha256"]}
+    with run_of(run, config, inputs) as opened:
+        return problem, problem.search(opened, quiet)

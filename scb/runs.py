@@ -17,6 +17,7 @@ import time
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import asdict
 from pathlib import Path
+from types import MappingProxyType
 from typing import IO, Any
 
 try:
@@ -275,6 +276,31 @@ def read_config(folder: str | Path) -> dict[str, Any]:
 def config_dict(config: Any) -> dict[str, Any]:
     """A configuration's dataclass as plain JSON types."""
     return dict(json.loads(json.dumps(asdict(config))))
+
+
+@contextlib.contextmanager
+def run_of(
+    folder: "Run | str | Path | None", config: Any, inputs: Mapping[str, str] = MappingProxyType({})
+) -> Iterator["Run | None"]:
+    """Within it the run of a folder, begun there, or gone on with where it was begun; a run, or None, is itself.
+
+    Args:
+      config: a dataclass, which decides the run; an `evolution.num_generations` may grow.
+      inputs: {name: digest} of files that the run begins with.
+
+    Raises:
+      UserError: as `Run.open`, also where the folder holds another run.
+    """
+    if folder is None or isinstance(folder, Run):
+        yield folder
+        return
+    stored = {"config": config_dict(config), "inputs": dict(inputs)}
+    begun = (Path(folder) / "config.json").exists()
+    run = Run.open(folder, stored, resume=begun, growing=["config.evolution.num_generations"])
+    try:
+        yield run
+    finally:
+        run.close()
 
 
 class Stopwatch:

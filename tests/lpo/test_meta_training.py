@@ -572,3 +572,18 @@ def test_defaults_take_a_bandit_with_noise():
     default = MetaTrainingConfig()
     assert (default.tasks, default.reward_noise) == (("Synthetic-Pendulum-v1",), 5.0)
     assert (default.drift, default.evolution.strategy) == (LearnedDrift(base="ppo"), "Open_ES")
+
+
+def test_a_folder_keeps_a_meta_training_from_python(config, tmp_path):
+    folder = tmp_path / "run"
+    longer = replace(config, evolution=replace(config.evolution, num_generations=4))
+    shorter = replace(config, evolution=replace(config.evolution, num_generations=2))
+    meta_train(shorter, folder, quiet=True)
+    logged = (folder / "metrics.jsonl").read_text()
+    # The same call with more generations goes on, and ends as one that had them from the start.
+    grown = meta_train(longer, str(folder), quiet=True)
+    assert (folder / "metrics.jsonl").read_text().startswith(logged)
+    whole = meta_train(longer, quiet=True)
+    jax.tree.map(np.testing.assert_array_equal, grown.mean, whole.mean)
+    with pytest.raises(UserError, match=r"its config differs at config\.agents_per_candidate"):
+        meta_train(replace(longer, agents_per_candidate=2), folder, quiet=True)

@@ -89,10 +89,10 @@ def test_a_curriculum_in_words_is_the_one_that_they_say():
         DiscoveryConfig(curriculum="rubbish")
 
 
-def test_what_is_for_algorithms_that_are_not_trained_is_refused():
+def test_what_is_for_algorithms_that_are_none_is_refused():
     lists = {"ppo": {"learning_rate": [0.001]}, "SAC": {"learning_rate": [0.1]}}
     for name in ("lists", "configs"):
-        with pytest.raises(UserError, match="for SAC, but the inner loop trains ppo"):
+        with pytest.raises(UserError, match="unknown algorithm 'SAC': did you mean sac"):
             BanditDiscovery(DiscoveryConfig(init="random", **{name: lists}))
         for wrong in ('{"ppo": {}}', {"ppo": scb.PPOConfig()}):
             with pytest.raises(UserError, match=f"{name} is .*: give a dict of dicts"):
