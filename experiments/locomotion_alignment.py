@@ -116,9 +116,9 @@ def parts(options: Options, report: dict[str, Any]) -> Iterator[Part]:
 
     names = list(dict.fromkeys(n for e in options.environments for n in validated(e)))
     for other in options.others:
-        path, places = ("others", other), {(name,): name for name in names}
-        left = lacking(report, path, places)
-        yield Part(path, partial(_trained_in, other, list(left.values()), options), tuple(left))
+        at, those = ("others", other), {(name,): name for name in names}
+        left = lacking(report, at, those)
+        yield Part(at, partial(_trained_in, other, list(left.values()), options), tuple(left))
 
 
 def _trained_in(environment: str, names: list[str], options: Options) -> dict[str, Any]:

@@ -193,8 +193,9 @@ def check_seeds(seeds: Sequence[int]) -> list[int]:
     Raises:
       UserError: there are none, one is no whole number of 32 bits, or is there twice.
     """
-    if not isinstance(seeds, Sequence | np.ndarray) or isinstance(seeds, str):
-        raise UserError(f"the seeds are {seeds!r}: give several, such as [{seeds!r}] or range(10).")
+    given: object = seeds
+    if not isinstance(given, Sequence | np.ndarray) or isinstance(given, str):
+        raise UserError(f"the seeds are {given!r}: give several, such as [0] or range(10).")
     if not len(seeds):
         raise UserError("no seeds: give at least one.")
     for seed in seeds:

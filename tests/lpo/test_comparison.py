@@ -219,7 +219,7 @@ def test_two_objectives_of_one_name_are_refused(arguments, one_sentence):
         ([], [0], "no objectives: give at least one"),
         ("ppo", [0], "a single one: give a list"),
         (["ppo", "ppo"], [0], "objective 'ppo' is there twice"),
-        (["ppo"], 2, r"the seeds are 2: give several, such as \[2\]"),
+        (["ppo"], 2, r"the seeds are 2: give several, such as \[0\]"),
         (["ppo"], "01", "the seeds are '01'"),
     ],
 )
