@@ -116,7 +116,8 @@ def parts(options: Options, report: dict[str, Any]) -> Iterator[Part]:
 
     names = list(dict.fromkeys(n for e in options.environments for n in validated(e)))
     for other in options.others:
-        at, those = ("others", other), {(name,): name for name in names}
+        at = ("others", other)
+        those: dict[Keys, str] = {(name,): name for name in names}
         left = lacking(report, at, those)
         yield Part(at, partial(_trained_in, other, list(left.values()), options), tuple(left))
 
