@@ -246,7 +246,7 @@ def kind(objective: str) -> str:
 
 def facts(report: Report) -> dict[str, Any]:
     """The correlations as tables, the best regime, those shown to rank, what objectives earn in the environments."""
-    found = aligned(report)
+    found, elsewhere = aligned(report), ranked_elsewhere(report)
     earned = {
         environment: {
             name: {of: float(iqm(getattr(curve, of))) for of in OUTCOMES} | {"n": len(curve.seeds)}
@@ -295,13 +295,24 @@ def facts(report: Report) -> dict[str, Any]:
             environment: {
                 other: [_text(x) for x in of_it.values()] for other, of_it in others.items()
             }
-            for environment, others in ranked_elsewhere(report).items()
+            for environment, others in elsewhere.items()
         },
         "elsewhere_shown": {
-            environment: [other for other, of_it in others.items() if of_it["area"].low > 0.0]
-            for environment, others in ranked_elsewhere(report).items()
+            environment: [
+                other
+                for other, of_it in elsewhere.get(environment, {}).items()
+                if of_it["area"].low > 0.0
+            ]
+            for environment in found
         },
-        "reporting": {x: len(reporting_there(report, x)) for x in report["environments"]},
+        "columns": {
+            environment: [
+                OUTCOMES.get(column)
+                or f"over the training, {len(reporting_there(report, environment))} objectives, agents that report"
+                for column in others[TOGETHER]
+            ]
+            for environment, others in elsewhere.items()
+        },
         "labels": LABELS,
         "judged_by": FITNESS,
         "outcomes": OUTCOMES,

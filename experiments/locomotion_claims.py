@@ -73,7 +73,9 @@ def confirmed(report: Report) -> list[tuple[Confirmation, int, Judged | None]]:
 
 def since(report: Report, asked: Confirmation) -> tuple[list[int], Estimate] | None:
     """(seeds, difference) of the pairs that were trained after those of a confirmation; None where they are few."""
-    entry = looked_at(report)[asked.environment]
+    entry = looked_at(report).get(asked.environment)
+    if entry is None:
+        return None
     last = max(asked.seeds)
     later = {
         name: {

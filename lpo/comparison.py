@@ -173,8 +173,8 @@ class Comparison:
 # Of PPO's fields those that are no hyperparameters of a comparison, and what they are.
 _APART = {
     "drift": "the objective's own",
-    "horizon": "the length of the training (--steps)",
-    "total_steps": "the number of steps (--steps)",
+    "horizon": "the length of the training, that is, steps",
+    "total_steps": "steps, which are given apart",
 }
 
 
@@ -260,6 +260,8 @@ def compare(
       UserError: there are no objectives, or two bear one name, by which their results are told apart.
     """
     loaded = load_apart(objectives)
+    if not loaded:
+        raise UserError("no objectives: give at least one, such as ppo.")
     spec = spec or ppo_spec(environment)
     place = Place.named(environment, backend)
     found = measure(
@@ -302,7 +304,7 @@ def compare(
 
 
 def learning_curves(
-    environment: str, objective: Objective | str, seeds: Sequence[int], **arguments: Any
+    environment: str, objective: Objective | str | Path, seeds: Sequence[int], **arguments: Any
 ) -> LearningCurves:
     """`compare` with a single objective."""
     (curves,) = compare(environment, [objective], seeds, **arguments).curves

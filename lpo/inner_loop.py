@@ -41,9 +41,6 @@ def _write_horizons(horizons: tuple[float, ...]) -> str:
 class MetaTrainingConfig:
     """What to learn an objective on, and how.
 
-    Lists are written with commas on the command line, and are tuples and dicts in Python:
-    `MetaTrainingConfig(tasks=("CartPole-v1",), hyperparameters={"learning_rate": (0.001, 0.005)})`.
-
     Attributes:
       tasks: where the inner loop trains: bandits (Synthetic-Pendulum-v1) or any environments
         (Pendulum-v1, hopper, ...), separated by commas; observations and actions may differ.
@@ -53,7 +50,7 @@ class MetaTrainingConfig:
       agent: PPO's static configuration; None takes `task_agent`'s.
       contexts: that a batch of a bandit holds.
       horizons: how long inner agents train, as fractions of the setting's number of updates (0.25,0.5,1), of
-        which one is drawn for each generation. None, or in Python (): always in full. A temporally-aware drift
+        which one is drawn for each generation. None: always in full. A temporally-aware drift
         learns here that the fraction of training done is what matters.
       hyperparameters: values that inner agents draw PPO's hyperparameters from (such as learning_rate=0.001
         policy_output_scale=1,0.01); the rest are those of the (evaluation) environment's own setting. With one
@@ -71,9 +68,8 @@ class MetaTrainingConfig:
         environment).
       initial_scale: of the drift's random start, so that the search begins near what it corrects.
       drift: the settings of what is learned.
-      evolution: of the candidates. In Python `dataclasses.replace(MetaTrainingConfig().evolution, num_generations=10)`
-        keeps the rest of the default, which an EvolutionConfig made anew does not. With several tasks `combine` should
-        be "ranks", as it is on the command line where nothing else is said: their returns have different scales.
+      evolution: of the candidates. With several tasks `combine` should be "ranks", as it is on the command line
+        where nothing else is said: their returns have different scales.
     """
 
     tasks: Annotated[
@@ -109,11 +105,15 @@ class MetaTrainingConfig:
         tasks: Any = self.tasks
         if isinstance(tasks, str):
             raise UserError(f"the tasks are {self.tasks!r}, a text: give a tuple of names.")
-        of_python: Any = self.hyperparameters
-        if not isinstance(of_python, Mapping):
+        hyperparameters: Any = self.hyperparameters
+        if not isinstance(hyperparameters, Mapping):
             raise UserError(
-                f"the hyperparameters are {of_python!r}: give a dict, such as {{'learning_rate': (0.001, 0.005)}}."
+                f"the hyperparameters are {hyperparameters!r}: give a dict, such as "
+                "{'learning_rate': (0.001, 0.005)}."
             )
+        for name, wanted in (("drift", Drift), ("evolution", EvolutionConfig)):
+            if not isinstance(given := getattr(self, name), wanted):
+                raise UserError(f"{name} is {given!r}: give one of the class {wanted.__name__}.")
         if not isinstance(self.horizons, tuple | list):
             raise UserError(f"the horizons are {self.horizons!r}: give a tuple, () for none.")
         if not isinstance(self.agent, PPOConfig | None):

@@ -21,6 +21,7 @@ import numpy as np
 from lpo.inner_loop import MetaTrainingConfig, TaskTraining
 from lpo.objectives import Objective, load_objective, save_objective
 from scb import processes
+from scb.command_line import GENERATIONS
 from scb.environments.registry import environment_spec
 from scb.errors import UserError
 from scb.evolution import EnvironmentSteps, EvolutionConfig, Outcome, evolve
@@ -111,7 +112,9 @@ def meta_train(
     """Evolves a drift.
 
     Args:
-      config: what it is learned on, and how.
+      config: what it is learned on, and how. What is a list on the command line is a tuple here, and what has names a
+        dict; `dataclasses.replace(MetaTrainingConfig().evolution, num_generations=10)` keeps the rest of its default,
+        which an EvolutionConfig made anew does not.
       run: a folder for logs and checkpoints. Killed, the same call goes on from the last checkpoint, also with more
         generations; once it has ended, it returns the outcome. None: nothing is kept.
       quiet: no line a generation.
@@ -123,8 +126,9 @@ def meta_train(
     Raises:
       UserError: the folder holds something else, or a run of another configuration.
     """
-    with run_of(run, config, config.checksums()) as opened:
-        return evolve(MetaTraining(config), config.evolution, opened, quiet)
+    problem = MetaTraining(config)  # a mistake must not leave a folder behind
+    with run_of(run, config, config.checksums(), GENERATIONS) as opened:
+        return evolve(problem, config.evolution, opened, quiet)
 
 
 def learn_objective(

@@ -1,7 +1,7 @@
 """Objectives by name or file: PPO's clip, DPO, no drift, the learned ones of the zoo, and formulas."""
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
@@ -67,7 +67,7 @@ def zoo_names() -> list[str]:
 
 
 def load_objective(name: "str | Path | Objective") -> Objective:
-    """An objective by name ("ppo", "ppo-0.3", "dpo", "dpo-4-1.2", "none", a zoo name) or file (path.npz).
+    """An objective by name ("ppo", "ppo-0.3", "dpo", "dpo-4-1.2", "none", a zoo name) or file (path.npz, or path).
 
     The number after PPO is its clip, those after DPO its alpha and beta. An objective is itself.
 
@@ -108,18 +108,17 @@ def same_drift(one: Objective, other: Objective) -> bool:
     )
 
 
-def load_apart(names: Sequence[str | Path | Objective]) -> list[Objective]:
+def load_apart(names: Iterable[str | Path | Objective]) -> list[Objective]:
     """Objectives by what `load_objective` takes, with names of their own.
 
     Files of one name go by what was typed.
 
     Raises:
-      UserError: as for `load_objective`, one stands there twice, or there is none.
+      UserError: as for `load_objective`, or one stands there twice.
     """
     if isinstance(names, str | Path | Objective):
         raise UserError("the objectives are a single one: give a list of them.")
-    if not names:
-        raise UserError("no objectives: give at least one, such as ppo.")
+    names = list(names)
     loaded = [load_objective(name) for name in names]
     known = [objective.name for objective in loaded]
     loaded = [

@@ -50,7 +50,7 @@ def drift_function(
     Raises:
       UserError: as `load_objective`.
     """
-    objective = _loaded(objective)
+    objective = load_objective(objective)
     return partial(_in_jax, objective.drift, objective.parameters)
 
 
@@ -64,7 +64,7 @@ def numpy_drift(
     Raises:
       UserError: as `load_objective`.
     """
-    objective = _loaded(objective)
+    objective = load_objective(objective)
     return partial(_in_numpy, objective.drift, _host_parameters(objective))
 
 
@@ -93,10 +93,6 @@ def _policy_loss(xp: Any, penalty: Any, log_ratio: Any, advantage: Any) -> Any:
     return (penalty - ratio * advantage).mean()
 
 
-def _loaded(objective: Objective | str | Path) -> Objective:
-    return load_objective(objective)
-
-
 def _for_torch(function: "TorchFunction", objective: Objective | str | Path) -> "TorchFunction":
     try:
         importlib.import_module("torch")
@@ -104,7 +100,7 @@ def _for_torch(function: "TorchFunction", objective: Objective | str | Path) -> 
         raise UserError(
             "a drift for PyTorch needs the package torch: install the extra `torch`."
         ) from error
-    objective = _loaded(objective)
+    objective = load_objective(objective)
     return partial(function, objective.drift, _host_parameters(objective))
 
 

@@ -14,6 +14,7 @@ import numpy as np
 
 from lpo.comparison import Comparison, compare, ppo_spec
 from lpo.objectives import Objective, check_names
+from scb.agents.spec import AgentSpec
 from scb.environments.registry import environment_spec, families
 from scb.errors import UserError, one_of
 from scb.rows import Rows
@@ -189,6 +190,23 @@ def reference_of(name: str, comparison: Comparison) -> tuple[float, str]:
     return best, BEST_HERE
 
 
+def suite_specs(
+    name: str, steps: int | None, hyperparameters: Mapping[str, Any]
+) -> dict[str, AgentSpec]:
+    """{environment: PPO's specification there} of a suite.
+
+    Raises:
+      UserError: as `ppo_spec`, with the environment's name: what fits one's batches need not fit another's.
+    """
+    specs = {}
+    for environment in suite(name):
+        try:
+            specs[environment] = ppo_spec(environment, steps, hyperparameters)
+        except UserError as error:
+            raise UserError(f"{environment}: {error}") from error
+    return specs
+
+
 def run_suite(
     name: str,
     objectives: Sequence[Objective],
@@ -215,6 +233,7 @@ def run_suite(
         episodes of a thousand steps fifteen take longer than the training itself.
       arguments: further ones of `compare`.
     """
+    specs = suite_specs(name, steps, hyperparameters)
     check_names(objectives)
     comparisons: dict[str, Comparison] = {}
     random: dict[str, float] = {}
@@ -226,7 +245,7 @@ def run_suite(
             environment_name,
             objectives,
             seeds,
-            spec=ppo_spec(environment_name, steps, hyperparameters),
+            spec=specs[environment_name],
             backend=physics,
             points=points,
             rows=rows,

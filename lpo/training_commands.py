@@ -18,7 +18,7 @@ from lpo.alignment import Regime, correlation_text, known_drifts, measure_alignm
 from lpo.comparison import Comparison, LearningCurves, compare, ppo_spec
 from lpo.fitness import LABELS
 from lpo.objectives import Objective, learned_in, load_apart, load_objective, same_drift
-from lpo.suite import SuiteScores, run_suite
+from lpo.suite import SuiteScores, run_suite, suite_specs
 from lpo.suite import suite as suite_environments
 from scb import plotting
 from scb.artefacts import package_versions
@@ -222,11 +222,7 @@ class Evaluate(Comparing):
         config, seeds = self.config, self.config.seed_list()
         environments = suite_environments(name)
         check_backend(config.backend, environments)
-        for environment in environments:
-            try:
-                ppo_spec(environment, config.steps, config.hyperparameters)
-            except UserError as error:  # what fits one environment's batches need not fit another's
-                raise UserError(f"{environment}: {error}") from error
+        suite_specs(name, config.steps, config.hyperparameters)
         homes = learned_in(objectives)
         (folder, rows), printer = self.opened(), console()
         scores, comparisons = run_suite(

@@ -101,6 +101,11 @@ def names_in(folder: Path) -> list[str]:
     return sorted(path.stem for path in folder.glob("*.npz"))
 
 
+def is_file(name: str) -> bool:
+    """Whether a name stands for a file, as path.npz does, or for one that is there by its name without .npz."""
+    return name.endswith(".npz") or os.path.isfile(f"{name}.npz")
+
+
 def named(name: str | Path, folder: Path, what: str, others: Sequence[str] = ()) -> Path:
     """The file of an artefact: by its name in a folder of those that ship, or itself, path.npz.
 
@@ -115,10 +120,8 @@ def named(name: str | Path, folder: Path, what: str, others: Sequence[str] = ())
     text, names = str(name), names_in(folder)
     if text in names:
         return folder / f"{text}.npz"
-    if text.endswith(".npz"):
-        return Path(text)
-    if os.path.isfile(f"{text}.npz"):  # as it was saved, where a name does for the file
-        return Path(f"{text}.npz")
+    if is_file(text):
+        return Path(text if text.endswith(".npz") else f"{text}.npz")
     if os.path.isdir(text):  # which no name is too long for
         there = names_in(Path(text))
         raise UserError(

@@ -11,7 +11,7 @@ import tyro
 
 from scb import experts, processes
 from scb.agents.spec import bandit_agent
-from scb.command_line import GENERATIONS, LongRun, Measuring, Output, flags
+from scb.command_line import LongRun, Measuring, Output, flags
 from scb.console import console
 from scb.discovery import BanditDiscovery, DiscoveryConfig
 from scb.environments.registry import environment_spec
@@ -130,12 +130,10 @@ class Discover(LongRun):
         return {"environment": config.environment}
 
     def growing(self) -> Collection[str]:
-        # The paper's curriculum is stretched to the length of the search.
-        return () if self.config.curriculum == "paper" else GENERATIONS
+        return self.config.growing
 
     def inputs(self) -> dict[str, str]:
-        start = self.config.start
-        return {} if start is None else {start: bandit_metadata(start)["sha256"]}
+        return self.config.checksums()
 
     def further(self) -> Iterator[str]:
         yield from super().further()
@@ -173,8 +171,7 @@ class Discover(LongRun):
         if self.judgement.judge_agents:
             if config.lists or config.configs:
                 console().print(
-                    "judged now by agents of the paper's lists and steps, not by those of --hyperparameters and "
-                    "--configs, which the search's mean is of",
+                    "judged by agents with the paper's hyperparameters and steps: what yours earn is the search's mean",
                     soft_wrap=True,
                 )
             metadata["results"] = judge_all(

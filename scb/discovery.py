@@ -27,7 +27,7 @@ from scb.agents.spec import (
     configured,
 )
 from scb.agents.tables import Lists, Values
-from scb.command_line import listed, text
+from scb.command_line import GENERATIONS, listed, text
 from scb.curriculum import (
     CurriculumConfig,
     EpisodeLengths,
@@ -75,8 +75,6 @@ _Curriculum = text(read_curriculum, lambda curriculum: str(curriculum or "none")
 class DiscoveryConfig:
     """What to discover, and how.
 
-    Lists are written with commas, and tables as JSON, on the command line; in Python they are tuples and dicts.
-
     Attributes:
       environment: the evaluation environment (Pendulum-v1, CartPole-v1, hopper, ..., or one's own as
         package.module:factory, which returns a gymnax environment).
@@ -111,9 +109,7 @@ class DiscoveryConfig:
       bandit: the networks and the latent.
       warm_start: how the expert is found and the bandit fitted to it.
       refinement: of the bandit that the search starts from.
-      evolution: of the candidates; without generations the fit, or what was refined, is the result. In Python
-        `dataclasses.replace(DiscoveryConfig().evolution, num_generations=10)` keeps the rest of the default, which an
-        EvolutionConfig made anew does not.
+      evolution: of the candidates; without generations the fit, or what was refined, is the result.
     """
 
     environment: str = "Pendulum-v1"
@@ -149,6 +145,15 @@ class DiscoveryConfig:
     evolution: Annotated[EvolutionConfig, tyro.conf.arg(name="outer loop")] = field(
         default_factory=lambda: EvolutionConfig(combine="ranks")
     )
+
+    @property
+    def growing(self) -> tuple[str, ...]:
+        """Settings of which a resumed search may have more: none where the paper's curriculum is stretched to it."""
+        return () if self.curriculum == "paper" else GENERATIONS
+
+    def checksums(self) -> dict[str, str]:
+        """{name: SHA-256} of the bandit that it starts from, whose name does not say which weights it stands for."""
+        return {} if self.start is None else {self.start: bandit_metadata(self.start)["sha256"]}
 
     @property
     def fitted(self) -> bool:
@@ -479,9 +484,11 @@ def discover(
     """Evolves a bandit.
 
     Args:
-      config: for which environment, and how.
+      config: for which environment, and how. What is a list or a table on the command line is a tuple or a dict here;
+        `dataclasses.replace(DiscoveryConfig().evolution, num_generations=10)` keeps the rest of its default, which an
+        EvolutionConfig made anew does not.
       run: a folder for logs and checkpoints. Killed, the same call goes on from the last checkpoint, also with more
-        generations; once it has ended, it returns the outcome. None: nothing is kept.
+        generations but for the paper's curriculum; once it has ended, it returns the outcome. None: nothing is kept.
       quiet: no line a generation.
 
     Returns:
@@ -491,7 +498,6 @@ def discover(
     Raises:
       UserError: the folder holds something else, or a run of another configuration.
     """
-    problem = BanditDiscovery(config)
-    inputs = {} if config.start is None else {config.start: bandit_metadata(config.start)["sha256"]}
-    with run_of(run, config, inputs) as opened:
+    problem = BanditDiscovery(config)  # a mistake must not leave a folder behind
+    with run_of(run, config, config.checksums(), config.growing) as opened:
         return problem, problem.search(opened, quiet)

@@ -79,7 +79,11 @@ class EvolutionConfig:
     def __post_init__(self) -> None:
         one_of("evolution strategy", self.strategy, STRATEGIES)
         one_of("combination of tasks", self.combine, COMBINATIONS)
-        at_least(0, self, "population_size", "num_generations")
+        at_least(0, self, "num_generations")
+        if not isinstance(self.population_size, int):
+            raise UserError(
+                f"population_size is {self.population_size!r}: it must be a whole number."
+            )
         if self.population_size < 2:
             raise UserError(
                 f"population_size is {self.population_size}: evolution compares candidates, so it needs at least 2."
@@ -355,7 +359,10 @@ def evolve(
             if generation > saved:
                 checkpoints.save(generation, kept)
                 saved = generation
-        return f"{run.folder} is saved after {generation} generations, and continues with --resume."
+        return (
+            f"{run.folder} is saved after {generation} generations, and goes on from there: with --resume, or by the "
+            "call that began it."
+        )
 
     evaluate = map_population(problem.evaluate, config.population_size, (0, None, None))
     steps = evaluated(problem, config, first)

@@ -195,7 +195,7 @@ def check_seeds(seeds: Sequence[int]) -> list[int]:
     """
     given: object = seeds
     if not isinstance(given, Sequence | np.ndarray) or isinstance(given, str):
-        raise UserError(f"the seeds are {given!r}: give several, such as [0] or range(10).")
+        raise UserError(f"the seeds are {given!r}: give a list, such as [0, 1] or range(10).")
     if not len(seeds):
         raise UserError("no seeds: give at least one.")
     for seed in seeds:

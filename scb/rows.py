@@ -34,6 +34,10 @@ class Rows:
 
     def __init__(self, path: str | Path | None = None) -> None:
         self.path = None if path is None else Path(path)
+        if self.path is not None and self.path.suffix != ".jsonl":
+            raise UserError(
+                f"rows are kept in a .jsonl file, and {path} is none: choose another name."
+            )
         self.rows: list[Row] = []
         self._configurations: dict[str, Any] = {}
         if self.path is None or not self.path.exists():
@@ -69,12 +73,13 @@ class Rows:
         for other in {row["configuration"] for row in there} - {digest}:
             stored = self._configurations[other]
             # What an earlier version did not write down is not compared.
-            difference = first_difference(stored, {name: described.get(name) for name in stored})
-            if difference and difference.startswith("objective"):
+            known = {name: described.get(name) for name in stored}
+            if stored.get("objective") != known.get("objective"):
                 raise UserError(
-                    f"{self.path or 'the rows'} are of another objective with the name {columns['objective']}: give "
-                    "this one a name of its own, or choose another file."
+                    f"{self.path or 'the rows'} hold another objective with the name {columns['objective']}: give this "
+                    "one a name of its own, or choose another file."
                 )
+            difference = first_difference(stored, known)
             if difference:
                 raise UserError(
                     f"{self.path or 'the rows'} were measured under another configuration: it differs at "

@@ -17,7 +17,6 @@ import time
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import asdict
 from pathlib import Path
-from types import MappingProxyType
 from typing import IO, Any
 
 try:
@@ -280,13 +279,17 @@ def config_dict(config: Any) -> dict[str, Any]:
 
 @contextlib.contextmanager
 def run_of(
-    folder: "Run | str | Path | None", config: Any, inputs: Mapping[str, str] = MappingProxyType({})
+    folder: "Run | str | Path | None",
+    config: Any,
+    inputs: Mapping[str, str],
+    growing: Collection[str],
 ) -> Iterator["Run | None"]:
     """Within it the run of a folder, begun there, or gone on with where it was begun; a run, or None, is itself.
 
     Args:
-      config: a dataclass, which decides the run; an `evolution.num_generations` may grow.
+      config: a dataclass, which decides the run.
       inputs: {name: digest} of files that the run begins with.
+      growing: fields, such as "evolution.num_generations", of which there may be more than there were.
 
     Raises:
       UserError: as `Run.open`, also where the folder holds another run.
@@ -294,9 +297,15 @@ def run_of(
     if folder is None or isinstance(folder, Run):
         yield folder
         return
-    stored = {"config": config_dict(config), "inputs": dict(inputs)}
-    begun = (Path(folder) / "config.json").exists()
-    run = Run.open(folder, stored, resume=begun, growing=["config.evolution.num_generations"])
+    path = Path(folder)
+    begun = path.exists() and not _has_room(path)
+    command = read_config(path).get("command") if begun else None  # of whoever began it
+    stored = {
+        "command": command or "python",
+        "config": config_dict(config),
+        "inputs": dict(inputs),
+    }
+    run = Run.open(path, stored, begun, growing=[f"config.{name}" for name in growing])
     try:
         yield run
     finally:

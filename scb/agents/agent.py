@@ -112,7 +112,8 @@ def _check_params(env: environment.Environment[Any, Any], params: Any) -> None:
         wanted = type(env.default_params)
     except UserError:  # a synthetic one without weights, whose parameters hold some
         return
-    if not isinstance(params, wanted):
+    # One of somebody's own may come with parameters of a class that it does not name.
+    if wanted is not environment.EnvParams and not isinstance(params, wanted):
         raise UserError(
             f"the environment's parameters are of the class {type(params).__name__}, and those of {env.name} of "
             f"{wanted.__name__}: give the second of scb.make(NAME), of the same environment."

@@ -5,11 +5,11 @@ A new family of environments touches two files: a module with its `scb.environme
 settings for is trained with general ones.
 """
 
-import os
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+from scb import artefacts
 from scb.environments.spec import EnvironmentSpec, Family, Made
 from scb.errors import UserError, unknown_name
 
@@ -35,8 +35,8 @@ def environment_spec(name: str | Path) -> EnvironmentSpec:
     """What is known of an environment.
 
     Args:
-      name: "Synthetic-Pendulum-v1", "CartPole-v1", "hopper", ..., the file.npz of a bandit or of a synthetic
-        MDP, or "package.module:factory" (see `scb.environments.custom`).
+      name: "Synthetic-Pendulum-v1", "CartPole-v1", "hopper", ..., the file.npz (or file) of a bandit or of a
+        synthetic MDP, or "package.module:factory" (see `scb.environments.custom`).
 
     Raises:
       UserError: unknown name (with near matches), or a file that is none of these.
@@ -45,7 +45,7 @@ def environment_spec(name: str | Path) -> EnvironmentSpec:
     for family in _FAMILIES.values():
         if family.owns(name):
             return family.spec(name)
-    if os.path.isfile(f"{name}.npz"):  # as it was saved, where a name does for the file
+    if artefacts.is_file(name):  # by its name, of a bandit or a synthetic MDP, and no environment's
         return environment_spec(f"{name}.npz")
     if ":" in name or "." in name:
         raise UserError(

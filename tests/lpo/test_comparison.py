@@ -219,7 +219,7 @@ def test_two_objectives_of_one_name_are_refused(arguments, one_sentence):
         ([], [0], "no objectives: give at least one"),
         ("ppo", [0], "a single one: give a list"),
         (["ppo", "ppo"], [0], "objective 'ppo' is there twice"),
-        (["ppo"], 2, r"the seeds are 2: give several, such as \[0\]"),
+        (["ppo"], 2, r"the seeds are 2: give a list, such as \[0, 1\]"),
         (["ppo"], "01", "the seeds are '01'"),
     ],
 )
@@ -232,3 +232,15 @@ def test_steps_and_drift_are_no_hyperparameters_of_a_comparison():
     for name, said in (("total_steps", "the number of steps"), ("drift", "the objective's own")):
         with pytest.raises(UserError, match=f"{name} is no hyperparameter here: it is {said}"):
             ppo_spec("CartPole-v1", hyperparameters={name: 1})
+
+
+def test_a_comparison_keeps_its_rows_in_a_file(tmp_path, tiny_agent):
+    spec = AgentSpec("ppo", tiny_agent, PPOHyperparameters())
+    file = tmp_path / "rows.jsonl"
+    first = compare("Synthetic-Pendulum-v1", ["ppo"], [0], spec, points=1, rows=file)
+    kept = file.read_bytes()
+    again = compare("Synthetic-Pendulum-v1", ["ppo"], [0], spec, points=1, rows=str(file))
+    np.testing.assert_array_equal(first.curves[0].returns, again.curves[0].returns)
+    assert file.read_bytes() == kept
+    with pytest.raises(UserError, match=r"are kept in a \.jsonl file"):
+        compare("Synthetic-Pendulum-v1", ["ppo"], [0], spec, rows=tmp_path / "rows.json")

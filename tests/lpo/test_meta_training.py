@@ -11,7 +11,8 @@ import pytest
 from gymnax.environments import spaces
 
 from lpo import inner_loop
-from lpo.drifts import LearnedDrift
+from lpo.commands import MetaTrain
+from lpo.drifts import ClipDrift, LearnedDrift
 from lpo.fitness import FITNESSES, Fitness
 from lpo.inner_loop import MetaTrainingConfig, TaskTraining, task_agent
 from lpo.meta_training import MetaTraining, meta_train
@@ -587,3 +588,16 @@ def test_a_folder_keeps_a_meta_training_from_python(config, tmp_path):
     jax.tree.map(np.testing.assert_array_equal, grown.mean, whole.mean)
     with pytest.raises(UserError, match=r"its config differs at config\.agents_per_candidate"):
         meta_train(replace(longer, agents_per_candidate=2), folder, quiet=True)
+
+
+def test_a_mistake_leaves_no_folder_of_a_meta_training(config, tmp_path):
+    folder = tmp_path / "run"
+    with pytest.raises(UserError, match="family clip, which has nothing to learn"):
+        meta_train(replace(config, drift=ClipDrift()), folder)
+    assert not folder.exists()
+
+
+def test_a_run_from_python_is_none_of_the_command_line(config, tmp_path):
+    meta_train(config, tmp_path / "run", quiet=True)
+    with pytest.raises(UserError, match="it was started with python"):
+        MetaTrain.parse([f"--resume={tmp_path / 'run'}"])

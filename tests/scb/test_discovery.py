@@ -687,3 +687,20 @@ def test_the_inner_loop_is_the_papers_where_no_agent_is_given():
 def test_impossible_discoveries_are_refused(arguments, message):
     with pytest.raises(UserError, match=message):
         BanditDiscovery(replace(CONFIG, **arguments))
+
+
+def test_a_folder_keeps_a_discovery_from_python(tmp_path):
+    folder = tmp_path / "run"
+    longer = replace(CONFIG, evolution=replace(CONFIG.evolution, num_generations=3))
+    discover(replace(CONFIG, evolution=replace(CONFIG.evolution, num_generations=2)), folder, True)
+    _, grown = discover(longer, str(folder), quiet=True)
+    _, whole = discover(longer, quiet=True)
+    jax.tree.map(np.testing.assert_array_equal, grown.mean, whole.mean)
+    with pytest.raises(UserError, match=r"its config differs at config\.environment"):
+        discover(replace(longer, environment="Acrobot-v1"), folder, quiet=True)
+
+
+def test_a_search_with_the_papers_curriculum_does_not_grow():
+    # It is stretched to the search's length.
+    assert DiscoveryConfig(environment="MountainCar-v0", curriculum="paper").growing == ()
+    assert DiscoveryConfig(curriculum="linear:10:20:1:2").growing == ("evolution.num_generations",)

@@ -193,7 +193,7 @@ def test_with_physics_different_drifts_share_a_program(bandit, monkeypatch):
             {"spec": AgentSpec("ppo", CONFIG, PPOHyperparameters(learning_rate=0.02))},
             "it differs at agent.hyperparameters.learning_rate (0.03 there, 0.02 now)",
         ),
-        ({"objectives": (Clip("ppo", 0.1),)}, "are of another objective with the name ppo: give"),
+        ({"objectives": (Clip("ppo", 0.1),)}, "hold another objective with the name ppo: give"),
     ],
 )
 def test_rows_of_another_configuration_are_refused(copy, measured, changes, difference):

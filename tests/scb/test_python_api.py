@@ -4,6 +4,8 @@ import gymnasium
 import gymnax
 import jax
 import pytest
+from flax import struct
+from gymnax.environments import environment
 
 import scb
 from scb.discovery import BanditDiscovery, DiscoveryConfig
@@ -97,3 +99,23 @@ def test_what_is_for_algorithms_that_are_none_is_refused():
         for wrong in ('{"ppo": {}}', {"ppo": scb.PPOConfig()}):
             with pytest.raises(UserError, match=f"{name} is .*: give a dict of dicts"):
                 DiscoveryConfig(**{name: wrong})
+
+
+def test_parameters_of_a_class_of_ones_own_are_taken():
+    @struct.dataclass
+    class Own(environment.EnvParams):
+        pass
+
+    class Plain(environment.Environment):
+        @property
+        def default_params(self):
+            return environment.EnvParams(max_steps_in_episode=3)
+
+        @property
+        def name(self):
+            return "Plain"
+
+    agent = scb.PPO(Plain(), scb.PPOConfig())
+    agent.check_inputs(scb.PPOHyperparameters(), Own())  # gymnax's own class says nothing
+    with pytest.raises(UserError, match="are of the class SACHyperparameters"):
+        agent.check_inputs(scb.SACHyperparameters(), Own())

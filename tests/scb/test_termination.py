@@ -90,7 +90,8 @@ time.sleep(60)
     # The search goes on while it is saved; what it logs then is computed again.
     assert 19 <= step <= logged and step % CONFIG.checkpoint_every
     assert said == (
-        f"search: {words}; {folder} is saved after {step} generations, and continues with --resume.\n"
+        f"search: {words}; {folder} is saved after {step} generations, and goes on from there: with --resume, "
+        "or by the call that began it.\n"
     )
     assert fingerprint(folder, resume=True) == whole
 
