@@ -85,9 +85,10 @@ def with_pairs(report: Mapping[str, Any]) -> Iterator[tuple[Confirmation, list[s
 
 
 def looked_at(report: Mapping[str, Any]) -> dict[str, Any]:
-    """{environment: its entry} without the agents that are trained for confirmations which are not complete.
+    """{name: entry} without the agents that are trained for confirmations which are not complete.
 
-    Who looks at a difference while it grows sees it pass its margin sooner or later.
+    Who looks at a difference while it grows sees it pass its margin sooner or later. An entry that has none of PPO's
+    agents then is left out: there is nothing to compare with.
     """
     pending = [asked for asked, seeds in with_pairs(report) if len(seeds) < len(asked.seeds)]
     found = {}
