@@ -319,14 +319,14 @@ def _final(axes: Axes, position: int, curve: "LearningCurves", look: Look) -> No
 
 def _place(curve: "LearningCurves") -> str:
     physics = "" if curve.backend is None else f" ({curve.backend} physics)"
-    return f"{curve.environment}{physics}"
+    words = {"policy_output_scale": "policy's last layer x"}
+    values = "".join(f", {words.get(k, k)} {value}" for k, value in curve.hyperparameters.items())
+    return f"{curve.environment}{physics}{values}"
 
 
 def _protocol(curve: "LearningCurves") -> str:
     actions = "mode" if curve.mode_actions else "sampled"
-    words = {"policy_output_scale": "policy's last layer x"}
-    values = "".join(f", {words.get(k, k)} {value}" for k, value in curve.hyperparameters.items())
-    return f"{_place(curve)}{values}: {actions} actions, {curve.episodes} episodes"
+    return f"{_place(curve)}: {actions} actions, {curve.episodes} episodes"
 
 
 def _number(counts: Sequence[int], of: str) -> str:
