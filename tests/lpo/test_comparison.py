@@ -229,7 +229,10 @@ def test_a_comparison_says_what_it_cannot_compare(objectives, seeds, message):
 
 
 def test_steps_and_drift_are_no_hyperparameters_of_a_comparison():
-    for name, said in (("total_steps", "steps, which are given apart"), ("drift", "the objective's own")):
+    for name, said in (
+        ("total_steps", "steps, which are given apart"),
+        ("drift", "the objective's own"),
+    ):
         with pytest.raises(UserError, match=f"{name} is no hyperparameter here: it is {said}"):
             ppo_spec("CartPole-v1", hyperparameters={name: 1})
 
