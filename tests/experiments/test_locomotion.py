@@ -52,6 +52,19 @@ def compared(monkeypatch):
     return asked, compared_limit
 
 
+@pytest.fixture
+def trained_at(compared, monkeypatch):
+    """The learning rates of those trainings."""
+    rates, stub = [], module.compare
+
+    def compare(environment, objectives, seeds, spec, *others, **named):
+        rates.append(spec.hyperparameters.learning_rate)
+        return stub(environment, objectives, seeds, spec, *others, **named)
+
+    monkeypatch.setattr(module, "compare", compare)
+    return rates
+
+
 FLAGS = ["--objectives", "ppo", "dpo", "--seeds", "4"]
 
 
@@ -283,16 +296,9 @@ def test_what_only_all_pairs_together_show_is_not_said_to_be_shown(monkeypatch):
 
 
 def test_objectives_are_trained_at_other_rates_by_agents_that_report_nothing(
-    tmp_path, compared, monkeypatch
+    tmp_path, compared, trained_at
 ):
     asked, _ = compared
-    trained_at, stub = [], module.compare
-
-    def compare(environment, objectives, seeds, spec, *others, **named):
-        trained_at.append(spec.hyperparameters.learning_rate)
-        return stub(environment, objectives, seeds, spec, *others, **named)
-
-    monkeypatch.setattr(module, "compare", compare)
     out = tmp_path / "report.json"
     flags = [*FLAGS, "--tuning-agents=2", "--rates", "0.001", f"--out={out}"]
     assert module.EXPERIMENT.main(flags) == 0
@@ -315,21 +321,14 @@ def test_objectives_are_trained_at_other_rates_by_agents_that_report_nothing(
     assert module.EXPERIMENT.main([*flags, "--rates", "0.002", "-1"]) == 2 and len(asked) == before
 
 
-def test_agents_that_report_at_another_rate_stand_apart(tmp_path, compared, monkeypatch):
-    rates, stub = [], module.compare
-
-    def compare(environment, objectives, seeds, spec, *others, **named):
-        rates.append(spec.hyperparameters.learning_rate)
-        return stub(environment, objectives, seeds, spec, *others, **named)
-
-    monkeypatch.setattr(module, "compare", compare)
+def test_agents_that_report_at_another_rate_stand_apart(tmp_path, trained_at):
     out = tmp_path / "report.json"
     assert module.EXPERIMENT.main([*FLAGS, f"--out={out}"]) == 0
     assert module.EXPERIMENT.main([*FLAGS, "--learning-rate", "0.0005", f"--out={out}"]) == 0
-    assert rates == [0.00025] * 4 + [0.0005] * 4
+    assert trained_at == [0.00025] * 4 + [0.0005] * 4
     # The environment's own rate is no other.
     assert module.EXPERIMENT.main([*FLAGS, "--learning-rate", "0.00025", f"--out={out}"]) == 0
-    assert len(rates) == 8
+    assert len(trained_at) == 8
     made = json.loads(out.read_text())
     entries = made["environments"]
     assert [*entries] == ["hopper", "hopper at 0.0005"]
