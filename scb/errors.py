@@ -35,14 +35,21 @@ def _check(
     names: Iterable[str],
     values: Mapping[str, float | None],
 ) -> None:
-    whole = _counted(of) if is_dataclass(of) else ()
-    for name, value in {**{name: getattr(of, name) for name in names}, **values}.items():
-        if isinstance(value, str) or (name in whole and isinstance(value, float)):
-            kind = "whole number" if name in whole else "number"
-            raise UserError(f"{name} is {value!r}: it must be a {kind}.")
+    for name, value in numbers(of, *names, **values).items():
         if value is not None and not holds(value):
             finite = ", and finite" if isinstance(value, float) else ""
             raise UserError(f"{name} is {value}: it must be {allowed}{finite}.")
+
+
+def numbers(of: object = None, *names: str, **values: Any) -> dict[str, Any]:
+    """{name: value} as `at_least` takes them; a UserError for a text, or a fraction where a field is a whole number."""
+    whole = _counted(of) if is_dataclass(of) else ()
+    found = {**{name: getattr(of, name) for name in names}, **values}
+    for name, value in found.items():
+        if isinstance(value, str) or (name in whole and isinstance(value, float)):
+            kind = "whole number" if name in whole else "number"
+            raise UserError(f"{name} is {value!r}: it must be a {kind}.")
+    return found
 
 
 def _counted(of: Any) -> set[str]:

@@ -22,7 +22,7 @@ from scb import processes, termination
 from scb.artefacts import machine_description
 from scb.checkpoints import continued
 from scb.console import Progress, progress_console
-from scb.errors import UserError, at_least, one_of, positive, unused
+from scb.errors import UserError, at_least, numbers, one_of, positive, unused
 from scb.files import plain
 from scb.keys import key_at, root_key, split_key
 from scb.runs import Run, Stopwatch
@@ -80,10 +80,7 @@ class EvolutionConfig:
         one_of("evolution strategy", self.strategy, STRATEGIES)
         one_of("combination of tasks", self.combine, COMBINATIONS)
         at_least(0, self, "num_generations")
-        if not isinstance(self.population_size, int):
-            raise UserError(
-                f"population_size is {self.population_size!r}: it must be a whole number."
-            )
+        numbers(self, "population_size")
         if self.population_size < 2:
             raise UserError(
                 f"population_size is {self.population_size}: evolution compares candidates, so it needs at least 2."
