@@ -23,7 +23,7 @@ from matplotlib.figure import Figure
 
 from experiments.claims import HOLDS
 from experiments.harness import Experiment, Report, packed
-from experiments.locomotion_claims import ASKED, asked_of, claims, confirmed, leading, since, texts
+from experiments.locomotion_claims import ASKED, STATED, claims, confirmed, leading, since, texts
 from experiments.parts import InParts, Keys, Part, file_name, lacking
 from lpo import figures
 from lpo.comparison import Comparison, LearningCurves, changed, compare, ppo_spec
@@ -250,7 +250,7 @@ def facts(report: Report) -> dict[str, Any]:
         "confirmations": [
             (
                 asked,
-                asked_of(asked.of, asked.reference),
+                STATED[asked.of].beside(asked.reference),
                 pairs,
                 judged,
                 judged and since(report, asked),
@@ -259,7 +259,7 @@ def facts(report: Report) -> dict[str, Any]:
         ],
         # What all pairs together may show, and those that were trained to confirm it do not.
         "unconfirmed": {x.claim.text for x in decided if x.outcome != HOLDS},
-        "asked": {of: asked_of(of) for of in ASKED},
+        "asked": {of: asked.beside() for of, asked in ASKED.items()},
         "texts": texts(report),
         "sweeps": {
             name: (sweep, len(entry["sweep"][REFERENCE]), tuned(sweep))

@@ -1,6 +1,7 @@
 """What is asked of objectives on locomotion, and what became of the claims that were stated first."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -12,25 +13,37 @@ from lpo.full_size import REFERENCE, Confirmation, as_comparison, looked_at, wit
 from scb.statistics import DECIDING, Estimate, paired_difference
 
 MARGIN = 0.05  # of what the reference earns: what is not worse by more is as good
-# What is asked of an objective, by the measure that decides it.
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What may be asked of an objective: `words` with a place for the reference, the measure that decides, a margin."""
+
+    words: str
+    measure: str
+    margin: float = 0.0
+
+    def beside(self, reference: str = REFERENCE) -> str:
+        """In words, beside that reference."""
+        return self.words.format(_called(reference))
+
+
+# What is asked of every objective.
 ASKED = {
-    "final": "ends no lower than {}",
-    "late": "earns no less over the last quarter than {}",
-    "early": "earns more over the first half than {}",
-    "area": "earns more over the training than {}",
+    "final": Asked("ends no lower than {}", "final", MARGIN),
+    "late": Asked("earns no less over the last quarter than {}", "late", MARGIN),
+    "early": Asked("earns more over the first half than {}", "early"),
+    "area": Asked("earns more over the training than {}", "area"),
 }
-
-
-def asked_of(of: str, reference: str = REFERENCE) -> str:
-    """One of `ASKED` in words, beside that reference."""
-    return ASKED[of].format(_called(reference))
+# And what is asked only of the one for which it was stated.
+STATED = {**ASKED, "late lead": Asked("earns more over the last quarter than {}", "late")}
 
 
 def paired(
     curves: LearningCurves, reference: LearningCurves, of: str
 ) -> Callable[..., Estimate] | Estimate | None:
-    """How much more agents of the same seeds earn, by one of `ASKED`; no interval where there are few."""
-    ours, theirs = curves.paired(reference, of)
+    """How much more agents of the same seeds earn, by one of `STATED`; no interval where there are few."""
+    ours, theirs = curves.paired(reference, STATED[of].measure)
     return of_agents(partial(paired_difference, ours, theirs), len(ours)) if len(ours) else None
 
 
@@ -120,16 +133,17 @@ def _by_name(environment: str, entry: Report) -> dict[str, LearningCurves]:
 
 
 def _text(entry: str, objective: str, of: str, reference: str = REFERENCE) -> str:
-    return f"{entry}: {objective} {asked_of(of, reference)}"
+    return f"{entry}: {objective} {STATED[of].beside(reference)}"
 
 
 def _claim(entry: str, curves: LearningCurves, reference: LearningCurves, of: str) -> Claim:
+    asked, evidence = STATED[of], paired(curves, reference, of)
     text = _text(entry, curves.objective, of, reference.objective)
-    if of in ("early", "area"):
-        return Claim(text, paired(curves, reference, of), places=0)
-    margin = float(f"{MARGIN * abs(float(getattr(reference, of).mean())):.4g}")
+    if not asked.margin:
+        return Claim(text, evidence, places=0)
+    margin = float(f"{asked.margin * abs(float(getattr(reference, asked.measure).mean())):.4g}")
     reason = f"a twentieth of what {_called(reference.objective)} earns"
-    return Claim(text, paired(curves, reference, of), 0.0, margin, reason, places=0)
+    return Claim(text, evidence, 0.0, margin, reason, places=0)
 
 
 def _called(reference: str) -> str:

@@ -27,7 +27,7 @@ class Confirmation:
     Attributes:
       environment, objective: whose it is; "hopper at 0.0005" is Hopper with that learning rate.
       seeds: of its pairs of agents, none of which suggested the claim.
-      of: what is said of them, "final", "early", "late" or "area".
+      of: what is said of them, "final", "early", "late" or "area" of all objectives, "late lead" of this one.
       reference: which objective its agents are compared with.
       known: the one of both whose agents of these seeds had been trained, and seen, before.
     """
@@ -57,6 +57,7 @@ CONFIRMATIONS = (
     Confirmation("hopper", "lpo-pendulum-ee", reporting(40, offset=10), "area", known=REFERENCE),
     Confirmation("hopper", "ta-lpo", reporting(40, offset=30), "area", "dpo", known="ta-lpo"),
     Confirmation("hopper at 0.0005", "ta-lpo", reporting(40), "area"),
+    Confirmation("hopper at 0.0005", "ta-lpo", reporting(40, offset=40), "late lead"),
 )
 
 
