@@ -5,16 +5,15 @@ hyperparameters drawn from the paper's lists so that the bandit suits any of the
 their return in the evaluation environment. The same search finds the paper's fully synthetic MDPs.
 """
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, cast
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import tyro
 from jax.typing import ArrayLike
 
 from scb import processes
@@ -26,215 +25,23 @@ from scb.agents.spec import (
     check_algorithms,
     configured,
 )
-from scb.agents.tables import Lists, Values
-from scb.command_line import GENERATIONS, listed, text
-from scb.curriculum import (
-    CurriculumConfig,
-    EpisodeLengths,
-    check_curriculum,
-    paper_curriculum,
-    read_curriculum,
-)
+from scb.curriculum import EpisodeLengths, check_curriculum, paper_curriculum
+from scb.discovery_config import DiscoveryConfig as DiscoveryConfig
 from scb.environments.registry import environment_spec
-from scb.environments.synthetic import (
-    BanditConfig,
-    SyntheticBandit,
-    Weights,
-)
-from scb.environments.synthetic_mdp import PARAMETERIZATIONS, synthetic_for
+from scb.environments.synthetic import SyntheticBandit, Weights
+from scb.environments.synthetic_mdp import synthetic_for
 from scb.environments.zoo import bandit_metadata, load_bandit, save_bandit
-from scb.errors import UserError, at_least, one_of, positive, unused
-from scb.evolution import EnvironmentSteps, EvolutionConfig, Outcome, evolve
-from scb.fitting import check_linear, standardize_reward
+from scb.errors import UserError, one_of
+from scb.evolution import EnvironmentSteps, Outcome, evolve
+from scb.fitting import standardize_reward
 from scb.judgement import check_fits
 from scb.keys import named_key, root_key, split_key
-from scb.lists import read_configs, read_lists, write_lists
 from scb.measurement import Judge, Place, train_and_judge
-from scb.refinement import RefinementConfig, refined
+from scb.refinement import refined
 from scb.runs import Run, config_dict, run_of
 from scb.spaces import check_bounded, kind_of_actions
-from scb.strategies import REMEMBERING, strategy_for
-from scb.warm_start import WarmStartConfig, expert_agent, warm_start
-
-INITS = ("random", "expert")
-MODES = ("all", "sequential")
-SELECTIONS = ("final", "best")
-
-
-def _read_algorithms(words: str) -> tuple[str, ...]:
-    if words.strip().lower() == "all":
-        return ()
-    return listed(words.lower(), f"algorithms, of {', '.join(ALGORITHMS)} or all,")
-
-
-_Algorithms = text(_read_algorithms, lambda names: ",".join(names) or "all", "NAME,NAME")
-_Curriculum = text(read_curriculum, lambda curriculum: str(curriculum or "none"), "CURRICULUM")
-
-
-@dataclass(frozen=True)
-class DiscoveryConfig:
-    """What to discover, and how.
-
-    Attributes:
-      environment: the evaluation environment (Pendulum-v1, CartPole-v1, hopper, ..., or one's own as
-        package.module:factory, which returns a gymnax environment).
-      backend: Brax's physics: generalized, positional, spring or mjx.
-      parameterization: I (the bandit), TI or T (fully synthetic MDPs: learned transition, reward and
-        termination, with or without a learned initial state).
-      max_steps: a synthetic MDP's maximum episode length; the environment's own where None.
-      algorithms: of the inner loop, separated by commas (ppo,sac,dqn,ddqn,ddpg,td3); in the mode
-        sequential a name may stand several times, and its algorithm then has that many turns. "all",
-        which is the empty tuple, for the paper's for the action space.
-      mode: all (every algorithm trains in every candidate) or sequential (one a generation, in turn).
-      fixed_hyperparameters: train with the paper's underlined values instead of drawing each agent's
-        from the paper's lists.
-      lists: {"ppo": {"learning_rate": [0.001, 0.005], ...}, ...}, a JSON file or the text itself, to draw from instead
-        of all the paper's lists of that algorithm: what has none here is at its default.
-      configs: {"ppo": {"num_envs": 1, "num_steps": 2048, ...}, ...}, a JSON file or the text itself, over
-        the inner loop's static configurations: batches, steps, networks.
-      agents_per_candidate: agents of each trained algorithm whose returns are a candidate's fitness.
-      evaluation_episodes: of each agent in the evaluation environment.
-      mode_actions: evaluate the most likely actions during the search, rather than sampled ones.
-      curriculum: of the evaluation episodes' length: paper, none, or
-        SHAPE:INITIAL:FINAL:BEGIN:TRANSITION such as linear:100:1000:20:160 (lengths in steps, then
-        generations).
-      init: expert (fit the bandit to an expert first, in a minute) or random (as the paper).
-      start: start from this bandit (a zoo name or file.npz) instead.
-      reward_std: scale the reward that the search starts from to this standard deviation, over
-        contexts and uniform actions, and shift it to mean zero. PPO, which normalises advantages, is
-        nearly indifferent; SAC, whose temperature starts at 1 and whose critics start near 0, is not.
-      select: what a search ends with: final (the mean of the last search distribution) or best (the
-        mean whose judgement during the search was best, and of whose agents no more than a quarter diverged; where
-        the search starts near its end, noise can lead it away again).
-      bandit: the networks and the latent.
-      warm_start: how the expert is found and the bandit fitted to it.
-      refinement: of the bandit that the search starts from.
-      evolution: of the candidates; without generations the fit, or what was refined, is the result.
-    """
-
-    environment: str = "Pendulum-v1"
-    backend: str | None = None
-    parameterization: str = "I"
-    max_steps: int | None = None
-    algorithms: Annotated[tuple[str, ...], _Algorithms] = ("ppo",)
-    mode: str = "all"
-    fixed_hyperparameters: bool = False
-    lists: Annotated[
-        Mapping[str, Lists],
-        tyro.conf.arg(name="hyperparameters"),
-        text(read_lists, write_lists, "FILE|JSON"),
-    ] = field(default_factory=dict)
-    configs: Annotated[Mapping[str, Values], text(read_configs, write_lists, "FILE|JSON")] = field(
-        default_factory=dict
-    )
-    agents_per_candidate: int = 4
-    evaluation_episodes: int = 16
-    mode_actions: bool = False
-    curriculum: Annotated[CurriculumConfig | str | None, _Curriculum] = None
-    init: str = "expert"
-    start: Annotated[str | None, tyro.conf.arg(name="from-bandit")] = None
-    reward_std: float | None = None
-    select: str = "final"
-    bandit: BanditConfig = field(default_factory=BanditConfig)
-    warm_start: Annotated[WarmStartConfig, tyro.conf.arg(name="warm start")] = field(
-        default_factory=WarmStartConfig
-    )
-    refinement: Annotated[RefinementConfig, tyro.conf.arg(name="refinement")] = field(
-        default_factory=RefinementConfig
-    )
-    evolution: Annotated[EvolutionConfig, tyro.conf.arg(name="outer loop")] = field(
-        default_factory=lambda: EvolutionConfig(combine="ranks")
-    )
-
-    @property
-    def growing(self) -> tuple[str, ...]:
-        """Settings of which a resumed search may have more: none where the paper's curriculum is stretched to it."""
-        return () if self.curriculum == "paper" else GENERATIONS
-
-    def checksums(self) -> dict[str, str]:
-        """{name: SHA-256} of the bandit that it starts from, whose name does not say which weights it stands for."""
-        return {} if self.start is None else {self.start: bandit_metadata(self.start)["sha256"]}
-
-    @property
-    def fitted(self) -> bool:
-        """Whether it starts from a fit to an expert."""
-        return self.init == "expert" and self.start is None
-
-    def __post_init__(self) -> None:
-        algorithms: Any = self.algorithms
-        if isinstance(algorithms, str):
-            raise UserError(f"the algorithms are {algorithms!r}, a text: give a tuple of names.")
-        for name in ("lists", "configs"):
-            given: Any = getattr(self, name)
-            if not isinstance(given, Mapping) or not all(
-                isinstance(of_it, Mapping) for of_it in given.values()
-            ):
-                raise UserError(
-                    f"{name} is {given!r}: give a dict of dicts, by algorithm and name."
-                )
-        if isinstance(self.curriculum, str):
-            object.__setattr__(self, "curriculum", read_curriculum(self.curriculum))
-        one_of("initialisation", self.init, INITS)
-        one_of("mode", self.mode, MODES)
-        one_of("selection", self.select, SELECTIONS)
-        one_of("parameterization", self.parameterization, PARAMETERIZATIONS)
-        if self.parameterization != "I" and self.fitted:
-            raise UserError(
-                f"a synthetic MDP ({self.parameterization}) cannot be fitted to an expert: use init random."
-            )
-        if self.parameterization != "I" and self.start is not None:
-            raise UserError("a synthetic MDP cannot start from a bandit: leave the start out.")
-        if self.parameterization == "T":
-            unused(
-                self.bandit,
-                "a synthetic MDP T starts where its environment does",
-                ("latent", "latent_size"),
-                "take TI or I",
-            )
-        if not self.fitted:
-            unused(
-                self.warm_start,
-                "nothing is fitted to an expert",
-                [entry.name for entry in fields(self.warm_start)],
-                "choose init expert and no bandit to start from",
-            )
-        if self.bandit.form == "linear":
-            because, networks = "the form linear has no networks", "take the form networks"
-            unused(self.bandit, because, ("hidden_size", "activation"), networks)
-            if self.fitted:
-                check_linear(self.warm_start.construction)
-                unused(
-                    self.warm_start,
-                    "the form linear is fitted in closed form, to the expert's actions alone",
-                    ("fit_steps", "num_actions"),
-                    networks,
-                )
-        if self.refinement.rounds and self.bandit.form != "linear":
-            raise UserError(
-                f"there are {self.refinement.rounds} refinement rounds, and only a linear bandit's policy is refined: "
-                "choose the form linear, or leave them out."
-            )
-        if self.lists and self.fixed_hyperparameters:
-            raise UserError(
-                "fixed hyperparameters are not drawn from lists: leave out the lists, or draw."
-            )
-        strategy = self.evolution.strategy
-        if self.mode == "sequential" and strategy in REMEMBERING:
-            raise UserError(
-                f"{strategy} compares fitness with that of earlier generations, which is another algorithm's in the "
-                "mode sequential: use the mode all, or choose another strategy, such as SNES."
-            )
-        if not self.evolution.num_generations and not (self.fitted or self.refinement.rounds):
-            raise UserError(
-                "there are 0 generations, and nothing is found before them: choose init expert or refinement rounds, "
-                "or at least 1."
-            )
-        positive(self, "reward_std")
-        if self.reward_std is not None and self.parameterization != "I":
-            raise UserError(
-                f"reward_std is for bandits, and parameterization {self.parameterization} is none: leave it out."
-            )
-        at_least(1, self, "agents_per_candidate", "evaluation_episodes")
+from scb.strategies import strategy_for
+from scb.warm_start import expert_agent, warm_start
 
 
 class BanditDiscovery:
