@@ -142,7 +142,11 @@ def test_a_table_of_a_suite_says_what_was_measured(suite):
 def test_what_readme_says_of_objectives_stands_in_the_results():
     readme = (ROOT / "README.md").read_text()
     pages = "".join((DOCS / f"{name}.md").read_text() for name in ("pendulum", "suites"))
-    rows = [line for line in readme.splitlines() if line.startswith(("| Pendulum,", "| [classic", "| [MinAtar"))]
+    rows = [
+        line
+        for line in readme.splitlines()
+        if line.startswith(("| Pendulum,", "| [classic", "| [MinAtar"))
+    ]
     numbers = re.findall(r"[−\d.]+ \[[^]]*\]", "".join(rows))
     assert len(numbers) == 12
     for number in numbers:

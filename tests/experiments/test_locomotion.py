@@ -280,7 +280,7 @@ def test_what_only_all_pairs_together_show_is_not_said_to_be_shown(monkeypatch):
     made = report(40)
     agents = made["environments"]["hopper"]["agents"]
     shown, row = (
-        "Shown to earn more over the training: on hopper, dpo",
+        "Shown to earn more over the training: dpo on hopper",
         "dpo earns more over the training",
     )
     assert shown in module.EXPERIMENT.page(made)
@@ -414,8 +414,25 @@ def test_a_confirmation_has_a_reference_of_its_own(monkeypatch):
     for agents in made["environments"]["hopper"]["agents"]["lpo-pendulum"].values():
         agents["returns"] = "0 50 9000"
     page = module.EXPERIMENT.page(made)
-    said = "Confirmed: on hopper, lpo-pendulum earns no less over the last quarter than dpo."
+    said = "Confirmed: lpo-pendulum on hopper earns no less over the last quarter than dpo."
     assert f"{said}** PPO has" in page
+
+
+def test_a_lead_that_is_asked_of_one_objective_alone_has_no_margin_and_stands_beside_what_is_asked_of_all(
+    monkeypatch,
+):
+    asked = full_size.Confirmation("hopper", "lpo-pendulum", range(4, 14), "late lead")
+    monkeypatch.setattr(full_size, "CONFIRMATIONS", (asked,))
+    made = report(14)
+    for agents in made["environments"]["hopper"]["agents"]["lpo-pendulum"].values():
+        agents["returns"] = "0 50 9000"
+    ((_, _, judged),) = locomotion_claims.confirmed(made)
+    assert judged.claim.least == 0 and judged.estimate.low > 0
+    assert "lpo-pendulum on hopper earns more over the last quarter than PPO." in (
+        module.EXPERIMENT.page(made)
+    )
+    texts = {claim.text for claim in locomotion_claims.claims(made)}
+    assert not any("more over the last quarter" in text for text in texts)
 
 
 def test_the_shipped_curves_are_of_the_full_size_and_stand_beside_shorter_trainings():
