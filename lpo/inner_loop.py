@@ -1,6 +1,5 @@
 """What meta-training is asked for, and its inner loop: agents that train with a drift, and what that is worth."""
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -20,7 +19,7 @@ from scb.agents.spec import AgentSpec, check_lists, environment_agent
 from scb.command_line import listed, numbers, text
 from scb.environments.registry import check_backend, environment_spec
 from scb.environments.zoo import bandit_metadata
-from scb.errors import UserError, at_least, one_of
+from scb.errors import UserError, at_least, of_classes, one_of, positive
 from scb.evolution import EnvironmentSteps, EvolutionConfig
 from scb.keys import named_key, root_key, split_key
 from scb.lists import read_values, write_values
@@ -111,15 +110,9 @@ class MetaTrainingConfig:
                 f"the hyperparameters are {hyperparameters!r}: give a dict, such as "
                 "{'learning_rate': (0.001, 0.005)}."
             )
-        for name, wanted in (("drift", Drift), ("evolution", EvolutionConfig)):
-            if not isinstance(given := getattr(self, name), wanted):
-                raise UserError(f"{name} is {given!r}: give one of the class {wanted.__name__}.")
+        of_classes(self, drift=Drift, evolution=EvolutionConfig, agent=PPOConfig | None)
         if not isinstance(self.horizons, tuple | list):
             raise UserError(f"the horizons are {self.horizons!r}: give a tuple, () for none.")
-        if not isinstance(self.agent, PPOConfig | None):
-            raise UserError(
-                f"the agent is of the class {type(self.agent).__name__}: give a PPOConfig, or None."
-            )
         if not self.tasks:
             raise UserError("the list of tasks is empty: give at least one bandit or environment.")
         for name in self.tasks:
@@ -147,10 +140,7 @@ class MetaTrainingConfig:
                 "--temporal brings them), or the fitness 'return'."
             )
         for horizon in self.horizons:
-            if not 0 < horizon < math.inf:
-                raise UserError(
-                    f"a horizon is {horizon}: it must be larger than 0, and finite (1 is the setting's own)."
-                )
+            positive(horizon=horizon)
         check_lists(self.hyperparameters, PPOHyperparameters())
         for name in ("drift", "horizon"):
             if name in self.hyperparameters:

@@ -13,7 +13,7 @@ from scb.curriculum import CurriculumConfig, read_curriculum
 from scb.environments.synthetic import BanditConfig
 from scb.environments.synthetic_mdp import PARAMETERIZATIONS
 from scb.environments.zoo import bandit_metadata
-from scb.errors import UserError, at_least, one_of, positive, unused
+from scb.errors import UserError, at_least, of_classes, one_of, positive, unused
 from scb.evolution import EvolutionConfig
 from scb.fitting import check_linear
 from scb.lists import read_configs, read_lists, write_lists
@@ -139,6 +139,14 @@ class DiscoveryConfig:
                 )
         if isinstance(self.curriculum, str):
             object.__setattr__(self, "curriculum", read_curriculum(self.curriculum))
+        of_classes(
+            self,
+            curriculum=CurriculumConfig | str | None,
+            bandit=BanditConfig,
+            warm_start=WarmStartConfig,
+            refinement=RefinementConfig,
+            evolution=EvolutionConfig,
+        )
         one_of("initialisation", self.init, INITS)
         one_of("mode", self.mode, MODES)
         one_of("selection", self.select, SELECTIONS)

@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import fields, is_dataclass
 from difflib import get_close_matches
-from typing import Any
+from typing import Any, get_args
 
 
 class UserError(Exception):
@@ -56,6 +56,14 @@ def _counted(of: Any) -> set[str]:
     """The fields of a dataclass that are whole numbers, also where a flag's name is annotated."""
     types = {f.name: getattr(f.type, "__origin__", f.type) for f in fields(of)}
     return {name for name, of_it in types.items() if of_it in (int, int | None)}
+
+
+def of_classes(of: Any, **wanted: Any) -> None:
+    """Raises a UserError where an attribute is not of its class, or union of classes, as None is where that has it."""
+    for name, classes in wanted.items():
+        if not isinstance(given := getattr(of, name), classes):
+            kinds = [x.__name__.replace("NoneType", "None") for x in get_args(classes) or [classes]]
+            raise UserError(f"{name} is {given!r}: give {' or '.join(kinds)}.")
 
 
 def first_line(error: Exception) -> str:

@@ -529,7 +529,10 @@ def test_physics_go_to_the_environment_and_not_to_its_bandit(
             },
             "needs a reference return of each, and hopper has none: leave out its task",
         ),
-        ({"horizons": (0.5, 0.0)}, "a horizon is 0.0: it must be larger than 0"),
+        ({"horizons": (0.5, 0.0)}, "horizon is 0.0: it must be positive, and finite."),
+        ({"horizons": ("a",)}, "horizon is 'a': it must be a number."),
+        ({"drift": "dpo"}, "drift is 'dpo': give Drift."),
+        ({"agent": 3}, "agent is 3: give PPOConfig or None."),
         (
             {"horizons": (0.5,), "fitness": "area"},
             "fitness 'area' needs trainings of one length: take no horizons",

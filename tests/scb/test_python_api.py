@@ -89,6 +89,10 @@ def test_a_curriculum_in_words_is_the_one_that_they_say():
     assert str(curriculum("paper")) != "None"
     with pytest.raises(UserError, match="the curriculum 'rubbish' is not understood"):
         DiscoveryConfig(curriculum="rubbish")
+    with pytest.raises(UserError, match=r"curriculum is 3: give CurriculumConfig or str or None\."):
+        DiscoveryConfig(curriculum=3)
+    with pytest.raises(UserError, match=r"evolution is \{\}: give EvolutionConfig\."):
+        DiscoveryConfig(evolution={})
 
 
 def test_what_is_for_algorithms_that_are_none_is_refused():
