@@ -162,31 +162,31 @@ def draw_actions(axes: Axes, entry: Mapping[str, Any], actions: str) -> tuple[Pl
 def action_bar(
     figure: Figure, axes: Axes, drawn: Any, environment: str, num_actions: int | None
 ) -> None:
-    """The colour bar below a map of best actions."""
-    bar = figure.colorbar(drawn, ax=axes, location="bottom", aspect=30)
+    """The colour bar beside a map of best actions."""
+    bar = figure.colorbar(drawn, ax=axes, aspect=30)
     bar.set_label(f"best action: {ACTIONS[environment]}", fontsize=8)
     if num_actions:
         bar.set_ticks(range(num_actions))
 
 
 def draw(report: Mapping[str, Any]) -> Figure:
-    """Best actions above, importance below, a column an environment."""
-    figure = Figure(figsize=(15.0, 6.0))
-    panels: Any = figure.subplots(2, len(CLASSIC_CONTROL), height_ratios=[1.6, 1.0])
-    for column, (name, found) in enumerate(report["environments"].items()):
-        top, bottom = panels[:, column]
-        plane, drawn = draw_actions(top, found, "actions")
-        action_bar(figure, top, drawn, name, found["num_actions"])
-        figures.draw_trajectory(top, plane, unpacked(found["episode"]))
-        top.set_title(name, fontsize=10)
+    """Best actions on the left, importance on the right, a row an environment."""
+    rows = len(report["environments"])
+    figure = Figure(figsize=(plotting.WIDTH, 0.6 + 2.7 * rows))
+    panels: Any = figure.subplots(rows, 2, squeeze=False)
+    for (left, right), (name, found) in zip(panels, report["environments"].items(), strict=True):
+        plane, drawn = draw_actions(left, found, "actions")
+        action_bar(figure, left, drawn, name, found["num_actions"])
+        figures.draw_trajectory(left, plane, unpacked(found["episode"]))
+        left.set_title(name, fontsize=10)
         shares = [x["value"] for x in found["importance"].values()]
         intervals = [(x["low"], x["high"]) for x in found["importance"].values()]
-        figures.importance_bars(bottom, list(found["importance"]), shares, intervals=intervals)
-        bottom.tick_params(labelsize=8)
+        figures.importance_bars(right, list(found["importance"]), shares, intervals=intervals)
+        right.tick_params(labelsize=8)
     plotting.figure_title(
         figure,
-        "The bandits' best actions, with an episode in the environment (\u00d7 its end); what their rewards "
-        "depend on (95 % intervals)",
+        "The bandits' best actions, with an episode in the environment (\u00d7 its end), and what their "
+        "rewards depend on (95 % intervals)",
     )
     return figure
 

@@ -168,20 +168,21 @@ def facts(report: Report) -> dict[str, Any]:
 
 
 def draw(report: Mapping[str, Any]) -> Figure:
-    """A column an environment: the expert above, the bandit below."""
-    figure = Figure(figsize=(3.0 * len(report["environments"]), 6.2))
-    panels: Any = figure.subplots(2, len(report["environments"]), squeeze=False)
-    for column, (name, entry) in enumerate(report["environments"].items()):
+    """A row an environment: the expert on the left, the bandit on the right."""
+    rows = len(report["environments"])
+    figure = Figure(figsize=(plotting.WIDTH, 0.6 + 2.7 * rows))
+    panels: Any = figure.subplots(rows, 2, squeeze=False)
+    for (left, right), (name, entry) in zip(panels, report["environments"].items(), strict=True):
         for axes, states, actions, whose in (
-            (panels[0, column], "visited", "expert_actions", "expert"),
-            (panels[1, column], "contexts", "bandit_actions", "bandit"),
+            (left, "visited", "expert_actions", "expert"),
+            (right, "contexts", "bandit_actions", "bandit"),
         ):
             _, drawn = draw_actions(axes, entry, actions)
             points = points_of(entry[states], entry["limits"])
             # A white edge, for black is hard to see on the dark ends of the background.
             axes.scatter(*points.T, s=6, color=plotting.BLACK, edgecolors="white", linewidths=0.3)
-            axes.set_title(f"{name}\n{whose}", fontsize=9)
-        action_bar(figure, panels[1, column], drawn, name, entry["num_actions"])
+            axes.set_title(f"{name}: {whose}", fontsize=9)
+        action_bar(figure, right, drawn, name, entry["num_actions"])
     plotting.figure_title(
         figure,
         f"{STATES} states of an expert in the environment and of the bandit, over the best actions",

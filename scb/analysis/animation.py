@@ -66,11 +66,11 @@ def _mountain_car(axes: Axes, observation: Floats) -> None:
 
     x = np.linspace(-1.2, 0.6, 100)
     axes.plot(x, height(x), color=plotting.GREY, linewidth=1.5)
-    axes.plot([0.5, 0.5], [height(0.5), height(0.5) + 0.2], color=plotting.GREEN, linewidth=2)
+    axes.plot([0.5, 0.5], [height(0.5), height(0.5) + 0.4], color=plotting.GREEN, linewidth=2)
     axes.plot(
         observation[0], height(observation[0]) + 0.04, "o", color=plotting.VERMILLION, markersize=9
     )
-    _view(axes, (-1.25, 0.65), (-0.1, 1.8))
+    _view(axes, (-1.4, 0.8), (-0.2, 2.0))
 
 
 def _view(axes: Axes, x: tuple[float, float], y: tuple[float, float]) -> None:

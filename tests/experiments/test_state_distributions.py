@@ -97,4 +97,4 @@ def test_the_page_and_the_figure_show_both_distributions(report):
     assert sum(line.startswith("| ") for line in lines) == 2 + 2
     figure = experiment.EXPERIMENT.figures(report)["state_distributions"]
     titles = [axes.get_title(loc="left") for axes in figure.axes]
-    assert {"MountainCar-v0\nexpert", "Pendulum-v1\nbandit"} <= set(titles)
+    assert {"MountainCar-v0: expert", "Pendulum-v1: bandit"} <= set(titles)
