@@ -15,7 +15,7 @@ from experiments.harness import Report
 from experiments.rendering import text
 from lpo.commands import MetaTrain
 from lpo.objectives import Objective
-from scb.command_line import Output
+from scb.command_line import SharedOutput
 from scb.curriculum import CurriculumConfig, paper_curriculum
 from scb.discovery import BanditDiscovery, DiscoveryConfig, discover
 from scb.errors import UserError
@@ -86,7 +86,7 @@ def objective_of_run(settings: Mapping[str, Any], folder: Path) -> Objective:
     """The objective of a run folder of that command, and of no other: read, or learned first, or its run resumed."""
     resume = folder if (folder / "config.json").exists() else None
     with released():
-        return replace(meta_training(settings), output=Output(folder, resume)).objective()
+        return replace(meta_training(settings), output=SharedOutput(folder, resume)).objective()
 
 
 def search(config: DiscoveryConfig, folder: str | Path) -> tuple[BanditDiscovery, Outcome]:

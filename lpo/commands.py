@@ -25,7 +25,7 @@ from lpo.meta_training import (
 from lpo.objectives import Objective, load_objective, save_objective
 from scb import plotting, processes
 from scb.artefacts import machine_description
-from scb.command_line import GENERATIONS, LongRun, Output, flags, listed
+from scb.command_line import GENERATIONS, LongRun, SharedOutput, flags, listed
 from scb.console import console
 from scb.errors import UserError
 from scb.files import make_folder
@@ -85,7 +85,7 @@ class MetaTrain(LongRun):
         default_factory=MetaTrainingConfig
     )
     family: Annotated[str, tyro.conf.arg(name="drift")] = LearnedDrift.name
-    output: Output = field(default_factory=lambda: Output(Path("runs/meta-train")))
+    output: SharedOutput = field(default_factory=lambda: SharedOutput(Path("runs/meta-train")))
 
     @classmethod
     def decided(cls, config: MetaTrainingConfig) -> dict[str, str]:

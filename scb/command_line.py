@@ -88,15 +88,24 @@ class Output:
       resume: a run folder to continue; its configuration applies, and a flag that contradicts it is
         an error.
       wandb: project to log to, with the extra `wandb`.
+    """
+
+    out: Path
+    resume: Path | None = None
+    wandb: str | None = None
+
+
+@dataclass(frozen=True)
+class SharedOutput(Output):
+    """As `Output`, of a run that several processes may compute together.
+
+    Attributes:
       coordinator: HOST:PORT of the first of several processes that compute the run together. Started by
         SLURM's srun or Open MPI's mpirun they find each other without these flags.
       processes: how many there are.
       process: which one this is, from 0.
     """
 
-    out: Path
-    resume: Path | None = None
-    wandb: str | None = None
     coordinator: str | None = None
     processes: int | None = None
     process: int | None = None

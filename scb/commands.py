@@ -11,7 +11,7 @@ import tyro
 
 from scb import experts, processes
 from scb.agents.spec import bandit_agent
-from scb.command_line import LongRun, Measuring, Output, flags
+from scb.command_line import LongRun, Measuring, SharedOutput, flags
 from scb.console import console
 from scb.discovery import BanditDiscovery, DiscoveryConfig
 from scb.environments.registry import environment_spec
@@ -123,7 +123,7 @@ class Discover(LongRun):
         default_factory=lambda: _quick({})
     )
     judgement: Judgement = field(default_factory=Judgement)
-    output: Output = field(default_factory=lambda: Output(Path("runs/discover")))
+    output: SharedOutput = field(default_factory=lambda: SharedOutput(Path("runs/discover")))
 
     @classmethod
     def decided(cls, config: DiscoveryConfig) -> dict[str, str]:

@@ -16,7 +16,7 @@ from gymnax.environments import spaces
 
 from scb import artefacts, judgement, listing
 from scb.cli import main
-from scb.command_line import Output
+from scb.command_line import SharedOutput
 from scb.commands import Discover, Judgement, TrainConfig
 from scb.console import console
 from scb.curriculum import CurriculumConfig, paper_curriculum
@@ -561,7 +561,7 @@ def test_every_flag_of_a_discovery_is_explained_in_a_group_of_its_own():
         BanditConfig,
         WarmStartConfig,
         EvolutionConfig,
-        Output,
+        SharedOutput,
         TrainConfig,
     ):
         explained = "".join(inspect.cleandoc(part.__doc__) for part in config.__mro__)

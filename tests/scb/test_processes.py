@@ -33,7 +33,7 @@ from scb.cli import run_program
 def commands():
     import jax
     from scb import processes
-    from scb.command_line import LongRun, Output
+    from scb.command_line import LongRun, SharedOutput
     from scb.evolution import EvolutionConfig, evolve
 
     @dataclass(frozen=True, kw_only=True)
@@ -42,7 +42,7 @@ def commands():
         presets = MappingProxyType({"quick": lambda given: EvolutionConfig(**CONFIG)})
         together = True
         config: EvolutionConfig = field(default_factory=lambda: EvolutionConfig(**CONFIG))
-        output: Output = field(default_factory=lambda: Output(Path("run")))
+        output: SharedOutput = field(default_factory=lambda: SharedOutput(Path("run")))
 
         def run(self):
             from tests.scb.probes import Parabola  # which starts JAX
