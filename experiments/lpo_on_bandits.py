@@ -35,8 +35,8 @@ from lpo.full_size import full_size
 from lpo.objectives import CLIPS, Objective, load_objective
 from scb import listing, plotting
 from scb.agents.spec import AgentSpec, environment_agent
-from scb.artefacts import machine_description
 from scb.environments.zoo import bandit_metadata
+from scb.machine import machine_description
 from scb.rows import Rows
 from scb.seeds import REPORTING, reporting, validation
 from scb.statistics import Estimate, estimate, iqm, pooled_estimate

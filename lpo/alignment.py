@@ -22,12 +22,12 @@ from lpo.inner_loop import MetaTrainingConfig, TaskTraining, task_agent
 from lpo.objectives import Objective, check_names, load_objective
 from scb.agents.ppo import PPOHyperparameters
 from scb.agents.spec import AgentSpec
-from scb.artefacts import machine_description, package_versions
 from scb.environments.registry import environment_spec
 from scb.environments.zoo import bandit_metadata
 from scb.errors import UserError, at_least, unused
 from scb.evolution import map_population, rank_failed_last
 from scb.keys import root_key, split_key
+from scb.machine import machine_description, package_versions
 from scb.measurement import Judge, check_seeds, train_and_judge
 from scb.objectives import families
 from scb.rows import Rows

@@ -24,11 +24,11 @@ from lpo.meta_training import (
 )
 from lpo.objectives import Objective, load_objective, save_objective
 from scb import plotting, processes
-from scb.artefacts import machine_description
 from scb.command_line import GENERATIONS, LongRun, SharedOutput, flags, listed
 from scb.console import console
 from scb.errors import UserError
 from scb.files import make_folder
+from scb.machine import machine_description
 
 _DISTILL = DistillConfig()
 

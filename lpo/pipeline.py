@@ -25,12 +25,12 @@ from lpo.meta_training import (
 )
 from lpo.objectives import Objective, check_names, load_objective
 from scb import plotting
-from scb.artefacts import machine_description, package_versions
 from scb.command_line import LongRun, Output
 from scb.console import console
 from scb.environments.registry import make
 from scb.evolution import EnvironmentSteps
 from scb.files import write_json
+from scb.machine import machine_description, package_versions
 from scb.rows import Rows
 from scb.runs import Run, Stopwatch, config_dict
 from scb.seeds import reporting

@@ -21,13 +21,13 @@ from lpo.objectives import Objective, learned_in, load_apart, load_objective, sa
 from lpo.suite import SuiteScores, run_suite, suite_specs
 from lpo.suite import suite as suite_environments
 from scb import plotting
-from scb.artefacts import package_versions
 from scb.command_line import Measuring, text
 from scb.console import console
 from scb.environments.registry import check_backend, environment_spec
 from scb.errors import UserError, at_least
 from scb.files import write_json
 from scb.lists import read_settings, write_settings
+from scb.machine import package_versions
 from scb.measurement import Place, check_seeds
 from scb.runs import config_dict
 from scb.statistics import estimate

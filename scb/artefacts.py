@@ -12,12 +12,8 @@ import hashlib
 import io
 import json
 import os
-import platform
-import subprocess
-import sys
 import zipfile
 from collections.abc import Iterator, Mapping, Sequence
-from importlib import metadata as distributions
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -28,11 +24,10 @@ from flax import traverse_util
 from scb import schema
 from scb.errors import UserError, first_line, unknown_name
 from scb.files import make_folder, strict_json, write_together
+from scb.machine import package_versions
 
 # numpy.ndarray leaves under any depth of dictionaries: {"reward": {"Dense_0": {"kernel": ...}}}.
 ArrayTree: TypeAlias = "dict[str, np.ndarray | ArrayTree]"
-
-_PACKAGES = ("jax", "jaxlib", "flax", "optax", "evosax", "gymnax", "brax", "numpy", "lpo")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -266,30 +261,6 @@ def unflatten(path: Path, flat: Mapping[str, np.ndarray]) -> ArrayTree:
     return tree
 
 
-def package_versions() -> dict[str, str]:
-    """Versions of Python, of what decides the numbers, and of this project ("lpo")."""
-    versions = {"python": platform.python_version()}
-    for package in _PACKAGES:
-        try:
-            versions[package] = distributions.version(package)
-        except distributions.PackageNotFoundError:
-            versions[package] = "not installed"
-    return versions
-
-
-def machine_description() -> dict[str, str | int]:
-    """What timings depend on: processor, cores, accelerator, platform; no host name and no path."""
-    devices = jax.devices()
-    return {
-        "processor": _processor(),
-        "cores": usable_cores(),
-        "accelerator": devices[0].device_kind if devices[0].platform != "cpu" else "none",
-        "jax_platform": devices[0].platform,
-        "jax_devices": len(devices),
-        "platform": f"{platform.system()} {platform.machine()}",
-    }
-
-
 def _paths(path: str | Path) -> tuple[Path, Path]:
     path = Path(path)
     # Not with_suffix: it would take the ".5" of "hopper-0.5" for a suffix.
@@ -379,32 +350,3 @@ def _as_json(value: object) -> object:
     if isinstance(value, Mapping):
         return dict(value)
     raise TypeError(f"a {type(value).__name__} is no JSON")
-
-
-def _processor() -> str:
-    if sys.platform.startswith("linux"):
-        try:
-            lines = Path("/proc/cpuinfo").read_text().splitlines()
-        except OSError:
-            lines = []
-        for line in lines:
-            key, _, value = line.partition(":")
-            if key.strip().lower() in ("model name", "hardware"):
-                return value.strip()
-    if sys.platform == "darwin":
-        answer = subprocess.run(
-            ["/usr/sbin/sysctl", "-n", "machdep.cpu.brand_string"],
-            capture_output=True,
-            text=True,
-            check=False,
-        )
-        if answer.returncode == 0:
-            return answer.stdout.strip()
-    return platform.processor() or platform.machine() or "unknown"
-
-
-def usable_cores() -> int:
-    """Cores that this process may use, which in a container or a batch system are fewer than the machine's."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1

@@ -20,7 +20,7 @@ def configure_jax() -> None:
     """One CPU device a core and a compilation cache, unless the environment's own settings say otherwise."""
     import jax
 
-    from scb.artefacts import usable_cores
+    from scb.machine import usable_cores
 
     if "JAX_NUM_CPU_DEVICES" not in os.environ and "host_platform_device_count" not in (
         os.environ.get("XLA_FLAGS", "")

@@ -17,8 +17,8 @@ import tyro
 from tyro.constructors import PrimitiveConstructorSpec
 
 from scb import processes
-from scb.artefacts import package_versions
 from scb.errors import UserError, one_of
+from scb.machine import package_versions
 from scb.rows import Rows
 from scb.runs import Run, config_dict, read_config, released
 

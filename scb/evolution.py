@@ -19,12 +19,12 @@ from jax.sharding import NamedSharding, PartitionSpec
 from scipy.stats import rankdata
 
 from scb import processes, termination
-from scb.artefacts import machine_description
 from scb.checkpoints import continued
 from scb.console import Progress, progress_console
 from scb.errors import UserError, at_least, numbers, one_of, positive, unused
 from scb.files import plain
 from scb.keys import key_at, root_key, split_key
+from scb.machine import machine_description
 from scb.runs import Run, Stopwatch
 from scb.seeds import VALIDATING, searching
 from scb.statistics import iqm

@@ -20,13 +20,13 @@ from jax.typing import ArrayLike
 
 from scb.agents.agent import Agent, evaluated_after
 from scb.agents.spec import AgentSpec
-from scb.artefacts import package_versions
 from scb.environments.registry import environment_spec
 from scb.errors import UserError, at_least, one_of
 from scb.evaluation import Episodes
 from scb.evolution import map_population
 from scb.files import plain
 from scb.keys import root_key, split_key
+from scb.machine import package_versions
 from scb.objectives import Objective, programs_for
 from scb.rows import Row, Rows
 

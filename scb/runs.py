@@ -28,9 +28,9 @@ from tensorboardX.proto.event_pb2 import Event, SessionLog
 from tensorboardX.record_writer import RecordWriter
 from tensorboardX.summary import scalar
 
-from scb.artefacts import machine_description
 from scb.errors import UserError
 from scb.files import cannot_write, make_folder, plain, write_json, write_text
+from scb.machine import machine_description
 
 _LOCK = ".lock"
 _held: dict[Path, IO[str]] = {}  # open as long as the process holds them

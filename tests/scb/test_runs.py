@@ -6,10 +6,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from scb.artefacts import machine_description
 from scb.checkpoints import Checkpoints
 from scb.errors import UserError
 from scb.files import write_json
+from scb.machine import machine_description
 from scb.runs import Run, Stopwatch, first_difference, held, read_config, released
 from tests.locking import is_locked
 
