@@ -99,6 +99,7 @@ class MetaTrainingConfig:
     )
 
     def __post_init__(self) -> None:
+        of_classes(self, drift=Drift, evolution=EvolutionConfig, agent=PPOConfig | None)
         one_of("fitness", self.fitness, FITNESSES)
         at_least(1, self.evolution, "num_generations")
         tasks: Any = self.tasks
@@ -110,7 +111,6 @@ class MetaTrainingConfig:
                 f"the hyperparameters are {hyperparameters!r}: give a dict, such as "
                 "{'learning_rate': (0.001, 0.005)}."
             )
-        of_classes(self, drift=Drift, evolution=EvolutionConfig, agent=PPOConfig | None)
         if not isinstance(self.horizons, tuple | list):
             raise UserError(f"the horizons are {self.horizons!r}: give a tuple, () for none.")
         if not self.tasks:
@@ -140,6 +140,8 @@ class MetaTrainingConfig:
                 "--temporal brings them), or the fitness 'return'."
             )
         for horizon in self.horizons:
+            if not isinstance(horizon, int | float | np.number):
+                raise UserError(f"a horizon is {horizon!r}: it must be a number.")
             positive(horizon=horizon)
         check_lists(self.hyperparameters, PPOHyperparameters())
         for name in ("drift", "horizon"):

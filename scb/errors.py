@@ -63,7 +63,9 @@ def of_classes(of: Any, **wanted: Any) -> None:
     for name, classes in wanted.items():
         if not isinstance(given := getattr(of, name), classes):
             kinds = [x.__name__.replace("NoneType", "None") for x in get_args(classes) or [classes]]
-            raise UserError(f"{name} is {given!r}: give {' or '.join(kinds)}.")
+            raise UserError(
+                f"{name} is of the class {type(given).__name__}: it must be of {' or '.join(kinds)}."
+            )
 
 
 def first_line(error: Exception) -> str:

@@ -3,13 +3,16 @@
 import json
 import re
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 
 from experiments import rendering
 from experiments.harness import bandit_of, forget_replaced
+from lpo.suite import SuiteScores
 from scb.environments.zoo import bandit_metadata, zoo_names
 from tests.site import public_names
 
@@ -129,14 +132,69 @@ def test_a_table_of_objectives_says_what_was_measured(data, page):
         assert f"| {' | '.join(cells)} |" in text, curve["objective"]
 
 
+IN_SUITES = {
+    "ppo": "PPO, clip 0.2",
+    "dpo": "DPO",
+    "ppo-0.5": "PPO, clip 0.5, tuned on all five",
+    "dpo-2-0.3": "DPO, α = 2, β = 0.3, tuned on all five",
+}
+
+
+def suite_scores(name, *without):
+    report = read(f"suite_{name}")
+    columns = [[e[x] for e in report["environments"]] for x in ("random", "reference", "source")]
+    names, scores = [e["name"] for e in report["environments"]], np.array(report["scores"])
+    found = SuiteScores(names, report["objectives"], scores, *columns, report["left_out"])
+    return found.without(*without)
+
+
+def minus(scores, one, other):
+    # All stay, for the best of them may be what scores are normalised by.
+    order = sorted(scores.objectives, key=lambda name: name != other)
+    places = [scores.objectives.index(x) for x in order]
+    found = replace(scores, objectives=order, scores=scores.scores[places]).differences()
+    return rendering.text(found[order.index(one)], 2, sign=True)
+
+
 @pytest.mark.parametrize("suite", ["classic", "minatar"])
 def test_a_table_of_a_suite_says_what_was_measured(suite):
     report, text = read(f"suite_{suite}"), (DOCS / "suites.md").read_text()
-    for scores in (report, report.get("elsewhere")):
-        for aggregate in scores["aggregate"] if scores else ():
-            assert f"| {rendering.text(aggregate, 2)} |" in text
-        for difference in scores["differences"][1:] if scores else ():
-            assert f"| {rendering.text(difference, 2, sign=True)} |" in text
+    for scores in filter(None, (report, report["elsewhere"])):
+        rows = zip(scores["objectives"], scores["aggregate"], scores["differences"], strict=True)
+        for i, (objective, aggregate, difference) in enumerate(rows):
+            cells = [IN_SUITES.get(objective, f"`{objective}`"), rendering.text(aggregate, 2)]
+            cells.append(rendering.text(difference, 2, sign=True) if i else "")
+            assert f"| {' | '.join(cells)} |" in text
+
+
+def test_what_is_said_of_suites_beside_the_tables_follows_from_the_data():
+    text = (DOCS / "suites.md").read_text()
+    five = suite_scores("classic", "none")
+    three = five.without("CartPole-v1", "Pendulum-v1")
+    for row, one, other in (
+        ("`lpo-pendulum` − clip 0.5", "lpo-pendulum", "ppo-0.5"),
+        ("`lpo-pendulum` − DPO, tuned", "lpo-pendulum", "dpo-2-0.3"),
+        ("DPO, tuned − DPO", "dpo-2-0.3", "dpo"),
+    ):
+        assert f"| {row} | {minus(three, one, other)} | {minus(five, one, other)} |" in text
+    for car in ("MountainCar-v0", "MountainCarContinuous-v0"):
+        assert "[−" in minus(three.without(car), "lpo-pendulum", "ppo")
+    games = suite_scores("minatar", "Breakout-MinAtar")
+    assert f"no lead is shown: {minus(games, 'lpo-multi', 'ppo')}." in text
+    for name, objective, without in (
+        ("classic_first", "lpo-pendulum", ("CartPole-v1", "Pendulum-v1")),
+        ("minatar_first", "lpo-multi", ("none",)),
+    ):
+        suggested = minus(suite_scores(name, *without), objective, "ppo")
+        assert f"suggested it, {suggested}" in text.replace("\n", " ")
+
+
+def test_what_counts_as_tuned_on_classic_control_was_best_where_it_was_chosen():
+    scores = suite_scores("classic_choice", "none")
+    earned = {x: y.value for x, y in zip(scores.objectives, scores.aggregate(), strict=True)}
+    for family, chosen in (("ppo", "ppo-0.5"), ("dpo", "dpo-2-0.3")):
+        of_it = [x for x in earned if x.startswith(family)]
+        assert max(of_it, key=earned.__getitem__) == chosen
 
 
 def test_what_readme_says_of_objectives_stands_in_the_results():

@@ -1,6 +1,7 @@
 """Episodes as moving pictures: classic control as a GIF, Brax in its own HTML viewer."""
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -60,13 +61,13 @@ def _cart_pole(axes: Axes, observation: Floats) -> None:
     _view(axes, (-2.4, 2.4), (-1.6, 3.2))
 
 
-def _mountain_car(axes: Axes, observation: Floats) -> None:
+def _mountain_car(goal: float, axes: Axes, observation: Floats) -> None:
     def height(x: Any) -> Any:
         return np.sin(3 * x) * 0.45 + 0.55
 
     x = np.linspace(-1.2, 0.6, 100)
     axes.plot(x, height(x), color=plotting.GREY, linewidth=1.5)
-    axes.plot([0.5, 0.5], [height(0.5), height(0.5) + 0.4], color=plotting.GREEN, linewidth=2)
+    axes.plot([goal, goal], [height(goal), height(goal) + 0.4], color=plotting.GREEN, linewidth=2)
     axes.plot(
         observation[0], height(observation[0]) + 0.04, "o", color=plotting.VERMILLION, markersize=9
     )
@@ -83,8 +84,8 @@ def _view(axes: Axes, x: tuple[float, float], y: tuple[float, float]) -> None:
 PICTURES: dict[str, Callable[[Axes, Floats], None]] = {
     "Acrobot-v1": _acrobot,
     "CartPole-v1": _cart_pole,
-    "MountainCar-v0": _mountain_car,
-    "MountainCarContinuous-v0": _mountain_car,
+    "MountainCar-v0": partial(_mountain_car, 0.5),
+    "MountainCarContinuous-v0": partial(_mountain_car, 0.45),
     "Pendulum-v1": _pendulum,
 }
 

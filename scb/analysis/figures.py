@@ -97,10 +97,12 @@ def trajectory_line(plane: Plane, states: NDArray[np.floating]) -> NDArray[np.fl
 
 
 def draw_trajectory(axes: Axes, plane: Plane, states: NDArray[np.floating]) -> None:
-    """[T, O] states of one episode as a black line, its end a cross."""
+    """[T, O] states of one episode as a black line, its end a cross, on the edge where it is beyond."""
     line = trajectory_line(plane, states)
+    end = np.clip(line[-1], *np.transpose(plane.limits))
     axes.plot(*line.T, color=plotting.BLACK, linewidth=1.2, label="an episode in the environment")
-    axes.plot(*line[-1], "x", color=plotting.BLACK, markersize=8, label="its end", linestyle="")
+    cross: dict[str, Any] = {"marker": "x", "linestyle": "", "markersize": 8, "label": "its end"}
+    axes.plot(*end, color=plotting.BLACK, clip_on=False, **cross)
 
 
 def explained(parts: Mapping[str, Any]) -> Figure:
