@@ -27,7 +27,8 @@ class Confirmation:
     Attributes:
       environment, objective: whose it is; "hopper at 0.0005" is Hopper with that learning rate.
       seeds: of its pairs of agents, none of which suggested the claim.
-      of: what is said of them, "final", "early", "late" or "area" of all objectives, "late lead" of this one.
+      of: what is said of them: "final" (no lower at the end, within a margin), "late" (no less over the last quarter,
+        within a margin), "late lead" (more over it), "early" (more over the first half) or "area" (more over all).
       reference: which objective its agents are compared with.
       known: the one of both whose agents of these seeds had been trained, and seen, before.
     """

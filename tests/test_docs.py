@@ -209,3 +209,11 @@ def test_what_readme_says_of_objectives_stands_in_the_results():
     assert len(numbers) == 12
     for number in numbers:
         assert number in pages, number
+
+
+def test_what_is_folded_is_closed_and_rendered():
+    folded = [page.read_text() for page in PAGES if "<details" in page.read_text()]
+    assert folded
+    for text in folded:
+        assert text.count("<details markdown><summary>") == text.count("\n\n</details>\n")
+    assert "- md_in_html" in (ROOT / "mkdocs.yml").read_text()

@@ -427,6 +427,13 @@ def test_defaults_that_depend_on_other_flags():
     assert asked_for("--drift mirror").drift.name == "mirror"
 
 
+@pytest.mark.parametrize(("command", "together"), [("run", False), ("meta-train", True)])
+def test_flags_of_several_processes_are_shown_where_they_are_taken(command, together, capsys):
+    with pytest.raises(SystemExit):
+        cli.main([command, "--help"])
+    assert ("--coordinator" in capsys.readouterr().out) == together
+
+
 @pytest.mark.parametrize("drift", [name for name, drift in DRIFTS.items() if drift.learned])
 def test_help_explains_every_flag_of_meta_train_in_groups(drift, capsys):
     config = MetaTrain.parse(["--drift", drift]).config
