@@ -21,7 +21,7 @@ from experiments.parts import InParts, Part
 from scb import plotting
 from scb.agents.spec import AgentSpec, algorithms_for, bandit_agent
 from scb.curriculum import paper_curriculum
-from scb.discovery import BanditDiscovery, DiscoveryConfig
+from scb.discovery import BanditDiscovery, DiscoveryConfig, discover
 from scb.environments.registry import environment_spec
 from scb.evolution import map_population
 from scb.measurement import Agents, Judge, train_and_judge
@@ -60,7 +60,7 @@ measure = InParts(parts)
 
 def _of_limit(environment: str, limit: str, plan: Mapping[str, Any]) -> dict[str, Any]:
     folder = f"{plan['runs']}/{environment}-{limit}"
-    problem, outcome = searches.search(config_of(environment, limit, plan), folder)
+    problem, outcome = discover(config_of(environment, limit, plan), folder)
     place = environment_spec(environment)
     entry: dict[str, Any] = {
         "random": round(place.random_return(), 2),

@@ -26,7 +26,7 @@ from scb import measurement, plotting
 from scb.agents.spec import ALGORITHMS, algorithms_for, bandit_agent
 from scb.analysis.optimal_actions import optimal_policy
 from scb.curriculum import paper_curriculum
-from scb.discovery import DiscoveryConfig
+from scb.discovery import DiscoveryConfig, discover
 from scb.environments.registry import environment_spec
 from scb.evaluation import evaluate
 from scb.evolution import map_population
@@ -134,7 +134,7 @@ def _source(judge_in: Place, source: str, plan: Mapping[str, Any]) -> tuple[Plac
         bandit, digest = bandit_of(judge_in.name)
         return Place(source, bandit, bandit.default_params), {"sha256": digest}
     kind = "drawn" if source == DRAWN else "fixed"
-    problem, outcome = searches.search(
+    problem, outcome = discover(
         config_of(judge_in.name, source, plan), f"{plan['runs']}/{judge_in.name}-{kind}"
     )
     place = Place(source, problem.bandit, problem.bandit.params(outcome.best_mean))

@@ -17,10 +17,10 @@ from lpo.commands import MetaTrain
 from lpo.objectives import Objective
 from scb.command_line import SharedOutput
 from scb.curriculum import CurriculumConfig, paper_curriculum
-from scb.discovery import BanditDiscovery, DiscoveryConfig, discover
+from scb.discovery import DiscoveryConfig, discover
 from scb.errors import UserError
-from scb.evolution import EvolutionConfig, Outcome
-from scb.runs import Run, config_dict, released
+from scb.evolution import EvolutionConfig
+from scb.runs import released
 from scb.statistics import Estimate, Statistic, estimate, stratified_estimate
 
 NONE = "none"  # the curriculum that is none
@@ -89,19 +89,9 @@ def objective_of_run(settings: Mapping[str, Any], folder: Path) -> Objective:
         return replace(meta_training(settings), output=SharedOutput(folder, resume)).objective()
 
 
-def search(config: DiscoveryConfig, folder: str | Path) -> tuple[BanditDiscovery, Outcome]:
-    """A discovery in this run folder, resumed where it was begun; where it has ended, no generation is computed."""
-    folder = Path(folder)
-    run = Run.open(folder, config_dict(config), resume=(folder / "config.json").exists())
-    try:
-        return discover(config, run)
-    finally:
-        run.close()
-
-
 def searched_curve(config: DiscoveryConfig, folder: str | Path) -> dict[str, Any]:
     """`curve` of a search, its "seconds" and "machines"; searched first where that has not ended yet."""
-    _, outcome = search(config, folder)
+    _, outcome = discover(config, folder)
     took = {"seconds": round(outcome.seconds, 1), "machines": machines(Path(folder))}
     return {**curve(outcome.metrics), **took}
 

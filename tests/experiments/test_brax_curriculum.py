@@ -83,7 +83,7 @@ def test_every_search_is_measured_once(monkeypatch):
         }
         return None, SimpleNamespace(metrics=[line], seconds=1.0)
 
-    monkeypatch.setattr(searches, "search", search)
+    monkeypatch.setattr(searches, "discover", search)
     plan = {**experiment.EXPERIMENT.presets["quick"], "seeds": {NONE: 2, "step": 1}}
     found = {"plan": plan}
     experiment.measure(plan, found, lambda: None)

@@ -6,7 +6,7 @@ from experiments import ablations, episode_lengths, generality, searches
 from experiments.claims import Claim, judge
 from scb import plotting
 from scb.commands import Discover
-from scb.discovery import DiscoveryConfig
+from scb.discovery import DiscoveryConfig, discover
 from scb.evolution import EvolutionConfig
 
 CONFIG = DiscoveryConfig(
@@ -22,8 +22,8 @@ CONFIG = DiscoveryConfig(
 
 @pytest.mark.slow
 def test_a_search_that_has_ended_is_read_and_not_run_again(tmp_path, small_agents):
-    _, first = searches.search(CONFIG, tmp_path / "run")
-    _, again = searches.search(CONFIG, tmp_path / "run")
+    _, first = discover(CONFIG, tmp_path / "run")
+    _, again = discover(CONFIG, tmp_path / "run")
     assert again.metrics == first.metrics
     assert again.seconds == pytest.approx(first.seconds, abs=1e-3)
     np.testing.assert_array_equal(
