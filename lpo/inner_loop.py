@@ -1,7 +1,7 @@
 """What meta-training is asked for, and its inner loop: agents that train with a drift, and what that is worth."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from typing import Annotated, Any
 
@@ -17,14 +17,16 @@ from scb.agents.agent import evaluated_after
 from scb.agents.ppo import PPOConfig, PPOHyperparameters
 from scb.agents.spec import AgentSpec, check_lists, environment_agent
 from scb.command_line import listed, numbers, text
+from scb.environments.custom import own_code
 from scb.environments.registry import check_backend, environment_spec
 from scb.environments.zoo import bandit_metadata
-from scb.errors import UserError, at_least, of_classes, one_of, positive
+from scb.errors import UserError, at_least, of_classes, one_of, positive, unused
 from scb.evolution import EnvironmentSteps, EvolutionConfig
 from scb.keys import named_key, root_key, split_key
 from scb.lists import read_values, write_values
 from scb.measurement import Judge, spaced, train_and_judge
 
+_OF_BANDITS = ("contexts", "reward_noise")
 POINTS = 5  # of the curve that the area is under
 
 
@@ -150,6 +152,9 @@ class MetaTrainingConfig:
                     f"{name} is not drawn from a list: the drift is what is learned, and horizons are a setting of "
                     "their own."
                 )
+        if not any(environment_spec(name).is_bandit for name in self.tasks):
+            noisy = _OF_BANDITS if self.reward_noise else _OF_BANDITS[:1]  # none is what there is
+            unused(self, "none of the tasks is a bandit", noisy, "take a bandit")
         at_least(1, self, "agents_per_candidate", "evaluation_episodes", "contexts")
         at_least(0, self, "reward_noise", "initial_scale")
 
@@ -169,15 +174,20 @@ class MetaTrainingConfig:
         """Where fitness is earned."""
         return self.homes if self.judgement.at_home else self.tasks
 
-    def checksums(self) -> dict[str, str]:
+    def weights(self) -> dict[str, str]:
         """{task: SHA-256} of the bandits and synthetic MDPs, whose names do not say which weights they stand for."""
         return {
             x: bandit_metadata(x)["sha256"] for x in self.tasks if environment_spec(x).synthetic
         }
 
+    def checksums(self) -> dict[str, str]:
+        """The same, and of the code of environments of one's own."""
+        return self.weights() | own_code({*self.tasks, *self.homes})
+
     def at_home(self) -> "MetaTrainingConfig":
         """The same on the tasks' evaluation environments themselves."""
-        return replace(self, tasks=self.homes, fitness="return", agent=None)
+        of_bandits: Any = {f.name: f.default for f in fields(self) if f.name in _OF_BANDITS}
+        return replace(self, tasks=self.homes, fitness="return", agent=None, **of_bandits)
 
 
 def task_agent(task: str, contexts: int) -> AgentSpec:

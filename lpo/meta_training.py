@@ -185,7 +185,7 @@ def _story(problem: MetaTraining, outcome: Outcome, mean: Any, command: str) -> 
         "config": {
             "meta_training": config_dict(problem.config),
             "homes": problem.config.homes,
-            "bandit_sha256": problem.config.checksums(),
+            "bandit_sha256": problem.config.weights(),
         },
         "seeds": {"meta_training": evolution.seed, "validation": VALIDATING.start},
         "results": {

@@ -9,7 +9,7 @@ at ±`MAX_LOG_RATIO`, and advantages that the caller has normalised over the min
 """
 
 import importlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -178,7 +178,16 @@ def _evaluate(
     like = partial(xp.asarray, dtype=log_ratio.dtype, device=device)
     log_ratio = xp.clip(log_ratio, -MAX_LOG_RATIO, MAX_LOG_RATIO)
     progress = xp.broadcast_to(like(progress), log_ratio.shape)
-    return drift(jax.tree.map(like, parameters), log_ratio, advantage, progress, xp)
+    return drift(_mapped(like, parameters), log_ratio, advantage, progress, xp)
+
+
+def _mapped(function: Callable[[Any], Any], tree: Any) -> Any:
+    """As `jax.tree.map`, which torch.compile cannot follow."""
+    if isinstance(tree, Mapping):
+        return {name: _mapped(function, x) for name, x in tree.items()}
+    if isinstance(tree, list | tuple):
+        return type(tree)(_mapped(function, x) for x in tree)
+    return function(tree)
 
 
 def _host_parameters(objective: Objective) -> Any:

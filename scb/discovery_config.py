@@ -10,6 +10,7 @@ from scb.agents.spec import ALGORITHMS
 from scb.agents.tables import Lists, Values
 from scb.command_line import GENERATIONS, listed, text
 from scb.curriculum import CurriculumConfig, read_curriculum
+from scb.environments.custom import own_code
 from scb.environments.synthetic import BanditConfig
 from scb.environments.synthetic_mdp import PARAMETERIZATIONS
 from scb.environments.zoo import bandit_metadata
@@ -117,8 +118,9 @@ class DiscoveryConfig:
         return () if self.curriculum == "paper" else GENERATIONS
 
     def checksums(self) -> dict[str, str]:
-        """{name: SHA-256} of the bandit that it starts from, whose name does not say which weights it stands for."""
-        return {} if self.start is None else {self.start: bandit_metadata(self.start)["sha256"]}
+        """{name: SHA-256} of what a name does not tell: a bandit that it starts from, an environment of one's own."""
+        start = {} if self.start is None else {self.start: bandit_metadata(self.start)["sha256"]}
+        return start | own_code([self.environment])
 
     @property
     def fitted(self) -> bool:
@@ -153,7 +155,8 @@ class DiscoveryConfig:
         one_of("parameterization", self.parameterization, PARAMETERIZATIONS)
         if self.parameterization != "I" and self.fitted:
             raise UserError(
-                f"a synthetic MDP ({self.parameterization}) cannot be fitted to an expert: use init random."
+                f"a synthetic MDP ({self.parameterization}) cannot be fitted to an expert, as is the "
+                "default: use init random."
             )
         if self.parameterization != "I" and self.start is not None:
             raise UserError("a synthetic MDP cannot start from a bandit: leave the start out.")

@@ -357,8 +357,8 @@ def evolve(
                 checkpoints.save(generation, kept)
                 saved = generation
         return (
-            f"{run.folder} is saved after {generation} generations, and goes on from there: with --resume, or by the "
-            "call that began it."
+            f"{run.folder} is saved after {generation} generations, and goes on from there: with --resume, or in "
+            "Python by the call that began it."
         )
 
     evaluate = map_population(problem.evaluate, config.population_size, (0, None, None))

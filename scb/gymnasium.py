@@ -77,10 +77,7 @@ class SyntheticEnv(gymnasium.Env[np.ndarray, Any]):
     """
 
     def __init__(self, file: str, render_mode: None = None) -> None:
-        if render_mode is not None:
-            raise NothingToShow(
-                f"render_mode is {render_mode!r}, and a bandit has nothing to show: leave it out."
-            )
+        _check_shown(render_mode)
         self._functions, self.observation_space, self.action_space = _opened(file)
         self._observation: np.ndarray | None = None
         self._starts = np.empty((0, 0), np.float32)
@@ -134,6 +131,13 @@ class SyntheticEnv(gymnasium.Env[np.ndarray, Any]):
         return after[0].copy(), float(reward[0]), terminated, truncated, {}
 
 
+def _check_shown(render_mode: str | None) -> None:
+    if render_mode is not None:
+        raise NothingToShow(
+            f"render_mode is {render_mode!r}, and a bandit has nothing to show: leave it out."
+        )
+
+
 class SyntheticVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     """Many of one bandit or synthetic MDP, stepped together.
 
@@ -143,9 +147,10 @@ class SyntheticVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
       autoreset_mode: SameStep, NextStep or Disabled, see `gymnasium.vector.AutoresetMode`. With NextStep,
         Gymnasium's usual one, every other step of a bandit is a reset, which pays nothing; but some of its wrappers
         of many environments count nothing else: RecordEpisodeStatistics, NormalizeObservation.
+      render_mode: None, as many scripts say it.
 
     Raises:
-      UserError: the file cannot be read, or is none of them; an unknown mode.
+      UserError: the file cannot be read, or is none of them; an unknown mode; another render mode.
     """
 
     def __init__(
@@ -153,7 +158,9 @@ class SyntheticVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         file: str,
         num_envs: int = 1,
         autoreset_mode: str | AutoresetMode = AutoresetMode.SAME_STEP,
+        render_mode: None = None,
     ) -> None:
+        _check_shown(render_mode)
         at_least(1, num_envs=num_envs)
         mode = autoreset_mode.value if isinstance(autoreset_mode, AutoresetMode) else autoreset_mode
         one_of("autoreset mode", mode, [x.value for x in AutoresetMode])

@@ -20,6 +20,7 @@ from jax.typing import ArrayLike
 
 from scb.agents.agent import Agent, evaluated_after
 from scb.agents.spec import AgentSpec
+from scb.environments.custom import own_code
 from scb.environments.registry import environment_spec
 from scb.errors import UserError, at_least, one_of
 from scb.evaluation import Episodes
@@ -282,6 +283,7 @@ def measure(
         "trained_in": params[0],
         "judged_in": params[1],
         "physics": train_in.backend,
+        "code": own_code([train_in.name, judge_in.name]),
         # Drawn agents share the values of lists out: of another number each has others.
         "drawn": len(agents.names) if agents.drawn else None,
         "points": points,

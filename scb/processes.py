@@ -64,8 +64,11 @@ def start(given: Mapping[str, str], environment: Mapping[str, str] = os.environ)
             "num_processes": _number(given, "processes", 1, 2**20),
         }
         settings["process_id"] = _number(given, "process", 0, settings["num_processes"] - 1)
-        if ":" not in given["coordinator"]:
-            raise UserError(f"--coordinator is {given['coordinator']!r}: give HOST:PORT.")
+        host, _, port = given["coordinator"].rpartition(":")
+        if not (host and port.isdecimal() and 1 <= int(port) < 2**16):
+            raise UserError(
+                f"--coordinator is {given['coordinator']!r}: give HOST:PORT, with a port from 1 to 65535."
+            )
     elif not any(_launched(name, environment) for name in _LAUNCHERS):
         return
     # Else the others are killed with a stack trace, before they can say a sentence.

@@ -21,6 +21,16 @@ Row = dict[str, Any]
 _AGENT = ("environment", "backend", "trained_in", "algorithm", "objective", "seed", "agent")
 
 
+def _row(line: str, where: str) -> Row:
+    try:
+        return dict(json.loads(line))
+    except (TypeError, ValueError) as error:
+        raise UserError(
+            f"{where}, is damaged ({error}): take the line out, and its agent is measured again, or choose another "
+            "file."
+        ) from error
+
+
 class Rows:
     """Tidy rows, in memory or in a file that grows an agent at a time.
 
@@ -45,7 +55,8 @@ class Rows:
         try:
             self._configurations = dict(json.loads(self._described.read_text()))
             lines = self.path.read_text().split("\n")
-            self.rows = [json.loads(line) for line in lines[:-1]]
+            for number, line in enumerate(lines[:-1], 1):
+                self.rows.append(_row(line, f"{self.path}, line {number}"))
             complete = all(
                 row.keys() >= {*_AGENT, "configuration"}
                 and row["configuration"] in self._configurations

@@ -95,6 +95,8 @@ class Run:
             if stored != asked:
                 write_json(folder / "config.json", config)
             return cls(folder, resumed=True, wandb_project=wandb_project)
+        if folder.is_file():
+            raise UserError(f"{folder} is a file, and a run needs a folder: choose another --out.")
         if folder.exists() and not _has_room(folder):
             raise UserError(
                 f"{folder} already exists and is not empty: choose another --out, or continue it with --resume."

@@ -1,18 +1,23 @@
 """Environments that are in no registry: `package.module:factory`, imported when one is made."""
 
+import ast
+import contextlib
+import hashlib
 import importlib
 import inspect
 import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 from gymnax.environments import environment, spaces
 
 from scb.environments.spec import Family, Made
-from scb.errors import UserError
+from scb.errors import UserError, first_line
 from scb.keys import root_key
 
 _NAME = re.compile(r"[^\W\d][\w.]*:[^\W\d]\w*")
@@ -33,24 +38,31 @@ class CustomFamily(Family):
         return _NAME.fullmatch(name) is not None
 
     def make(self, name: str, **arguments: Any) -> Made:
-        module, _, factory = name.partition(":")
-        here = str(Path.cwd())
-        if here not in sys.path:
-            sys.path.append(here)
         try:
-            function = getattr(importlib.import_module(module), factory)
+            function = getattr(_module(name), name.partition(":")[2])
         # Whatever a module does that is not ours.
         except Exception as error:
             raise UserError(
                 f"environment {name!r} cannot be imported ({error}): give package.module:factory, of a module that "
                 "Python finds from here."
             ) from error
-        try:
-            # Before the call, inside of which a TypeError is a mistake of another kind.
-            inspect.signature(function).bind(**arguments)
-        except TypeError as error:
-            raise UserError(f"environment {name!r} does not take {arguments}: {error}.") from error
-        made = function(**arguments)
+        if isinstance(function, environment.Environment) and not arguments:
+            made: Any = function
+        elif not callable(function):
+            raise UserError(
+                f"environment {name!r} is a {type(function).__name__}, which cannot be called: give a class or a "
+                "function that returns a gymnax 1.x environment."
+            )
+        else:
+            try:
+                # Before the call, inside of which a TypeError is a mistake of another kind.
+                inspect.signature(function).bind(**arguments)
+            except TypeError as error:
+                given = (
+                    f"the arguments {arguments}" if arguments else "to be called without arguments"
+                )
+                raise UserError(f"environment {name!r} does not take {given}: {error}.") from error
+            made = function(**arguments)
         env, params = made if isinstance(made, tuple) and len(made) == 2 else (made, None)
         if not isinstance(env, environment.Environment):
             raise UserError(
@@ -60,6 +72,27 @@ class CustomFamily(Family):
         params = env.default_params if params is None else params
         _check(name, env, params)
         return env, params
+
+
+def _module(name: str) -> ModuleType:
+    here = str(Path.cwd())
+    if here not in sys.path:
+        sys.path.append(here)
+    return importlib.import_module(name.partition(":")[0])
+
+
+def own_code(names: Iterable[str]) -> dict[str, str]:
+    """{name: SHA-256} of environments of one's own: of what the factory's module says, without comments and layout.
+
+    What that module imports does not count, nor one without source.
+    """
+    found = {}
+    for name in filter(CustomFamily().owns, names):
+        # A module that cannot be imported is told of where the environment is made.
+        with contextlib.suppress(Exception):
+            said = ast.unparse(ast.parse(inspect.getsource(_module(name))))
+            found[name] = hashlib.sha256(said.encode()).hexdigest()
+    return found
 
 
 def _check(name: str, env: environment.Environment[Any, Any], params: Any) -> None:
@@ -77,11 +110,17 @@ def _check(name: str, env: environment.Environment[Any, Any], params: Any) -> No
             "has gymnax's own parameters, whose episodes end after one step: give it default_params with its "
             "max_steps_in_episode"
         )
+    if params.max_steps_in_episode < 1:
+        raise wrong(
+            f"has a max_steps_in_episode of {params.max_steps_in_episode}, after which an episode ends: it must be at "
+            "least 1"
+        )
     observations, actions = env.observation_space(params), env.action_space(params)
     for kind, space in {"observations": observations, "actions": actions}.items():
         if not isinstance(space, spaces.Box | spaces.Discrete):
             raise wrong(
-                f"has a {type(space).__name__} of {kind}: one Box or Discrete is understood: put all into one"
+                f"has a {type(space).__module__}.{type(space).__name__} of {kind}: one Box or Discrete of "
+                "gymnax.environments.spaces is understood"
             )
 
     def check_values(of: str, found: Any, values: str) -> None:
@@ -98,11 +137,25 @@ def _check(name: str, env: environment.Environment[Any, Any], params: Any) -> No
         action = actions.sample(key)
         inner = env.step_env(key, state, action, params)
         check_values("step_env", inner, "observation, state, reward, terminated, info")
+        if not jnp.issubdtype(jnp.result_type(inner[3]), jnp.bool_):
+            raise wrong(
+                f"returns a terminated of the type {jnp.result_type(inner[3])} from step_env: return a bool"
+            )
         step = env.step(key, state, action, params)
         check_values("step", step, "observation, state, reward, terminated, truncated, info")
         return observation, step
 
-    first, step = jax.eval_shape(first_step, root_key(0))
+    try:
+        first, step = jax.eval_shape(first_step, root_key(0))
+    except NotImplementedError as error:
+        raise wrong(
+            "lacks reset_env or step_env, which gymnax's own reset and step call: define these two"
+        ) from error
+    except jax.errors.ConcretizationTypeError as error:
+        raise wrong(
+            f"asks for a value where JAX only has a shape ({first_line(error)}): write reset_env and step_env with "
+            "jnp.where or jax.lax.cond in place of if"
+        ) from error
     for when, observation in {"reset": first, "step": step[0]}.items():
         shape = getattr(observation, "shape", type(observation).__name__)
         if shape != observations.shape:

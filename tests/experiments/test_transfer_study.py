@@ -55,7 +55,7 @@ def test_the_page_says_returns_and_differences(report):
     # The search of seed 2 has no counterpart; the difference is that of seed 0, and one search has no interval.
     assert row.count("(\u2212500)") == 2 and row.count("(\u2212500.00)") == 1
     assert row.endswith("| 2 | 1.5 |")
-    assert "- no reward noise: `lpo meta-train --reward-noise=0.0`" in page
+    assert "| no reward noise | `lpo meta-train --reward-noise=0.0` |" in page
     assert (
         "| shown to be worse, references included | none | none |" in page
     )  # of two searches of the default

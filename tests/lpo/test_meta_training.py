@@ -542,6 +542,11 @@ def test_physics_go_to_the_environment_and_not_to_its_bandit(
         ({"agents_per_candidate": 0}, "agents_per_candidate is 0: it must be at least 1."),
         ({"evaluation_episodes": -1}, "evaluation_episodes is -1: it must be at least 1."),
         ({"contexts": 0}, "contexts is 0: it must be at least 1."),
+        (
+            {"tasks": ("Pendulum-v1",), "reward_noise": 2.0},
+            "reward_noise is 2.0, and none of the tasks is a bandit: leave it out, or take a bandit.",
+        ),
+        ({"tasks": ("Pendulum-v1",), "contexts": 7}, "contexts is 7, and none of the tasks is a"),
         ({"reward_noise": -0.1}, "reward_noise is -0.1: it must be 0 or larger, and finite."),
         (
             {"initial_scale": float("nan")},

@@ -86,7 +86,7 @@ pytestmark = pytest.mark.usefixtures("small_agents")
         ("discover --curriculum linear:1:2:3:0", "the curriculum's transition is 0"),
         ("discover --mode al", "unknown mode 'al': did you mean all"),
         ("discover --parameterization IT", "unknown parameterization 'IT': did you mean"),
-        ("discover --parameterization T", "(T) cannot be fitted to an expert: use init random"),
+        ("discover --parameterization T", "(T) cannot be fitted to an expert, as is the default"),
         ("discover --parameterization TI --init random --max-steps 0", "max_steps is 0"),
         ("discover --max-steps 5", "max_steps is 5, and parameterization I has episodes of 1 step"),
         (

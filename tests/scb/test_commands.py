@@ -6,6 +6,8 @@ import os
 import re
 import shlex
 import shutil
+import subprocess
+import sys
 from dataclasses import fields
 from pathlib import Path
 
@@ -533,6 +535,11 @@ def test_the_programs_say_their_version_and_complete_their_words():
     result = call("--version")
     assert (result.code, result.err) == (0, "")
     assert re.fullmatch(r"scb \d+\.\d+\.\d+ \(python .*jax .*\)\n", result.out)
+    for program in ("scb", "lpo"):
+        found = subprocess.run(
+            [sys.executable, "-m", program, "--version"], capture_output=True, text=True, check=True
+        )
+        assert found.stdout.startswith(f"{program} ")
     completion = call("--tyro-print-completion", "bash")
     assert completion.code in (0, None)
     assert "discover" in completion.out and "--population-size" in completion.out

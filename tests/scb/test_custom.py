@@ -5,7 +5,11 @@ import sys
 import numpy as np
 import pytest
 
+from lpo.comparison import compare, ppo_spec
+from lpo.inner_loop import MetaTrainingConfig
 from scb.cli import main
+from scb.discovery import DiscoveryConfig
+from scb.environments.custom import own_code
 from scb.environments.registry import check_backend, environment_spec, make
 from scb.environments.zoo import bandit_metadata
 from scb.errors import UserError
@@ -70,6 +74,26 @@ class NoParameters(Pendulum):
     def default_params(self):
         return environment.EnvParams()
 
+class NoParts(environment.Environment):
+    default_params = Pendulum().default_params
+    observation_space, action_space = Pendulum().observation_space, Pendulum().action_space
+
+class FloatTerminated(Pendulum):
+    def step_env(self, *arguments):
+        *others, terminated, info = super().step_env(*arguments)
+        return *others, jnp.float32(terminated), info
+
+class AsksForValues(Pendulum):
+    def step_env(self, key, state, action, params):
+        if state.theta > 0:
+            action = -action
+        return super().step_env(key, state, action, params)
+
+def no_steps():
+    return Pendulum(), Pendulum().default_params.replace(max_steps_in_episode=0)
+
+instance = Pendulum()
+
 def endless():
     return Pendulum(), {"g": 10.0}
 
@@ -106,6 +130,40 @@ def test_an_environment_is_what_the_factory_returns(module):
     assert spec.random_return() < -5
 
 
+def test_an_environment_itself_is_taken_as_well_as_what_makes_it(module):
+    env, params = make(f"{module}:instance")
+    assert env.name == "Pendulum-v1" and params.max_steps_in_episode == 200
+
+
+def test_the_code_of_an_environment_counts_and_its_comments_do_not(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    names = [f"{tmp_path.name.replace('-', '_')}_{i}" for i in range(3)]
+    for name, said in zip(
+        names, (MODULE, "# Mine.\n" + MODULE, MODULE + "number = 4"), strict=True
+    ):
+        (tmp_path / f"{name}.py").write_text(said)
+    one, same, other = (own_code([f"{x}:alone", "Pendulum-v1"])[f"{x}:alone"] for x in names)
+    assert one == same != other
+    assert own_code(["Pendulum-v1", "nowhere.at_all:make", "C:/nothing"]) == {}
+
+
+def test_what_was_begun_with_other_code_does_not_go_on(module, tmp_path, monkeypatch):
+    name = f"{module}:with_parameters"
+    assert DiscoveryConfig(name).checksums().keys() == {name}
+    config = MetaTrainingConfig(tasks=(name,))
+    assert config.checksums().keys() == {name} and not config.weights()
+    spec = ppo_spec(name, 64, {"num_envs": 2, "num_steps": 8, "num_minibatches": 1})
+
+    def rows(seeds):
+        return compare(name, ["ppo"], seeds, spec, points=1, episodes=1, rows=tmp_path / "a.jsonl")
+
+    rows([0])
+    monkeypatch.setattr("scb.measurement.own_code", lambda names: dict.fromkeys(names, "other"))
+    with pytest.raises(UserError, match="under another configuration"):
+        rows([0, 1])
+
+
 def test_the_physics_that_a_factory_takes_is_part_of_the_place(module):
     name = f"{module}:with_physics"
     soft, hard = (Place.named(name, backend) for backend in ("soft", "hard"))
@@ -126,7 +184,7 @@ def test_the_physics_that_a_factory_takes_is_part_of_the_place(module):
             "{}:OtherObservations",
             r"shape \(3,\) from reset, where its observation_space says \(4,\)",
         ),
-        ("{}:OtherActions", "has a Tuple of actions: one Box or Discrete is understood"),
+        ("{}:OtherActions", "has a gymnax.environments.spaces.Tuple of actions: one Box or Disc"),
         ("{}:OlderStep", "returns 5 of step, where gymnax 1.x returns observation, state, reward"),
         ("{}:OlderReset", "returns 3 of reset, where gymnax 1.x returns observation, state: "),
         ("{}:NoStep", "returns 1 of step, where gymnax 1.x returns"),
@@ -136,9 +194,13 @@ def test_the_physics_that_a_factory_takes_is_part_of_the_place(module):
             "{}:NoParameters",
             "gymnax's own parameters, whose episodes end after one step: give it d",
         ),
+        ("{}:NoParts", "lacks reset_env or step_env, which gymnax's own reset and step call"),
+        ("{}:FloatTerminated", "returns a terminated of the type float32 from step_env: return a"),
+        ("{}:AsksForValues", "asks for a value where JAX only has a shape .*jax.lax.cond"),
+        ("{}:no_steps", "has a max_steps_in_episode of 0, after which an episode ends"),
         ("{}:endless", "without max_steps_in_episode"),
         ("{}:wrong", "returned a str: it must return a gymnax"),
-        ("{}:number", "does not take"),
+        ("{}:number", "is a int, which cannot be called: give a class or a function"),
     ],
 )
 def test_what_is_no_factory_is_refused(module, name, message):
@@ -157,7 +219,7 @@ def test_where_nobody_earns_a_number_the_environment_is_told(module):
 def test_a_bug_inside_of_a_factory_is_not_taken_for_wrong_arguments(module):
     with pytest.raises(TypeError, match="unsupported operand"):
         make(f"{module}:broken")
-    with pytest.raises(UserError, match=r"does not take {'length': 3}"):
+    with pytest.raises(UserError, match=r"does not take the arguments {'length': 3}"):
         make(f"{module}:broken", length=3)
 
 

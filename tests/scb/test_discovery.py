@@ -648,7 +648,10 @@ def test_the_inner_loop_is_the_papers_where_no_agent_is_given():
         ({"reward_std": 1.0, "parameterization": "TI"}, "reward_std is for bandits, and"),
         ({"mode": "al"}, "unknown mode 'al': did you mean all"),
         ({"parameterization": "IT"}, "unknown parameterization 'IT': did you mean"),
-        ({"parameterization": "T", "init": "expert"}, "cannot be fitted to an expert: use init ra"),
+        (
+            {"parameterization": "T", "init": "expert"},
+            "cannot be fitted to an expert, as is the def",
+        ),
         ({"parameterization": "TI", "start": "x"}, "cannot start from a bandit: leave the start"),
         ({"max_steps": 5}, "max_steps is 5, and parameterization I has episodes of 1 step"),
         ({"algorithms": ("ppo", "ddpg")}, "ddpg does not fit the environment's discrete actions"),

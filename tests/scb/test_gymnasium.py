@@ -231,6 +231,9 @@ def test_nothing_is_rendered():
         UserError, match="render_mode is 'rgb_array', and a bandit has nothing to show"
     ):
         SyntheticEnv("Synthetic-Pendulum-v1", render_mode="rgb_array")
+    assert gymnasium.make_vec(name, num_envs=2, render_mode=None).num_envs == 2
+    with pytest.raises(UserError, match="a bandit has nothing to show"):
+        SyntheticVectorEnv("Synthetic-Pendulum-v1", 2, render_mode="rgb_array")
     # After which Stable-Baselines3 makes it without.
     with pytest.warns(UserWarning, match="render_mode='rgb_array'"), pytest.raises(TypeError):
         gymnasium.make(name, render_mode="rgb_array")

@@ -234,6 +234,16 @@ def test_a_file_of_something_else_is_refused_and_stays(copy, content):
     assert copy.read_text() == content
 
 
+def test_a_damaged_row_is_named_and_its_agent_is_measured_again_without_it(copy, file, measured):
+    whole = copy.read_text().splitlines(keepends=True)
+    copy.write_text("".join([whole[0], "{half\n", *whole[2:]]))
+    with pytest.raises(UserError, match=r"line 2, is damaged .*: take the line out"):
+        Rows(copy)
+    copy.write_text("".join([whole[0], *whole[2:]]))
+    returns = [[row["return"] for row in rows] for rows in (measured(copy), file[1])]
+    np.testing.assert_allclose(*returns, rtol=1e-3)
+
+
 @pytest.mark.parametrize("content", ["[]\n", "[1]\n", "{}\n", "no JSON\n"])
 def test_rows_without_their_configurations_are_refused(copy, content):
     copy.with_suffix(".json").write_text(content)

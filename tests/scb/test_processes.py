@@ -169,6 +169,12 @@ def test_a_folder_that_the_first_is_refused_is_refused_to_all(tmp_path):
         ({"coordinator": "here:1", "processes": "two", "process": "0"}, "--processes is 'two'"),
         ({"coordinator": "here:1", "processes": "2", "process": "2"}, "a number from 0 to 1"),
         ({"coordinator": "here", "processes": "2", "process": "1"}, "give HOST:PORT"),
+        (
+            {"coordinator": "here:x", "processes": "2", "process": "1"},
+            "with a port from 1 to 65535",
+        ),
+        ({"coordinator": "here:", "processes": "2", "process": "1"}, "with a port from 1 to 65535"),
+        ({"coordinator": "here:65536", "processes": "2", "process": "0"}, "'here:65536': give H"),
     ],
 )
 def test_processes_that_do_not_say_who_they_are_are_refused(given, message):

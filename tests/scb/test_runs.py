@@ -85,7 +85,7 @@ def test_a_folder_that_holds_something_is_refused(tmp_path):
 
 def test_a_file_in_the_place_of_the_folder_is_refused(tmp_path):
     (tmp_path / "file").write_text("")
-    with pytest.raises(UserError, match="already exists"):
+    with pytest.raises(UserError, match="file is a file, and a run needs a folder: choose another"):
         Run.open(tmp_path / "file", CONFIG)
 
 

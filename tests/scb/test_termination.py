@@ -91,7 +91,7 @@ time.sleep(60)
     assert 19 <= step <= logged and step % CONFIG.checkpoint_every
     assert said == (
         f"search: {words}; {folder} is saved after {step} generations, and goes on from there: with --resume, "
-        "or by the call that began it.\n"
+        "or in Python by the call that began it.\n"
     )
     assert fingerprint(folder, resume=True) == whole
 
