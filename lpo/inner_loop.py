@@ -83,7 +83,8 @@ class MetaTrainingConfig:
     contexts: int = 200
     horizons: Annotated[tuple[float, ...], text(_read_horizons, _write_horizons, "A,B,C")] = ()
     hyperparameters: Annotated[
-        Mapping[str, tuple[float, ...]], text(read_values, write_values, "'NAME=A,B NAME=A'")
+        Mapping[str, tuple[float, ...]],
+        text(read_values, write_values, "NAME=A,B NAME=A", spaced=True),
     ] = field(default_factory=lambda: {"policy_output_scale": (1.0, 0.01)})
     reward_noise: float = 5.0
     agents_per_candidate: int = 4

@@ -23,17 +23,20 @@ from lpo.meta_training import (
     environment_problem,
     learn_objective,
 )
-from lpo.objectives import Objective, check_names, load_objective
+from lpo.objectives import Objective, load_objective
 from scb import plotting
 from scb.command_line import LongRun, Output
 from scb.console import console
 from scb.environments.registry import make
+from scb.errors import UserError
 from scb.evolution import EnvironmentSteps
 from scb.files import write_json
 from scb.machine import machine_description, package_versions
 from scb.rows import Rows
 from scb.runs import Run, Stopwatch, config_dict
 from scb.seeds import reporting
+
+REFERENCES = ("ppo", "dpo")
 
 
 @dataclass(frozen=True)
@@ -178,9 +181,13 @@ def reporting_seeds(seed: int, count: int) -> list[int]:
 
 
 def _with_references(objective: Objective) -> list[Objective]:
-    objectives = [load_objective("ppo"), load_objective("dpo"), objective]
-    check_names(objectives)
-    return objectives
+    references = [load_objective(name) for name in REFERENCES]
+    if objective.name in REFERENCES:
+        raise UserError(
+            f"--objective is {objective.name!r}, which every run is compared with anyway: give another, or leave it "
+            "out to learn one."
+        )
+    return [*references, objective]
 
 
 def _told(problem: MetaTraining, run: Run) -> dict[str, Any]:

@@ -118,7 +118,14 @@ def _in_numpy(drift: Drift, parameters: Any, *arguments: Any, **named: Any) -> A
 def _in_torch(
     drift: Drift, parameters: Any, log_ratio: Any, advantage: Any, progress: Any = None
 ) -> Any:
-    torch = importlib.import_module("torch")
+    import torch
+
+    for name, value in (("log_ratio", log_ratio), ("advantage", advantage)):
+        if not isinstance(value, torch.Tensor):
+            raise UserError(
+                f"{name} is no tensor of PyTorch but of the class {type(value).__name__}: give a tensor, such as "
+                "torch.as_tensor makes, or use lpo.numpy_drift or lpo.drift_function."
+            )
     return _evaluate(torch, drift, parameters, log_ratio, advantage.to(log_ratio), progress)
 
 
@@ -126,7 +133,8 @@ def _loss_in_torch(
     drift: Drift, parameters: Any, log_ratio: Any, advantage: Any, progress: Any = None
 ) -> Any:
     penalty = _in_torch(drift, parameters, log_ratio, advantage, progress)
-    torch = importlib.import_module("torch")
+    import torch
+
     return _policy_loss(torch, penalty, log_ratio, advantage.to(log_ratio))
 
 
@@ -165,8 +173,14 @@ def _evaluate(
             )
         progress = 0.0
     # A tensor's or a traced array's values are not looked at: that would wait for a device.
-    given = isinstance(progress, int | float | list | tuple | np.generic | np.ndarray)
-    if given and not np.all((np.asarray(progress) >= 0) & (np.asarray(progress) <= 1)):
+    inside = True
+    if isinstance(
+        progress, int | float
+    ):  # apart, for torch.compile cannot follow a branch on an array
+        inside = 0 <= progress <= 1
+    elif isinstance(progress, list | tuple | np.generic | np.ndarray):
+        inside = bool(np.all((np.asarray(progress) >= 0) & (np.asarray(progress) <= 1)))
+    if not inside:
         raise UserError(f"progress is {progress}: it is the fraction of training done, in [0, 1].")
     if np.shape(progress) not in ((), log_ratio.shape):
         raise UserError(

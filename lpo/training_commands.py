@@ -79,7 +79,7 @@ class JudgedConfig(Agents):
 
     seeds: int = 1
     hyperparameters: Annotated[
-        Mapping[str, Any], text(read_settings, write_settings, "'NAME=A NAME=B'")
+        Mapping[str, Any], text(read_settings, write_settings, "NAME=A NAME=B", spaced=True)
     ] = field(default_factory=dict)
     sampled_actions: bool = False
 

@@ -28,12 +28,18 @@ GENERATIONS = ("evolution.num_generations",)
 _STYLE = (tyro.conf.OmitArgPrefixes, tyro.conf.HelptextFromCommentsOff)
 
 
-def text(read: Callable[[str], T], write: Callable[[T], str], metavar: str) -> Any:
-    """Annotates a field whose value is one word of the command line; `read` raises a UserError for a wrong one."""
+def text(
+    read: Callable[[str], T], write: Callable[[T], str], metavar: str, spaced: bool = False
+) -> Any:
+    """Annotates a field whose value is text of the command line; `read` raises a UserError for a wrong one.
+
+    Args:
+      spaced: of several words, which may stand in quotes, as a command writes them itself, or not.
+    """
     return PrimitiveConstructorSpec(
-        nargs=1,
+        nargs="*" if spaced else 1,
         metavar=metavar,
-        instance_from_str=lambda words: read(words[0]),
+        instance_from_str=lambda words: read(" ".join(words)),
         is_instance=lambda value: True,
         str_from_instance=lambda value: [write(value)],
     )

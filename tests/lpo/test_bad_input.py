@@ -110,7 +110,7 @@ def test_a_number_out_of_range_is_told_its_range(refused, arguments, message):
         ("align --contexts 0", "contexts is 0: it must be at least 1."),
         ("evaluate --objectives", "no objectives: give at least one"),
         ("evaluate --objectives ppo ppo", "objective 'ppo' is there twice"),
-        ("run --objective ppo", "objective 'ppo' is there twice"),
+        ("run --objective ppo", "'ppo', which every run is compared with anyway"),
         ("certify missing.npz", "missing.npz does not exist"),
     ],
 )

@@ -333,6 +333,13 @@ class TestTorch:
         with pytest.raises(UserError, match="same shape"):
             torch_loss("ppo")(torch.zeros(5), torch.zeros(5, 1), 0.0)
 
+    @pytest.mark.parametrize("wrong", ["log_ratio", "advantage"])
+    def test_an_array_of_numpys_is_no_tensor(self, torch, wrong, one_sentence):
+        given = {"log_ratio": torch.zeros(5), "advantage": torch.zeros(5), wrong: np.zeros(5)}
+        with pytest.raises(UserError) as error:
+            torch_loss("ppo")(**given, progress=0.0)
+        assert f"{wrong} is no tensor of PyTorch but" in one_sentence(str(error.value))
+
     @pytest.mark.slow
     @pytest.mark.parametrize("objective", ["ppo", "dpo", "lpo-pendulum"])
     def test_the_example_trains(self, objective):

@@ -104,6 +104,7 @@ def test_processes_find_what_one_with_all_their_devices_finds(tmp_path, number):
         assert said.splitlines()[-1].split() == [str(i == 0), *wanted]  # after Gloo's own
         # The first alone says how far they are.
         assert ("generation 12/12" in error) == (i == 0)
+        assert (f"process 0 waits for {number - 1} more at localhost" in error) == (i == 0)
     for name in ("metrics.jsonl", "config.json"):
         assert (several / name).read_bytes() == (one / name).read_bytes()
 
