@@ -13,8 +13,9 @@ import tyro
 
 from lpo import search_figures
 from lpo.certificate import certify
-from lpo.distill import DistillConfig, distill
+from lpo.distill import distill
 from lpo.drifts import LearnedDrift, learned_drift
+from lpo.formula_search import DistillConfig
 from lpo.inner_loop import MetaTrainingConfig
 from lpo.meta_training import (
     TEMPORAL_HORIZONS,

@@ -12,10 +12,11 @@ import pytest
 import lpo.distill
 from lpo import cli, commands
 from lpo.certificate import certify
-from lpo.distill import DistillConfig, _front, _shortest, distill, sample_updates
+from lpo.distill import _shortest, distill, sample_updates
 from lpo.drifts import ClipDrift, ClosedFormDrift, DPODrift, LearnedDrift
 from lpo.drifts.formula import parse
 from lpo.drifts.sums import as_sum, as_text
+from lpo.formula_search import DistillConfig, front_of
 from lpo.objectives import Objective, load_objective, save_objective
 from scb.agents.ppo import PPO, PPOHyperparameters
 from scb.environments.registry import make
@@ -308,7 +309,7 @@ def test_no_formula_is_kept_that_a_shorter_one_equals():
     def of(*factors):
         return ((factors, 0.5),)
 
-    front = _front([(of("A", "d", "d"), 0.9), (of("A", "d"), 0.5), (of("d"), 0.7)])
+    front = front_of([(of("A", "d", "d"), 0.9), (of("A", "d"), 0.5), (of("d"), 0.7)])
     assert [score for _, score, _ in front] == [0.7, 0.9]
 
 
