@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from experiments import lpo_on_bandits as module
+from experiments import lpo_on_bandits_page as page_of_it
 from experiments.rendering import text
 from experiments.searches import meta_training
 from lpo.comparison import Comparison, LearningCurves
@@ -115,7 +116,7 @@ def test_the_page_says_costs_returns_and_differences(report):
 
 def test_the_page_on_pendulum_has_the_differences_of_the_committed_report():
     docs = Path(module.__file__).parents[1] / "docs"
-    tables = module.facts(json.loads((docs / "data/lpo_on_bandits.json").read_text()))["tables"]
+    tables = page_of_it.facts(json.loads((docs / "data/lpo_on_bandits.json").read_text()))["tables"]
     flax, small = (tables[f"Pendulum, {label}"]["against"] for label in module.SCALES)
     page = (docs / "pendulum.md").read_text()
     for name, (final, area) in small.items():
@@ -190,7 +191,9 @@ def tiny(monkeypatch):
     monkeypatch.setattr(module, "objective_of_run", objective_of_run)
     monkeypatch.setattr(module, "compare", compare)
     plan = {
-        "searches": {source: {"seeds": 1, "settings": {"of": source}} for source in module.SOURCES},
+        "searches": {
+            source: {"seeds": 1, "settings": {"of": source}} for source in page_of_it.SOURCES
+        },
         "timing": {"population_size": 3},
         "agents": 2,
         "tuning_agents": 2,

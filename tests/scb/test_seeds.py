@@ -53,6 +53,7 @@ REPORTERS = {
             "linear_fits",
             "locomotion",
             "lpo_on_bandits",
+            "lpo_on_bandits_page",
             "robustness",
             "sb3",
             "transfer_study",
