@@ -269,7 +269,7 @@ def test_a_confirmation_is_decided_by_its_own_agents_when_all_are_there(monkeypa
         agents["13"] = more[name]["13"]
     ((_, pairs, judged),) = locomotion_claims.confirmed(made)
     assert (pairs, judged.outcome) == (10, claims.HOLDS)
-    assert "| none | +100 [100, 100] | −5 | confirmed |" in module.EXPERIMENT.page(made)
+    assert "| +100 [100, 100] | −5 | confirmed |" in module.EXPERIMENT.page(made)
     made["environments"]["hopper"]["agents"].pop("dpo")
     assert locomotion_claims.confirmed(made) == []
 
@@ -370,7 +370,7 @@ def test_of_a_pending_confirmation_whose_reference_was_known_the_objective_alone
     made = report(13)
     counts = {c.objective: len(c.seeds) for c in module.facts(made)["comparisons"]["hopper"].curves}
     assert counts == {"ppo": 13, "dpo": 4, "lpo-pendulum": 13}
-    row = "| hopper: dpo earns no less over the last quarter than PPO | 10, seeds 4 to 13 | ppo | "
+    row = "| hopper: dpo earns no less over the last quarter than PPO | 10, seeds 4 to 13; ppo known before | "
     assert row in module.EXPERIMENT.page(made)
 
 
@@ -409,7 +409,7 @@ def test_a_confirmation_has_a_reference_of_its_own(monkeypatch):
     )
     assert judged.estimate.value == pytest.approx(np.subtract(ours, theirs).mean())
     assert "a twentieth of what dpo earns" in judged.claim.reason
-    row = "than dpo | 10, seeds 4 to 13 | lpo-pendulum | "
+    row = "than dpo | 10, seeds 4 to 13; lpo-pendulum known before | "
     assert row in module.EXPERIMENT.page(made)
     for agents in made["environments"]["hopper"]["agents"]["lpo-pendulum"].values():
         agents["returns"] = "0 50 9000"
