@@ -5,6 +5,7 @@ expert does, what standing still does. Whatever of it depends on the physics is 
 environments without a choice of physics the backend is None.
 """
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -136,7 +137,11 @@ class EnvironmentSpec:
         return int(self.make()[1].max_steps_in_episode)
 
     def random_return(self, backend: str | None = None) -> float:
-        """Mean return of uniformly random actions; measured, once in a process, where the table lacks it."""
+        """Mean return of uniformly random actions; measured, once in a process, where the table lacks it.
+
+        Raises:
+          UserError: it is no number, or actions have no bounds.
+        """
         physics = self.physics(backend)
         known = self.random_returns.get(physics)
         return _measured(self, physics) if known is None else known
@@ -167,7 +172,12 @@ class EnvironmentSpec:
 
 @cache
 def _measured(spec: EnvironmentSpec, backend: str | None) -> float:
-    return random_return(*spec.make(backend))
+    found = random_return(*spec.make(backend))
+    if not math.isfinite(found):
+        raise UserError(
+            f"random actions earn {found:g} in {spec.name}: see that its rewards are finite."
+        )
+    return found
 
 
 class Family(ABC):

@@ -8,7 +8,7 @@ import pytest
 from lpo.comparison import compare, ppo_spec
 from lpo.inner_loop import MetaTrainingConfig
 from scb.cli import main
-from scb.discovery import DiscoveryConfig
+from scb.discovery import BanditDiscovery, DiscoveryConfig
 from scb.environments.custom import own_code
 from scb.environments.registry import check_backend, environment_spec, make
 from scb.environments.zoo import bandit_metadata
@@ -209,11 +209,15 @@ def test_what_is_no_factory_is_refused(module, name, message):
 
 
 def test_where_nobody_earns_a_number_the_environment_is_told(module):
-    place = Place.named(f"{module}:NoRewards")
-    with pytest.raises(
-        UserError, match=r"random actions earn a finite number in .*NoRewards: look"
-    ):
-        as_random(np.array([np.nan]), place)
+    name = f"{module}:NoRewards"
+    message = r"random actions earn nan in .*NoRewards: see that its rewards are finite"
+    with pytest.raises(UserError, match=message):
+        as_random(np.array([np.nan]), Place.named(name))
+    # Before a search for an expert, or a generation, that could find nothing.
+    for init in ("expert", "random"):
+        problem = BanditDiscovery(DiscoveryConfig(environment=name, init=init))
+        with pytest.raises(UserError, match=message):
+            problem.search(quiet=True)
 
 
 def test_a_bug_inside_of_a_factory_is_not_taken_for_wrong_arguments(module):
