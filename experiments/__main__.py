@@ -14,7 +14,6 @@ import pkgutil
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any, Literal, cast
 
@@ -22,6 +21,7 @@ import tyro
 
 from experiments import claims, harness, rendering
 from experiments.harness import DATA, DOCS, Experiment, Files
+from scb import termination
 from scb.errors import UserError, unknown_name
 from scb.files import make_folder
 
@@ -121,6 +121,9 @@ def _is_whole_paper(out: Path) -> bool:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """The command."""
+    if argv is None:  # a caller's process is the caller's
+        termination.watch("experiments")
+        termination.goes_on(harness.AGAIN)
     given = list(sys.argv[1:] if argv is None else argv)
     if given and not given[0].startswith("-"):
         name, *rest = given
@@ -154,8 +157,11 @@ def _all(arguments: All) -> int:
         print(f"{experiment.name} ...{note}", flush=True)
         files = Files(out, arguments.docs, arguments.only_render or kept)
         options = experiment.options(arguments.preset)
-        run = partial(experiment.run, options, files)
-        failed |= bool(harness.exit_status(experiment.name, run))
+        try:
+            failed |= bool(experiment.run(options, files))
+        except UserError as error:  # the others are not its fault
+            print(f"{experiment.name}: {error}", file=sys.stderr)
+            failed = True
     (arguments.docs / "experiments.md").write_text(overview(experiments, arguments.data))
     print(f"written: {arguments.docs / 'experiments.md'}")
     return 2 if failed else 0

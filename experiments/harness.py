@@ -10,7 +10,6 @@ import importlib
 import json
 import shlex
 import shutil
-import sys
 import time
 import tomllib
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -28,6 +27,7 @@ from experiments import claims, rendering
 from experiments.claims import Claim, Judged
 from experiments.parts import InParts, Jobs, elsewhere
 from scb import plotting
+from scb.cli import exit_code
 from scb.command_line import flags
 from scb.environments.registry import environment_spec, families
 from scb.environments.synthetic import SyntheticBandit
@@ -41,6 +41,8 @@ CLASSIC_CONTROL = tuple(sorted(families()["classic"].suite))
 DATA = Path("docs/data")
 DOCS = Path("docs")
 PLANS = Path(__file__).with_name("plans")
+# Of what is interrupted.
+AGAIN = "the same command measures what its report lacks."
 Save = Callable[[], None]
 Report = Mapping[str, Any]
 Measure = Callable[[Any, dict[str, Any], Save], None]
@@ -193,7 +195,7 @@ class Experiment:
         out = files.out or self.out or DATA / f"{self.name}.json"
         # What is measured elsewhere leaves the documentation's page as it is.
         docs = files.docs or (DOCS if files.out is None else out.parent)
-        make_folder(docs, "--docs")
+        make_folder(docs, "--docs" if files.docs or files.out is None else "--out")
         if not files.only_render:
             make_folder(out.parent)
         # Two that measure would each save what they have, and not what the other has.
@@ -268,8 +270,8 @@ class Experiment:
         """
         if self.presets and not complete(report):
             raise UserError(
-                f"the report of {self.name} is not complete: run python -m experiments {self.name} "
-                f"--preset {report.get('preset', 'quick')}, which goes on where it was."
+                f"the report of {self.name} is not complete: leave out --only-render, with --preset "
+                f"{report.get('preset', 'quick')}, and the command goes on where it was."
             )
         if rendering.has_template(self.name):
             (docs / f"{self.name}.md").write_text(self.page(report))
@@ -285,12 +287,8 @@ def plan_of(name: str) -> dict[str, Any]:
 
 
 def exit_status(name: str, command: Callable[[], int]) -> int:
-    """What a command returns; 2 where it raises a UserError, whose sentence goes to stderr behind the name."""
-    try:
-        return command()
-    except UserError as error:
-        print(f"{name}: {error}", file=sys.stderr)
-        return 2
+    """What a command returns, or what it is where it fails for a reason that a user can see to, with a sentence."""
+    return exit_code(name, command, AGAIN)
 
 
 def complete(report: Report) -> bool:
@@ -303,7 +301,9 @@ def read(path: Path, missing_is_new: bool = False, keys: Iterable[str] = ()) -> 
     if missing_is_new and not path.exists():
         return {}
     try:
-        report = dict(json.loads(path.read_text()))
+        report: Any = json.loads(path.read_text())
+        if not isinstance(report, dict):
+            raise ValueError("it is no JSON object")
         if lacking := [key for key in keys if key not in report]:
             raise ValueError(f"it lacks {', '.join(lacking)}")
     except (OSError, TypeError, ValueError) as error:

@@ -19,6 +19,7 @@ from typing import Any, Literal, TypeVar
 import submitit
 from submitit.helpers import Checkpointable
 
+from scb import termination
 from scb.errors import UserError, at_least, first_line, unused
 from scb.files import make_folder, write_json
 
@@ -221,24 +222,30 @@ def elsewhere(
     executor = jobs.executor_in(folder / "jobs") if waiting else None
     running: dict[Part, submitit.Job[None]] = {}
     failed: dict[Part, str] = {}
-    try:
-        while waiting or running:
-            while executor and waiting and len(running) < jobs.jobs:
-                part = waiting.pop(0)
-                kept[part].with_suffix(".error").unlink(missing_ok=True)
-                running[part] = executor.submit(Measurement(part, kept[part]))
-                tell(f"{part.name}: job {running[part].job_id}")
-            for part in [part for part, job in running.items() if job.done()]:
-                job = running.pop(part)
-                if not taken(part):
-                    said = kept[part].with_suffix(".error")
-                    failed[part] = said.read_text() if said.exists() else "its job left nothing"
-                    tell(f"{part.name}: failed, job {job.job_id} ({failed[part]})")
-            if running:
-                time.sleep(every)
-    except BaseException:
+
+    def cancel() -> str:
         for job in running.values():
             job.cancel()
+        return f"its {len(running)} jobs are cancelled, and the same command measures what its report lacks."
+
+    try:
+        with termination.saving(cancel):
+            while waiting or running:
+                while executor and waiting and len(running) < jobs.jobs:
+                    part = waiting.pop(0)
+                    kept[part].with_suffix(".error").unlink(missing_ok=True)
+                    running[part] = executor.submit(Measurement(part, kept[part]))
+                    tell(f"{part.name}: job {running[part].job_id}")
+                for part in [part for part, job in running.items() if job.done()]:
+                    job = running.pop(part)
+                    if not taken(part):
+                        said = kept[part].with_suffix(".error")
+                        failed[part] = said.read_text() if said.exists() else "its job left nothing"
+                        tell(f"{part.name}: failed, job {job.job_id} ({failed[part]})")
+                if running:
+                    time.sleep(every)
+    except BaseException:
+        cancel()
         raise
     if failed:
         part, reason = next(iter(failed.items()))

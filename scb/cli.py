@@ -49,53 +49,61 @@ def run_program(
       commands: {name: function or LongRun}, asked for after JAX is configured.
       arguments: those of the process where None.
     """
-    configure_jax()
     from scb import processes, termination
 
     # A caller's process is the caller's.
-    if arguments is not None:
-        return _run(program, description, commands(), arguments)
-    termination.watch(program)
-    status = _run(program, description, commands(), sys.argv[1:])
-    processes.end(status)
+    if arguments is None:
+        termination.watch(program)
+    configure_jax()
+    from scb.command_line import LongRun, call
+
+    given, known = sys.argv[1:] if arguments is None else arguments, commands()
+    command = known.get(given[0]) if given else None
+    again = ""
+    if isinstance(command, type) and issubclass(command, LongRun):
+        again = "a run with --out continues with --resume."
+    termination.goes_on(again)
+    status = exit_code(program, lambda: call(program, description, known, given), again)
+    if arguments is None:
+        processes.end(status)
     return status
 
 
-def _run(
-    program: str, description: str, commands: Mapping[str, Any], arguments: Sequence[str]
-) -> int:
-    from scb.command_line import call
+def exit_code(program: str, act: Callable[[], int | None], again: str = "") -> int:
+    """Acts; what it returns, or 0, and where it fails for a reason that a user can see to, a sentence and the code.
+
+    Args:
+      program: whose sentence it is.
+      again: how what is interrupted goes on, a sentence's end; "" where it does not.
+    """
     from scb.errors import UserError
     from scb.processes import LostProcess
 
+    def tell(*parts: str) -> None:
+        print(f"{program}: {'; '.join(filter(None, parts))}", file=sys.stderr, flush=True)
+
     try:
-        call(program, description, commands, arguments)
+        status = act()
         sys.stdout.flush()
     except BrokenPipeError:
         # Whoever read the output, such as `head`, has enough; Python would complain at its exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except UserError as error:
-        print(f"{program}: {error}", file=sys.stderr, flush=True)
+        tell(str(error))
         if isinstance(error, LostProcess):
             os._exit(2)  # an orderly end would wait for the lost one
         return 2
     except OSError as error:
         if error.errno not in _NO_ROOM:
             raise
-        print(
-            f"{program}: cannot write {error.filename or 'what was done'} ({error.strerror}): make room; a run with "
-            "checkpoints continues with --resume.",
-            file=sys.stderr,
-        )
+        what = f"cannot write {error.filename or 'what was done'} ({error.strerror})"
+        tell(f"{what}: make room{'' if again else '.'}", again)
         return 1
     except KeyboardInterrupt:
-        print(
-            f"{program}: interrupted; a run with checkpoints continues with --resume.",
-            file=sys.stderr,
-        )
+        tell(f"interrupted{'' if again else '.'}", again)
         return 130
-    return 0
+    return status or 0
 
 
 def _commands() -> dict[str, Any]:

@@ -16,6 +16,7 @@ SAID = {signal.SIGTERM: "told to end", signal.SIGINT: "interrupted"}
 writing = threading.RLock()
 _savers: list[Callable[[], str]] = []
 _pipe: int | None = None
+_again = ""
 
 
 @contextlib.contextmanager
@@ -31,6 +32,12 @@ def saving(save: Callable[[], str]) -> Iterator[None]:
     finally:
         with writing:
             _savers.remove(save)
+
+
+def goes_on(how: str) -> None:
+    """From now on a process that ends, and has nothing to save, says this of how to go on; "" for nothing."""
+    global _again
+    _again = how
 
 
 def watch(program: str) -> None:
@@ -64,6 +71,6 @@ def _wait(program: str, read: int) -> None:
             # Whatever it is, what was saved before is there, and the time that is left is short.
             except Exception as error:
                 said.append(f"what was done since the last checkpoint is lost ({error}).")
-        end = " ".join(said) or "a run with --out continues with --resume."
-        print(f"{program}: {SAID[signal.Signals(number)]}; {end}", file=sys.stderr, flush=True)
+        told = "; ".join(filter(None, (SAID[signal.Signals(number)], " ".join(said) or _again)))
+        print(f"{program}: {told.rstrip('.')}.", file=sys.stderr, flush=True)
         os._exit(128 + number)

@@ -589,4 +589,8 @@ def test_an_interruption_is_exit_code_130(monkeypatch, bandit_file):
     monkeypatch.setattr("scb.commands.judge", interrupt)
     result = call("train", "--bandit", bandit_file)
     assert result.code == 130
-    assert result.err.startswith("scb: interrupted") and result.err.count("\n") == 1
+    assert result.err == "scb: interrupted; a run with --out continues with --resume.\n"
+    # What has no --resume does not speak of it.
+    monkeypatch.setattr("scb.listing.list_command", interrupt)
+    result = call("list")
+    assert (result.code, result.err) == (130, "scb: interrupted.\n")
