@@ -39,7 +39,7 @@ from experiments.harness import Experiment, Save, bandit_of, settled
 from scb.agents.spec import bandit_agent
 from scb.artefacts import flatten
 from scb.environments.zoo import space_description
-from scb.errors import one_of
+from scb.errors import UserError, one_of
 from scb.evolution import map_population
 from scb.keys import named_key, root_key, split_key
 from scb.statistics import Estimate, estimate
@@ -253,6 +253,8 @@ class Options:
 
 def measure(options: Options, report: dict[str, Any], save: Save) -> None:
     """An algorithm at a time, here and there."""
+    if options.rejax_python is not None and not options.rejax_python.exists():
+        raise UserError(f"{options.rejax_python} is not there: give another --rejax-python.")
     names = options.algorithms.split(",")
     for name in names:
         one_of("algorithm", name, TASKS)

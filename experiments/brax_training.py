@@ -230,7 +230,7 @@ def claims(report: Report) -> list[Claim]:
             or row["trained"] >= LEAST_TIMES * row["bandit_steps"]
         )
         name = f"{row['bandit']}, {row['algorithm'].upper()}"
-        text = f"{name}: the environment takes {LEAST_TIMES} times the steps or more"
+        text = f"{name}: the environment takes {LEAST_TIMES} times the steps or more to the level's lower end"
         evidence = of_agents(partial(median, times), len(times)) if told else None
         found.append(Claim(text, evidence, LEAST_TIMES, places=0))
         standing = environment_spec(row["environment"]).standing_still(row["backend"])

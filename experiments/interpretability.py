@@ -108,7 +108,8 @@ def claims(report: Report) -> list[Claim]:
     more = Estimate(speed[0] - angle[0], speed[1] - angle[2], speed[2] - angle[1], 0)
     found = [
         Claim(
-            "Acrobot's angular velocities cause more of the reward's variance than its angles", more
+            "each of Acrobot's angular velocities causes more of the reward's variance than any entry of its angles",
+            more,
         )
     ]
     for kind in ("position", "angle"):

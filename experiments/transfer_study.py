@@ -29,6 +29,7 @@ from lpo.objectives import Objective, load_objective
 from lpo.suite import suite
 from scb.environments.registry import environment_spec
 from scb.errors import one_of
+from scb.measurement import check_seeds
 from scb.plotting import BLUE, GREY, VERMILLION, estimate_row
 from scb.rows import Rows
 from scb.seeds import REPORTING
@@ -198,11 +199,14 @@ class Options:
     runs: Path = Path("runs/transfer_study")
     """for the run folders"""
 
+    def __post_init__(self) -> None:
+        check_seeds(self.meta_seeds)
+        for name in self.variations:
+            one_of("variation", name, VARIATIONS)
+
 
 def parts(options: Options, report: dict[str, Any]) -> Iterator[Part]:
     """Objectives: each is learned, then judged where it is not yet; all have as many searches wherever it ends."""
-    for name in options.variations:
-        one_of("variation", name, VARIATIONS)
     searches = {"generations": options.generations, "population_size": options.population_size}
     settled(report, searches=searches)
     report["evaluations"] = [asdict(e) for e in EVALUATIONS]

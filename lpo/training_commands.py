@@ -131,7 +131,8 @@ class Comparing(Measuring):
     def compare(self, objectives: Sequence[Objective]) -> Comparison:
         """Trains with the objectives, and leaves rows, comparison.json and curves.png where a folder is named."""
         config: JudgedConfig = self.config
-        environment, seeds = config.environment or "Pendulum-v1", config.seed_list()
+        environment = "Pendulum-v1" if config.environment is None else config.environment
+        seeds = config.seed_list()
         spec = ppo_spec(environment, config.steps, config.hyperparameters)
         Place.named(environment, config.backend)  # a mistake must not leave a folder behind
         folder, rows = self.opened()

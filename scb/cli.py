@@ -76,7 +76,9 @@ def exit_code(program: str, act: Callable[[], int | None], again: str = "") -> i
       program: whose sentence it is.
       again: how what is interrupted goes on, a sentence's end; "" where it does not.
     """
-    from scb.errors import UserError
+    from jax.errors import JaxRuntimeError
+
+    from scb.errors import UserError, first_line
     from scb.processes import LostProcess
 
     def tell(*parts: str) -> None:
@@ -94,6 +96,16 @@ def exit_code(program: str, act: Callable[[], int | None], again: str = "") -> i
         if isinstance(error, LostProcess):
             os._exit(2)  # an orderly end would wait for the lost one
         return 2
+    except (MemoryError, JaxRuntimeError) as error:
+        if isinstance(error, JaxRuntimeError) and "RESOURCE_EXHAUSTED" not in str(error):
+            raise
+        reason = first_line(error).rstrip(".")
+        tell(
+            f"out of memory ({reason}): take fewer agents, candidates, episodes or environments at a "
+            f"time{'' if again else '.'}",
+            again,
+        )
+        return 1
     except OSError as error:
         if error.errno not in _NO_ROOM:
             raise

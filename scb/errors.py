@@ -21,6 +21,8 @@ def at_least(minimum: int, of: object = None, *names: str, **values: float | Non
     """
     allowed = f"at least {minimum}" if minimum else "0 or larger"
     _check(lambda value: minimum <= value < math.inf, allowed, of, names, values)
+    # What JAX counts with; beyond it a computation would overflow, or never end.
+    _check(lambda value: value < 2**32, "below 2^32", of, names, values)
 
 
 def positive(of: object = None, *names: str, **values: float | None) -> None:

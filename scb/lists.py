@@ -40,7 +40,7 @@ def _read(
     words: str, what: str, wanted: str, checked: Callable[[str, Mapping[str, Any]], T]
 ) -> dict[str, T]:
     source, content = "the text", words
-    if not words.lstrip().startswith("{"):
+    if not words.lstrip().startswith(("{", "[")):
         source = words
         try:
             content = Path(words).read_bytes().decode()

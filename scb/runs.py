@@ -115,19 +115,7 @@ class Run:
             path = self.folder / name
             if not path.exists():
                 continue
-            kept, lines = [], path.read_text().splitlines()
-            for number, line in enumerate(lines, 1):
-                try:
-                    generation = json.loads(line)["generation"]
-                except (ValueError, KeyError, TypeError) as error:
-                    if number == len(lines):
-                        break  # the half line that a kill left at the end
-                    raise UserError(
-                        f"line {number} of {path} is damaged ({error}): mend it, or remove the file, of which "
-                        "nothing but the log is lost."
-                    ) from error
-                if generation < step:
-                    kept.append(line + "\n")
+            kept = [line + "\n" for line, told in _logged(path) if told["generation"] < step]
             write_text(path, "".join(kept))
 
     def log(self, generation: int, metrics: Mapping[str, float], seconds: float) -> None:
@@ -172,13 +160,13 @@ class Run:
     def metrics(self) -> list[dict[str, Any]]:
         """All logged generations, oldest first."""
         path = self.folder / "metrics.jsonl"
-        return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+        return [told for _, told in _logged(path)] if path.exists() else []
 
     def seconds(self) -> float:
         """Wall-clock seconds of all logged generations, over every resumption."""
         path = self.folder / "timing.jsonl"
-        lines = path.read_text().splitlines() if path.exists() else []
-        return float(sum(json.loads(line)["seconds"] for line in lines))
+        lines = _logged(path) if path.exists() else []
+        return float(sum(told.get("seconds", 0.0) for _, told in lines))
 
     def end_log(self) -> None:
         """Closes what generations are logged to; the folder stays this process's."""
@@ -193,6 +181,28 @@ class Run:
         """Ends the log, and lets go of the folder."""
         self.end_log()
         _release(self.folder / _LOCK)
+
+
+def _logged(path: Path) -> list[tuple[str, dict[str, Any]]]:
+    """The lines of a log, as they stand there and as they are read, without the half one that a kill left at its end.
+
+    Raises:
+      UserError: another line is damaged.
+    """
+    found, lines = [], path.read_text(errors="replace").splitlines()
+    for number, line in enumerate(lines, 1):
+        try:
+            told = dict(json.loads(line))
+            int(told["generation"])
+        except (ValueError, KeyError, TypeError) as error:
+            if number == len(lines):
+                break
+            raise UserError(
+                f"line {number} of {path} is damaged ({error}): mend it, or remove the file, of which "
+                "nothing but the log is lost."
+            ) from error
+        found.append((line, told))
+    return found
 
 
 def _has_room(folder: Path) -> bool:

@@ -142,7 +142,8 @@ def explain_command(
     printer = console()
     earned = numbers["return_of_optimal_policy"]
     printer.print(
-        f"The bandit's optimal policy earns {earned['value']:.1f} in {place} ({episodes} episodes)."
+        f"The bandit's optimal policy earns {earned['value']:.1f} in {place} "
+        f"({episodes} episode{'s' * (episodes > 1)})."
     )
     for name, share in sorted(numbers["importance"].items(), key=lambda item: -item[1]):
         printer.print(f"  {share:6.1%} of the reward's variance, alone or with others: {name}")

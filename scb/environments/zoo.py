@@ -143,6 +143,11 @@ def save_bandit(
       UserError: weights of other shapes than the environment's; a "T" whose evaluation environment would not come
         back the same.
     """
+    if not isinstance(synthetic, SyntheticBandit | SyntheticMDP):
+        raise UserError(
+            f"something of the class {type(synthetic).__name__} is no bandit: give save_bandit the path, the bandit or "
+            "synthetic MDP, and its weights."
+        )
     if not isinstance(weights, Mapping):
         raise UserError(
             f"the weights of {synthetic.name} are of the class {type(weights).__name__}: give a dict of arrays, as the "

@@ -8,6 +8,7 @@ import pytest
 from experiments import transfer_study as module
 from experiments.searches import meta_training
 from lpo.objectives import load_objective
+from scb.errors import UserError
 from scb.statistics import estimate
 
 
@@ -99,6 +100,9 @@ def test_what_an_earlier_search_found_is_measured_again(tmp_path, monkeypatch, r
         module, "_earned", lambda objective, place, at, _: asked.append(at.name) or np.zeros(2)
     )
     monkeypatch.setattr(module, "REFERENCES", ())
+    for wrong, message in ((-1,), "a seed is -1"), ((), "no seeds: give at least one"):
+        with pytest.raises(UserError, match=message):
+            module.Options(meta_seeds=wrong)
     options = module.Options(variations=("default",), meta_seeds=(0, 1))
     for part in module.parts(options, report):
         part.add(part.measured(), report)

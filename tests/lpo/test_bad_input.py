@@ -69,7 +69,7 @@ def test_an_unknown_name_is_answered_by_near_ones(refused, arguments, message):
         ("train --seeds 0", "seeds is 0: it must be at least 1"),
         ("evaluate --seeds -1", "seeds is -1: it must be at least 1"),
         ("train --seed -1", "seed is -1: it must be 0 or larger"),
-        ("train --seed 4294967296", "a seed is 4294967296"),
+        ("train --seed 4294967296", "seed is 4294967296"),
     ],
 )
 def test_a_number_out_of_range_is_told_its_range(refused, arguments, message):
@@ -109,6 +109,11 @@ def test_a_number_out_of_range_is_told_its_range(refused, arguments, message):
         ),
         ("align --contexts 0", "contexts is 0: it must be at least 1."),
         ("evaluate --objectives", "no objectives: give at least one"),
+        ("train --environment=", "unknown environment ''"),
+        ("evaluate --environment=", "unknown environment ''"),
+        ("evaluate --seeds 99999999999", "seeds is 99999999999: it must be below 2^32"),
+        ("evaluate --steps 99999999999999999999", "it must be below 2^32"),
+        ("evaluate --hyperparameters num_envs=99999999999", "num_envs is 99999999999: it must be"),
         ("evaluate --objectives ppo ppo", "objective 'ppo' is there twice"),
         ("run --objective ppo", "'ppo', which every run is compared with anyway"),
         ("certify missing.npz", "missing.npz does not exist"),
@@ -214,7 +219,7 @@ def interrupted(working_folder, monkeypatch, capsys) -> Path:
     arguments = ["--population-size", "4", "--reward-noise", "2", "--out", "started"]
     assert cli.main(["meta-train", *arguments]) == 130
     error = capsys.readouterr().err
-    assert error == "lpo: interrupted; a run with checkpoints continues with --resume.\n"
+    assert error == "lpo: interrupted; a run with --out continues with --resume.\n"
     return working_folder / "started"
 
 

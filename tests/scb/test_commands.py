@@ -15,6 +15,7 @@ import jax
 import numpy as np
 import pytest
 from gymnax.environments import spaces
+from jax.errors import JaxRuntimeError
 
 from scb import artefacts, judgement, listing
 from scb.cli import main
@@ -590,6 +591,14 @@ def test_an_interruption_is_exit_code_130(monkeypatch, bandit_file):
     result = call("train", "--bandit", bandit_file)
     assert result.code == 130
     assert result.err == "scb: interrupted; a run with --out continues with --resume.\n"
+
+    def exhausted(*_, **__):
+        raise JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory allocating 8 bytes.")
+
+    monkeypatch.setattr("scb.commands.judge", exhausted)
+    result = call("train", "--bandit", bandit_file)
+    assert result.code == 1
+    assert "Out of memory allocating 8 bytes): take fewer agents" in result.err
     # What has no --resume does not speak of it.
     monkeypatch.setattr("scb.listing.list_command", interrupt)
     result = call("list")

@@ -256,6 +256,21 @@ def test_a_line_that_is_damaged_before_the_last_is_told_and_nothing_dropped(run,
     assert (run.folder / "metrics.jsonl").read_text() == written
 
 
+def test_a_log_that_is_damaged_is_told_wherever_it_is_read(run):
+    for generation in range(3):
+        run.log(generation, {"fitness/mean": 1.0}, 2.0)
+    paths = [run.folder / name for name in ("metrics.jsonl", "timing.jsonl")]
+    for path in paths:
+        path.write_bytes(path.read_bytes()[:-9])  # as a kill leaves it
+    assert [told["generation"] for told in run.metrics()] == [0, 1]
+    assert run.seconds() == 4.0
+    for path in paths:
+        path.write_bytes(b"\xff\xfe" + path.read_bytes())
+    for read in (run.metrics, run.seconds, lambda: run.rewind(3)):
+        with pytest.raises(UserError, match=r"line 1 of .*\.jsonl is damaged"):
+            read()
+
+
 def test_rewinding_a_run_without_logs_is_nothing(run):
     run.rewind(0)
     assert not (run.folder / "metrics.jsonl").exists()

@@ -92,6 +92,10 @@ def test_what_could_not_be_loaded_is_not_saved(tmp_path):
     other = BANDITS["discrete"].init_weights(jax.random.key(0))
     with pytest.raises(UserError, match=r"array 'reward/Dense_0/kernel' .* is expected"):
         save_bandit(path, BANDITS["box"], other)
+    with pytest.raises(
+        UserError, match="something of the class dict is no bandit: give save_bandit"
+    ):
+        save_bandit(path, other, BANDITS["box"])
     with pytest.raises(UserError, match="the arrays are a ndarray: give a dictionary of them"):
         artefacts.save(path, np.zeros(420), METADATA)
     assert not path.exists()
