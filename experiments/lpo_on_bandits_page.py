@@ -59,7 +59,10 @@ def claims(report: Report) -> list[Claim]:
         evidence = paired(curves[name], curves["ppo"], "final") if name in curves else None
         if callable(evidence):
             evidence = evidence().without_interval()
-        text, reason = f"Hopper: {name} ends no lower than PPO", "a twentieth of PPO's mean return"
+        text, reason = (
+            f"Hopper: {name} ends no lower than PPO, on the same seeds",
+            "a twentieth of PPO's mean return",
+        )
         found.append(Claim(text, evidence, 0.0, margin, reason, places=0))
     return found
 

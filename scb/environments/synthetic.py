@@ -306,8 +306,20 @@ class SyntheticBandit(SyntheticEnvironment[BanditState, BanditParams]):
 
 
 def encode_action(action: ArrayLike, space: spaces.Box | spaces.Discrete) -> jax.Array:
-    """An action as networks take it: [A], a discrete one one-hot, a continuous one clipped to its bounds."""
+    """An action as networks take it: [A], a discrete one one-hot, a continuous one clipped to its bounds.
+
+    Raises:
+      UserError: a discrete one is no number, or, where it is not traced, none of the space's.
+    """
     if isinstance(space, spaces.Discrete):
+        if jnp.shape(action) != ():
+            raise UserError(
+                f"the action has shape {jnp.shape(action)}: a discrete one is a number, of shape ()."
+            )
+        if not isinstance(action, jax.core.Tracer) and action not in range(space.n):
+            raise UserError(
+                f"the action is {action}: it must be a whole number from 0 to {space.n - 1}."
+            )
         return jax.nn.one_hot(action, action_size(space))
     return jnp.reshape(jnp.clip(jnp.asarray(action), space.low, space.high), (action_size(space),))
 

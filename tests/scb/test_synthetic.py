@@ -15,6 +15,7 @@ from scb.environments.synthetic import (
     BanditState,
     SyntheticBandit,
     bandit_for,
+    encode_action,
 )
 from scb.errors import UserError
 from tests.scb.probes import context_bandit
@@ -82,6 +83,21 @@ def test_a_discrete_action_enters_the_reward_one_hot():
             mlp(params.weights["reward"], inputs, "tanh")[0],
             rtol=1e-5,
         )
+
+
+@pytest.mark.parametrize(
+    ("action", "message"),
+    [
+        (jnp.zeros(1, int), r"the action has shape \(1,\): a discrete one is a number"),
+        (3, "the action is 3: it must be a whole number from 0 to 2"),
+        (jnp.int32(-1), "the action is -1: it must be"),
+        (0.5, "the action is 0.5: it must be"),
+    ],
+)
+def test_a_discrete_action_that_is_none_is_refused(action, message):
+    with pytest.raises(UserError, match=message):
+        encode_action(action, spaces.Discrete(3))
+    np.testing.assert_array_equal(encode_action(np.int64(2), spaces.Discrete(3)), [0, 0, 1])
 
 
 def test_a_continuous_action_beyond_its_bounds_is_the_action_at_the_bound():
