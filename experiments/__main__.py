@@ -14,6 +14,7 @@ import pkgutil
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, cast
 
@@ -22,6 +23,7 @@ import tyro
 from experiments import claims, harness, rendering
 from experiments.harness import DATA, DOCS, Experiment, Files
 from scb import termination
+from scb.cli import INTERRUPTED
 from scb.errors import UserError, unknown_name
 from scb.files import make_folder
 
@@ -134,10 +136,14 @@ def main(argv: Sequence[str] | None = None) -> int:
         prog="python -m experiments",
         description=__doc__,
     )
-    if arguments.list:
-        print(listing())
-        return 0
-    return harness.exit_status("experiments", lambda: _all(arguments))
+    return harness.exit_status(
+        "experiments", lambda: _listed() if arguments.list else _all(arguments)
+    )
+
+
+def _listed() -> int:
+    print(listing())
+    return 0
 
 
 def _all(arguments: All) -> int:
@@ -157,11 +163,10 @@ def _all(arguments: All) -> int:
         print(f"{experiment.name} ...{note}", flush=True)
         files = Files(out, arguments.docs, arguments.only_render or kept)
         options = experiment.options(arguments.preset)
-        try:
-            failed |= bool(experiment.run(options, files))
-        except UserError as error:  # the others are not its fault
-            print(f"{experiment.name}: {error}", file=sys.stderr)
-            failed = True
+        status = harness.exit_status(experiment.name, partial(experiment.run, options, files))
+        if status == INTERRUPTED:
+            return status
+        failed |= bool(status)  # the others are not its fault
     (arguments.docs / "experiments.md").write_text(overview(experiments, arguments.data))
     print(f"written: {arguments.docs / 'experiments.md'}")
     return 2 if failed else 0

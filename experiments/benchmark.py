@@ -23,6 +23,7 @@ project deals its population out to them, rejax leaves that to XLA.
 """
 
 import json
+import os
 import subprocess
 import sys
 import tempfile
@@ -250,11 +251,13 @@ class Options:
     """some of them, comma-separated"""
     steps: int = STEPS
 
+    def __post_init__(self) -> None:
+        if self.rejax_python is not None and not os.access(self.rejax_python, os.X_OK):
+            raise UserError(f"{self.rejax_python} is no program: give another --rejax-python.")
+
 
 def measure(options: Options, report: dict[str, Any], save: Save) -> None:
     """An algorithm at a time, here and there."""
-    if options.rejax_python is not None and not options.rejax_python.exists():
-        raise UserError(f"{options.rejax_python} is not there: give another --rejax-python.")
     names = options.algorithms.split(",")
     for name in names:
         one_of("algorithm", name, TASKS)

@@ -41,7 +41,7 @@ CLASSIC_CONTROL = tuple(sorted(families()["classic"].suite))
 DATA = Path("docs/data")
 DOCS = Path("docs")
 PLANS = Path(__file__).with_name("plans")
-# Of what is interrupted.
+# How what is interrupted goes on.
 AGAIN = "the same command measures what its report lacks."
 Save = Callable[[], None]
 Report = Mapping[str, Any]

@@ -224,9 +224,9 @@ def elsewhere(
     failed: dict[Part, str] = {}
 
     def cancel() -> str:
-        for job in running.values():
-            job.cancel()
-        return f"its {len(running)} jobs are cancelled, and the same command measures what its report lacks."
+        for job in list(running.values()):
+            job.cancel(check=False)  # one that has ended by itself is no reason to leave the others
+        return "its jobs are cancelled"
 
     try:
         with termination.saving(cancel):
@@ -234,10 +234,12 @@ def elsewhere(
                 while executor and waiting and len(running) < jobs.jobs:
                     part = waiting.pop(0)
                     kept[part].with_suffix(".error").unlink(missing_ok=True)
-                    running[part] = executor.submit(Measurement(part, kept[part]))
+                    with termination.writing:  # none is submitted that `cancel` does not know
+                        running[part] = executor.submit(Measurement(part, kept[part]))
                     tell(f"{part.name}: job {running[part].job_id}")
                 for part in [part for part, job in running.items() if job.done()]:
-                    job = running.pop(part)
+                    with termination.writing:
+                        job = running.pop(part)
                     if not taken(part):
                         said = kept[part].with_suffix(".error")
                         failed[part] = said.read_text() if said.exists() else "its job left nothing"

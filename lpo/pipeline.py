@@ -36,7 +36,7 @@ from scb.rows import Rows
 from scb.runs import Run, Stopwatch, config_dict
 from scb.seeds import reporting
 
-REFERENCES = ("ppo", "dpo")
+REFERENCES = ("ppo", "dpo")  # that every run is compared with
 
 
 @dataclass(frozen=True)
@@ -184,8 +184,8 @@ def _with_references(objective: Objective) -> list[Objective]:
     references = [load_objective(name) for name in REFERENCES]
     if objective.name in REFERENCES:
         raise UserError(
-            f"--objective is {objective.name!r}, which every run is compared with anyway: give another, or leave it "
-            "out to learn one."
+            f"--objective is named {objective.name!r}, as one that every run is compared with anyway: give another, "
+            "under another name, or leave it out to learn one."
         )
     return [*references, objective]
 

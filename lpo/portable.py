@@ -174,9 +174,8 @@ def _evaluate(
         progress = 0.0
     # A tensor's or a traced array's values are not looked at: that would wait for a device.
     inside = True
-    if isinstance(
-        progress, int | float
-    ):  # apart, for torch.compile cannot follow a branch on an array
+    # A number apart, for torch.compile cannot follow a branch on an array.
+    if isinstance(progress, int | float):
         inside = 0 <= progress <= 1
     elif isinstance(progress, list | tuple | np.generic | np.ndarray):
         inside = bool(np.all((np.asarray(progress) >= 0) & (np.asarray(progress) <= 1)))

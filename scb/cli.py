@@ -13,6 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+INTERRUPTED = 130  # the exit code, as shells have it
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
 
 
@@ -62,7 +63,8 @@ def run_program(
     again = ""
     if isinstance(command, type) and issubclass(command, LongRun):
         again = "a run with --out continues with --resume."
-    termination.goes_on(again)
+    if arguments is None:
+        termination.goes_on(again)
     status = exit_code(program, lambda: call(program, description, known, given), again)
     if arguments is None:
         processes.end(status)
@@ -78,7 +80,7 @@ def exit_code(program: str, act: Callable[[], int | None], again: str = "") -> i
     """
     from jax.errors import JaxRuntimeError
 
-    from scb.errors import UserError, first_line
+    from scb.errors import UserError
     from scb.processes import LostProcess
 
     def tell(*parts: str) -> None:
@@ -99,11 +101,9 @@ def exit_code(program: str, act: Callable[[], int | None], again: str = "") -> i
     except (MemoryError, JaxRuntimeError) as error:
         if isinstance(error, JaxRuntimeError) and "RESOURCE_EXHAUSTED" not in str(error):
             raise
-        reason = first_line(error).rstrip(".")
+        reason = f" ({str(error).rstrip('.')})" if str(error) else ""
         tell(
-            f"out of memory ({reason}): take fewer agents, candidates, episodes or environments at a "
-            f"time{'' if again else '.'}",
-            again,
+            f"out of memory{reason}: begin anew with fewer agents, candidates, episodes or environments."
         )
         return 1
     except OSError as error:
@@ -114,7 +114,7 @@ def exit_code(program: str, act: Callable[[], int | None], again: str = "") -> i
         return 1
     except KeyboardInterrupt:
         tell(f"interrupted{'' if again else '.'}", again)
-        return 130
+        return INTERRUPTED
     return status or 0
 
 

@@ -36,10 +36,16 @@ def text(
     Args:
       spaced: of several words, which may stand in quotes, as a command writes them itself, or not.
     """
+
+    def instance(words: list[str]) -> T:
+        if not words:
+            raise UserError(f"a flag that takes {metavar} has no value: give one, or leave it out.")
+        return read(" ".join(words))
+
     return PrimitiveConstructorSpec(
         nargs="*" if spaced else 1,
         metavar=metavar,
-        instance_from_str=lambda words: read(" ".join(words)),
+        instance_from_str=instance,
         is_instance=lambda value: True,
         str_from_instance=lambda value: [write(value)],
     )

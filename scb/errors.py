@@ -17,12 +17,14 @@ class UserError(Exception):
 def at_least(minimum: int, of: object = None, *names: str, **values: float | None) -> None:
     """Raises a UserError where a value, or an attribute `of` something by these names, is smaller or not finite.
 
-    None is neither.
+    So does a whole number that JAX does not count to, of 2^31 or more; a seed, which may be larger, is checked where
+    it is used. None is nothing of this.
     """
     allowed = f"at least {minimum}" if minimum else "0 or larger"
     _check(lambda value: minimum <= value < math.inf, allowed, of, names, values)
-    # What JAX counts with; beyond it a computation would overflow, or never end.
-    _check(lambda value: value < 2**32, "below 2^32", of, names, values)
+    for name, value in numbers(of, *names, **values).items():
+        if isinstance(value, int) and value >= 2**31 and name != "seed":
+            raise UserError(f"{name} is {value}: it must be {allowed}, and below 2^31.")
 
 
 def positive(of: object = None, *names: str, **values: float | None) -> None:

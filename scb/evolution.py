@@ -356,10 +356,7 @@ def evolve(
             if generation > saved:
                 checkpoints.save(generation, kept)
                 saved = generation
-        return (
-            f"{run.folder} is saved after {generation} generations, and goes on from there: with --resume, or in "
-            "Python by the call that began it."
-        )
+        return f"{run.folder} is saved after {generation} generations"
 
     evaluate = map_population(problem.evaluate, config.population_size, (0, None, None))
     steps = evaluated(problem, config, first)

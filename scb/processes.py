@@ -73,7 +73,7 @@ def start(given: Mapping[str, str], environment: Mapping[str, str] = os.environ)
         return
     if given and settings["process_id"] == 0 and settings["num_processes"] > 1:
         others = settings["num_processes"] - 1
-        print(f"process 0 waits for {others} more at {given['coordinator']}", file=sys.stderr)
+        print(f"process 0 waits for {others} more at {given['coordinator']} ...", file=sys.stderr)
     # Else the others are killed with a stack trace, before they can say a sentence.
     jax.config.update("jax_enable_recoverability", True)
     try:

@@ -28,6 +28,7 @@ from tensorboardX.proto.event_pb2 import Event, SessionLog
 from tensorboardX.record_writer import RecordWriter
 from tensorboardX.summary import scalar
 
+from scb import termination
 from scb.errors import UserError
 from scb.files import cannot_write, make_folder, plain, write_json, write_text
 from scb.machine import machine_description
@@ -165,8 +166,8 @@ class Run:
     def seconds(self) -> float:
         """Wall-clock seconds of all logged generations, over every resumption."""
         path = self.folder / "timing.jsonl"
-        lines = _logged(path) if path.exists() else []
-        return float(sum(told.get("seconds", 0.0) for _, told in lines))
+        lines = _logged(path, "seconds") if path.exists() else []
+        return float(sum(told["seconds"] for _, told in lines))
 
     def end_log(self) -> None:
         """Closes what generations are logged to; the folder stays this process's."""
@@ -183,24 +184,34 @@ class Run:
         _release(self.folder / _LOCK)
 
 
-def _logged(path: Path) -> list[tuple[str, dict[str, Any]]]:
+def _logged(path: Path, *needed: str) -> list[tuple[str, dict[str, Any]]]:
     """The lines of a log, as they stand there and as they are read, without the half one that a kill left at its end.
+
+    Args:
+      needed: what each line has beside its generation.
 
     Raises:
       UserError: another line is damaged.
     """
     found, lines = [], path.read_text(errors="replace").splitlines()
     for number, line in enumerate(lines, 1):
+        reason = ""
         try:
-            told = dict(json.loads(line))
-            int(told["generation"])
-        except (ValueError, KeyError, TypeError) as error:
+            told = json.loads(line)
+        except ValueError as error:
             if number == len(lines):
                 break
+            reason = str(error)
+        else:
+            if not isinstance(told, dict) or type(told.get("generation")) is not int:
+                reason = "it is of no generation"
+            elif lacking := [name for name in needed if name not in told]:
+                reason = f"it lacks {', '.join(lacking)}"
+        if reason:
             raise UserError(
-                f"line {number} of {path} is damaged ({error}): mend it, or remove the file, of which "
+                f"line {number} of {path} is damaged ({reason}): mend it, or remove the file, of which "
                 "nothing but the log is lost."
-            ) from error
+            )
         found.append((line, told))
     return found
 
@@ -235,10 +246,16 @@ def held(path: Path) -> Iterator[None]:
     """Within it a file is this process's; a UserError where it is another's. A lock stands beside it meanwhile."""
     lock = path.with_name(f".{path.name}{_LOCK}")
     _lock(lock, path)
-    try:
-        yield
-    finally:
+
+    def remove() -> str:
         lock.unlink(missing_ok=True)
+        return ""
+
+    try:
+        with termination.saving(remove):
+            yield
+    finally:
+        remove()
         _release(lock)
 
 

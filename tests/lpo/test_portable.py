@@ -333,6 +333,13 @@ class TestTorch:
         with pytest.raises(UserError, match="same shape"):
             torch_loss("ppo")(torch.zeros(5), torch.zeros(5, 1), 0.0)
 
+    @pytest.mark.parametrize("objective", ["ppo", "ta-lpo"])
+    def test_a_loss_is_one_graph_of_torch_compile(self, torch, objective):
+        loss = torch_loss(objective)
+        compiled = torch.compile(loss, backend="eager", fullgraph=True)
+        given = torch.linspace(-1, 1, 5), torch.linspace(1, -2, 5), torch.tensor(0.3)
+        assert torch.allclose(compiled(*given), loss(*given))
+
     @pytest.mark.parametrize("wrong", ["log_ratio", "advantage"])
     def test_an_array_of_numpys_is_no_tensor(self, torch, wrong, one_sentence):
         given = {"log_ratio": torch.zeros(5), "advantage": torch.zeros(5), wrong: np.zeros(5)}

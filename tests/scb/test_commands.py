@@ -591,15 +591,27 @@ def test_an_interruption_is_exit_code_130(monkeypatch, bandit_file):
     result = call("train", "--bandit", bandit_file)
     assert result.code == 130
     assert result.err == "scb: interrupted; a run with --out continues with --resume.\n"
+    # What has no --resume does not speak of it.
+    monkeypatch.setattr("scb.listing.list_command", interrupt)
+    result = call("list")
+    assert (result.code, result.err) == (130, "scb: interrupted.\n")
 
+
+def test_out_of_memory_is_a_sentence(monkeypatch, bandit_file):
     def exhausted(*_, **__):
         raise JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory allocating 8 bytes.")
 
     monkeypatch.setattr("scb.commands.judge", exhausted)
     result = call("train", "--bandit", bandit_file)
     assert result.code == 1
-    assert "Out of memory allocating 8 bytes): take fewer agents" in result.err
-    # What has no --resume does not speak of it.
-    monkeypatch.setattr("scb.listing.list_command", interrupt)
-    result = call("list")
-    assert (result.code, result.err) == (130, "scb: interrupted.\n")
+    assert result.err == (
+        "scb: out of memory (RESOURCE_EXHAUSTED: Out of memory allocating 8 bytes): begin anew with fewer agents, "
+        "candidates, episodes or environments.\n"
+    )
+
+    def another(*_, **__):
+        raise JaxRuntimeError("INTERNAL: a bug")
+
+    monkeypatch.setattr("scb.commands.judge", another)
+    with pytest.raises(JaxRuntimeError):
+        call("train", "--bandit", bandit_file)

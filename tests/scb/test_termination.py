@@ -77,6 +77,7 @@ def end():
     os.kill(os.getpid(), signal.{how})
 
 termination.watch("search")
+termination.goes_on("the same call goes on.")
 threading.Thread(target=end, daemon=True).start()
 search()
 time.sleep(60)
@@ -90,8 +91,7 @@ time.sleep(60)
     # The search goes on while it is saved; what it logs then is computed again.
     assert 19 <= step <= logged and step % CONFIG.checkpoint_every
     assert said == (
-        f"search: {words}; {folder} is saved after {step} generations, and goes on from there: with --resume, "
-        "or in Python by the call that began it.\n"
+        f"search: {words}; {folder} is saved after {step} generations; the same call goes on.\n"
     )
     assert fingerprint(folder, resume=True) == whole
 
@@ -105,7 +105,7 @@ from scb import termination
 termination.watch("long")
 spin = jax.jit(lambda x: jax.lax.while_loop(lambda x: x > 0, lambda x: x + 1, x))
 spin.lower(1.0).compile()
-with termination.saving(lambda: "saved."), termination.saving(lambda: 1 / 0):
+with termination.saving(lambda: "saved"), termination.saving(lambda: 1 / 0):
     print("ready", flush=True)
     spin(1.0).block_until_ready()
 """
@@ -115,7 +115,7 @@ with termination.saving(lambda: "saved."), termination.saving(lambda: 1 / 0):
     _, said = process.communicate(timeout=30)
     assert process.returncode == 143
     assert said == (
-        "long: told to end; saved. what was done since the last checkpoint is lost (division by zero).\n"
+        "long: told to end; saved; what was done since the last checkpoint is lost (division by zero).\n"
     )
 
 

@@ -1,0 +1,149 @@
+"""How long a training an objective bears: on its bandit, from a quarter to eight times as long as where it was learned.
+
+    python -m experiments horizons
+
+Agents train on the Pendulum bandit as they do where objectives are learned, and are judged there, for as many batches
+as the inner loop has and for fewer and more; the same agents with every objective, and with PPO's clip.
+"""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import jax
+import numpy as np
+from matplotlib.figure import Figure
+
+from experiments.harness import Experiment, Report, packed, settled, unpacked
+from experiments.parts import InParts, Part
+from lpo import figures
+from lpo.inner_loop import MetaTrainingConfig, TaskTraining
+from lpo.objectives import Objective, load_objective, zoo_names
+from scb import plotting
+from scb.environments.zoo import bandit_metadata
+from scb.errors import UserError, at_least
+from scb.keys import named_key, root_key
+from scb.statistics import Estimate, estimate
+
+TASK = "Synthetic-Pendulum-v1"
+REFERENCE = "ppo"
+SEED = 1  # nothing is chosen by it
+
+
+@dataclass(frozen=True)
+class Options:
+    """Which objectives, and how long trainings."""
+
+    objectives: tuple[str, ...] = ("dpo", *zoo_names())
+    """beside PPO's clip"""
+    horizons: tuple[float, ...] = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
+    """lengths, in trainings of the search"""
+    agents: int = 64
+    """of each objective, for every length"""
+
+    def __post_init__(self) -> None:
+        at_least(10, self, "agents")
+        if not self.horizons or min(self.horizons) <= 0:
+            raise UserError(f"the horizons are {self.horizons}: give positive numbers.")
+
+
+def measured(name: str, options: Options) -> dict[str, Any]:
+    """{horizon: what each agent earns}, in standard deviations of the bandit's reward, and whose weights these were."""
+    objective = load_objective(name)
+    config = MetaTrainingConfig(drift=objective.drift, horizons=options.horizons)
+    task = TaskTraining(config, TASK)
+    scale = float(task.env.reward_scale(task.env_params, named_key(root_key(SEED), "scale")))
+    key = named_key(root_key(SEED), "horizons")
+    earned = jax.jit(lambda of, horizon: task.fitness(of, key, options.agents, horizon))
+    found = {}
+    for horizon in options.horizons:
+        returns = np.asarray(earned(objective.parameters, horizon)) / scale
+        found[f"{horizon:g}"] = packed([returns])[0]
+    digests = {"sha256": bandit_metadata(TASK)["sha256"], "objective_sha256": _digest(objective)}
+    return {**digests, "returns": found}
+
+
+def _digest(objective: Objective) -> str:
+    return str(objective.metadata.get("sha256", ""))
+
+
+def parts(options: Options, report: dict[str, Any]) -> Iterator[Part]:
+    """An objective at a time."""
+    settled(report, agents=options.agents, horizons=list(options.horizons))
+    entries = report.setdefault("objectives", {})
+    for name in dict.fromkeys((REFERENCE, *options.objectives)):
+        if name in entries and entries[name]["objective_sha256"] != _digest(load_objective(name)):
+            del entries[name]  # of another of this name
+        yield Part(("objectives", name), partial(measured, name, options))
+
+
+measure = InParts(parts)
+
+
+def leads(report: Report) -> dict[str, dict[str, Estimate]]:
+    """{objective: {horizon: how much more its agents earn than with PPO's clip}}, corrected for all together."""
+    returns = {
+        name: {h: unpacked([line])[0] for h, line in entry["returns"].items()}
+        for name, entry in report["objectives"].items()
+    }
+    reference = returns.pop(REFERENCE)
+    comparisons = sum(map(len, returns.values()))
+    return {
+        name: {
+            h: estimate(x - reference[h], np.mean, 1 - 0.05 / comparisons) for h, x in of_it.items()
+        }
+        for name, of_it in returns.items()
+    }
+
+
+def facts(report: Report) -> dict[str, Any]:
+    """The leads, and for which lengths each objective is shown ahead of the clip, or behind it."""
+    found = leads(report)
+    batches = TaskTraining(MetaTrainingConfig(), TASK).spec.config.num_iterations
+    known = {name: load_objective(name) for name in found}
+    learned = {
+        name: o.metadata.get("config", {}).get("meta_training", {}).get("horizons") or [1.0]
+        for name, o in known.items()
+        if o.learned_on
+    }
+    sides = {
+        name: {
+            "ahead": [h for h, x in of_it.items() if x.low is not None and x.low > 0],
+            "behind": [h for h, x in of_it.items() if x.high is not None and x.high < 0],
+        }
+        for name, of_it in found.items()
+    }
+    return {"leads": found, "sides": sides, "learned": learned, "batches": batches}
+
+
+def draw(report: Mapping[str, Any]) -> Figure:
+    """Each objective's lead over the clip against how long its agents trained."""
+    figure = Figure(figsize=(7, 4))
+    axes = figure.subplots()
+    found = leads(report)
+    looks = figures.looks(list(found))
+    for name, of_it in found.items():
+        look, lengths = looks[name], [float(h) for h in of_it]
+        plotting.estimate_curve(
+            axes, lengths, list(of_it.values()), look.color, look.linestyle, name, look.marker
+        )
+    axes.axhline(0, color=plotting.GREY, linewidth=1)
+    axes.set_xscale("log", base=2)
+    ticks = report["horizons"]
+    axes.set_xticks(ticks, [f"{x:g}" for x in ticks])
+    axes.set(xlabel="length of the training, in trainings of the search")
+    axes.set_ylabel("more than with PPO's clip,\nin deviations of the reward")
+    axes.legend(fontsize=8)
+    return figure
+
+
+EXPERIMENT = Experiment(
+    "horizons",
+    "How long a training do learned objectives bear?",
+    measure,
+    draw,
+    facts=facts,
+    options=Options,
+    keys=("objectives",),
+)
