@@ -599,7 +599,7 @@ def test_an_interruption_is_exit_code_130(monkeypatch, bandit_file):
 
 def test_out_of_memory_is_a_sentence(monkeypatch, bandit_file):
     def exhausted(*_, **__):
-        raise JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory allocating 8 bytes.")
+        raise JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory allocating 8 bytes.\nA table.")
 
     monkeypatch.setattr("scb.commands.judge", exhausted)
     result = call("train", "--bandit", bandit_file)

@@ -145,9 +145,12 @@ def test_a_rescaled_curriculum_reaches_its_end_within_the_search(name):
         (("constant", 1, 2, 0, 1), "cannot go from 1 to 2"),
         (
             ("linear", 1, 2**31, 0, 1),
-            "the curriculum's final length is 2147483648: it must be below",
+            "the curriculum's final length is 2147483648: it must be at least 1, and below 2^31",
         ),
-        (("linear", 1, 2, 0, 2**31), "the curriculum's transition is 2147483648: it must be below"),
+        (
+            ("linear", 1, 2, 0, 2**31),
+            "the curriculum's transition is 2147483648: it must be at least 1, and below 2^31",
+        ),
     ],
 )
 def test_a_curriculum_that_cannot_be_is_refused(arguments, message):
