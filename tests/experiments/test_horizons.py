@@ -36,7 +36,7 @@ def test_leads_are_of_the_same_agents(report):
 def test_the_page_says_who_is_ahead_and_from_where_on_not(report):
     page = module.EXPERIMENT.page(report)
     assert "ahead at every length are dpo; behind are ta-lpo at 8 times the length" in page
-    assert "| ta-lpo | +1.00 [" in page and "| 0.25, 0.5, 1 and 2 |" in page
+    assert "| ta-lpo | +1.00 [" in page and "0.25, 0.5, 1 and 2 (ta-lpo) |" in page
     (axes,) = module.EXPERIMENT.figures(report)["horizons"].axes
     assert axes.get_legend_handles_labels()[1] == ["dpo", "ta-lpo"]
 
