@@ -306,7 +306,7 @@ def read(path: Path, missing_is_new: bool = False, keys: Iterable[str] = ()) -> 
             raise ValueError("it is no JSON object")
         if lacking := [key for key in keys if key not in report]:
             raise ValueError(f"it lacks {', '.join(lacking)}")
-    except (OSError, TypeError, ValueError) as error:
+    except (OSError, ValueError) as error:
         raise UserError(
             f"{path} is no report of this command ({error}): measure first, or choose another --out."
         ) from error

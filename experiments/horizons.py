@@ -15,6 +15,7 @@ import jax
 import numpy as np
 from matplotlib.figure import Figure
 
+from experiments.claims import CONFIDENCE
 from experiments.harness import Experiment, Report, packed, settled, unpacked
 from experiments.parts import InParts, Part
 from lpo import figures
@@ -88,11 +89,9 @@ def leads(report: Report) -> dict[str, dict[str, Estimate]]:
         for name, entry in report["objectives"].items()
     }
     reference = returns.pop(REFERENCE)
-    comparisons = sum(map(len, returns.values()))
+    confidence = 1.0 - (1.0 - CONFIDENCE) / sum(map(len, returns.values()))
     return {
-        name: {
-            h: estimate(x - reference[h], np.mean, 1 - 0.05 / comparisons) for h, x in of_it.items()
-        }
+        name: {h: estimate(x - reference[h], np.mean, confidence) for h, x in of_it.items()}
         for name, of_it in returns.items()
     }
 

@@ -103,7 +103,7 @@ class BanditDiscovery:
     def search(self, run: Run | None = None, quiet: bool = False) -> Outcome:
         """Evolves; in a run's folder the fit is kept, so that a resumed one need not look for an expert again."""
         self._folder, self._quiet = None if run is None else run.folder, quiet
-        # Where it is no number, neither will be what most agents earn.
+        # First: where it is no number, neither is what an expert or most agents earn.
         environment_spec(self.config.environment).random_return(self.config.backend)
         return evolve(self, self.config.evolution, run, quiet)
 

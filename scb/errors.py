@@ -22,9 +22,6 @@ def at_least(minimum: int, of: object = None, *names: str, **values: float | Non
     """
     allowed = f"at least {minimum}" if minimum else "0 or larger"
     _check(lambda value: minimum <= value < math.inf, allowed, of, names, values)
-    for name, value in numbers(of, *names, **values).items():
-        if isinstance(value, int) and value >= 2**31 and name != "seed":
-            raise UserError(f"{name} is {value}: it must be {allowed}, and below 2^31.")
 
 
 def positive(of: object = None, *names: str, **values: float | None) -> None:
@@ -43,6 +40,8 @@ def _check(
         if value is not None and not holds(value):
             finite = ", and finite" if isinstance(value, float) else ""
             raise UserError(f"{name} is {value}: it must be {allowed}{finite}.")
+        if isinstance(value, int) and value >= 2**31 and name != "seed":
+            raise UserError(f"{name} is {value}: it must be {allowed}, and below 2^31.")
 
 
 def numbers(of: object = None, *names: str, **values: Any) -> dict[str, Any]:

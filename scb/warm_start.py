@@ -262,9 +262,8 @@ def warm_start(
             earned, _ = pupils(fit(dataset, key_fit)[0], key_agents)
             return earned, steps + pupils.steps
 
-    # First, for where it is no number there is nothing to be found.
-    random = environment_spec(place.name).random_return(place.backend)
     expert = find_expert(place, key_expert, config, quiet, worth, folder)
+    random = environment_spec(place.name).random_return(place.backend)
     if not expert.mean_return >= random:  # of a simulation that breaks down it is no number
         raise UserError(
             f"the expert of {place.name} earns {expert.mean_return:.4g} and random actions {random:.4g}: give it more "
