@@ -7,7 +7,6 @@ each, bound to a core each as far as there are cores. Then by itself what is not
 what candidates are worth, and the search's own arithmetic, which each of them does. Nothing else should run beside it.
 """
 
-import json
 import math
 import os
 import socket
@@ -32,7 +31,7 @@ from scb.discovery import BanditDiscovery, DiscoveryConfig
 from scb.errors import UserError, at_least
 from scb.evolution import EvolutionConfig
 from scb.keys import root_key
-from scb.runs import Stopwatch
+from scb.runs import Stopwatch, log_lines
 from scb.strategies import strategy_for
 
 # The strategies' work by the number of candidates; the largest is a thousand devices' with sixteen each.
@@ -90,8 +89,8 @@ def _generations(number: int, options: Options) -> list[float]:
         code = "import sys; from lpo.cli import main; sys.exit(main())"
         words = [f"--{name}={value}" for name, value in flags.items()]
         together(number, [code, "meta-train", *words])
-        lines = (Path(folder) / "run" / "timing.jsonl").read_text().splitlines()
-    return [round(json.loads(line)["seconds"], 3) for line in lines[1:-1]]
+        lines = log_lines(Path(folder) / "run" / "timing.jsonl", "seconds")
+    return [round(line["seconds"], 3) for line in lines[1:-1]]
 
 
 def _gathering(number: int, options: Options) -> float:

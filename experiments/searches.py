@@ -1,6 +1,5 @@
 """Discoveries that experiments compare: each in a run folder of its own, so that a killed one goes on."""
 
-import json
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -20,7 +19,7 @@ from scb.curriculum import CurriculumConfig, paper_curriculum
 from scb.discovery import DiscoveryConfig, discover
 from scb.errors import UserError
 from scb.evolution import EvolutionConfig
-from scb.runs import released
+from scb.runs import log_lines, released
 from scb.statistics import Estimate, Statistic, estimate, stratified_estimate
 
 NONE = "none"  # the curriculum that is none
@@ -97,15 +96,15 @@ def searched_curve(config: DiscoveryConfig, folder: str | Path) -> dict[str, Any
 
 
 def read_log(folder: Path) -> tuple[list[dict[str, Any]], list[float]]:
-    """What a run folder's log says of each generation, and its seconds; of a run in progress up to a cut line."""
-    metrics, timing = _lines(folder / "metrics.jsonl"), _lines(folder / "timing.jsonl")
+    """What a run's folder logs of each generation, and its seconds; of a run in progress, where it has both."""
+    metrics, timing = log_lines(folder / "metrics.jsonl"), _timing(folder)
     number = min(len(metrics), len(timing))  # one is written before the other
     return metrics[:number], [line["seconds"] for line in timing[:number]]
 
 
 def machines(folder: Path) -> list[dict[str, Any]]:
     """Where a run folder's generations were computed, in turn; empty where its log is older than that it says so."""
-    return each_once(x["machine"] for x in _lines(folder / "timing.jsonl") if "machine" in x)
+    return each_once(x["machine"] for x in _timing(folder) if "machine" in x)
 
 
 def ran_on(curves: Iterable[Mapping[str, Any]], report: Report) -> list[dict[str, Any]]:
@@ -128,17 +127,8 @@ def each_once(found: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
     return once
 
 
-def _lines(path: Path) -> list[dict[str, Any]]:
-    rows: list[dict[str, Any]] = []
-    for line in path.read_text().splitlines() if path.exists() else []:
-        try:
-            row = json.loads(line)
-        except json.JSONDecodeError:
-            break
-        if row.get("generation") != len(rows):
-            break
-        rows.append(row)
-    return rows
+def _timing(folder: Path) -> list[dict[str, Any]]:
+    return log_lines(folder / "timing.jsonl", "seconds")
 
 
 def judgements(metrics: Sequence[Mapping[str, Any]]) -> list[tuple[int, dict[str, Any]]]:

@@ -160,14 +160,12 @@ class Run:
 
     def metrics(self) -> list[dict[str, Any]]:
         """All logged generations, oldest first."""
-        path = self.folder / "metrics.jsonl"
-        return [told for _, told in _logged(path)] if path.exists() else []
+        return log_lines(self.folder / "metrics.jsonl")
 
     def seconds(self) -> float:
         """Wall-clock seconds of all logged generations, over every resumption."""
-        path = self.folder / "timing.jsonl"
-        lines = _logged(path, "seconds") if path.exists() else []
-        return float(sum(told["seconds"] for _, told in lines))
+        lines = log_lines(self.folder / "timing.jsonl", "seconds")
+        return float(sum(line["seconds"] for line in lines))
 
     def end_log(self) -> None:
         """Closes what generations are logged to; the folder stays this process's."""
@@ -184,8 +182,10 @@ class Run:
         _release(self.folder / _LOCK)
 
 
-def _logged(path: Path, *needed: str) -> list[tuple[str, dict[str, Any]]]:
-    """The lines of a log, as they stand there and as they are read, without the half one that a kill left at its end.
+def log_lines(path: Path, *needed: str) -> list[dict[str, Any]]:
+    """What a run's metrics.jsonl or timing.jsonl says of each generation, oldest first; nothing where it is not there.
+
+    The half line that a kill left at its end is left out.
 
     Args:
       needed: what each line has beside its generation.
@@ -193,6 +193,11 @@ def _logged(path: Path, *needed: str) -> list[tuple[str, dict[str, Any]]]:
     Raises:
       UserError: another line is damaged.
     """
+    return [told for _, told in _logged(path, *needed)] if path.exists() else []
+
+
+def _logged(path: Path, *needed: str) -> list[tuple[str, dict[str, Any]]]:
+    """The same, of a log that is there: its lines as they stand there, and as they are read."""
     found, lines = [], path.read_text(errors="replace").splitlines()
     for number, line in enumerate(lines, 1):
         reason = ""
