@@ -73,8 +73,10 @@ def parts(options: Options, report: dict[str, Any]) -> Iterator[Part]:
     """An objective at a time."""
     settled(report, agents=options.agents, horizons=list(options.horizons))
     entries = report.setdefault("objectives", {})
-    for name in dict.fromkeys((REFERENCE, *options.objectives)):
-        if name in entries and entries[name]["objective_sha256"] != _digest(load_objective(name)):
+    # All of them before the first is measured.
+    named = {name: load_objective(name) for name in (REFERENCE, *options.objectives)}
+    for name, objective in named.items():
+        if name in entries and entries[name]["objective_sha256"] != _digest(objective):
             del entries[name]  # of another of this name
         yield Part(("objectives", name), partial(measured, name, options))
 

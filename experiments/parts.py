@@ -9,9 +9,11 @@ was: a part that was found is not measured again, and a part that is being measu
 import fcntl
 import hashlib
 import json
+import os
 import re
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, TypeVar
@@ -205,9 +207,9 @@ def elsewhere(
     Raises:
       UserError: some of them failed; what the others found is in the report.
     """
-    make_folder(folder)
     # Two that stand in one place are one: its job would only wait for the other's.
     named = {part.name: part for part in parts if not part.there(report)}
+    make_folder(folder)
     kept = {part: folder / f"{_digest(part, settings)}.json" for part in named.values()}
 
     def taken(part: Part) -> bool:
@@ -219,7 +221,12 @@ def elsewhere(
         return part.there(report)
 
     waiting = [part for part in kept if not taken(part)]
-    executor = jobs.executor_in(folder / "jobs") if waiting else None
+    try:
+        executor = jobs.executor_in(folder / "jobs") if waiting else None
+    except UserError:
+        with suppress(OSError):  # results of an earlier start stay
+            folder.rmdir()
+        raise
     running: dict[Part, submitit.Job[None]] = {}
     failed: dict[Part, str] = {}
 
@@ -234,7 +241,8 @@ def elsewhere(
                 while executor and waiting and len(running) < jobs.jobs:
                     part = waiting.pop(0)
                     kept[part].with_suffix(".error").unlink(missing_ok=True)
-                    with termination.writing:  # none is submitted that `cancel` does not know
+                    # None is submitted that `cancel` does not know.
+                    with termination.writing, _told_apart(folder / "jobs" / "ended.err"):
                         running[part] = executor.submit(Measurement(part, kept[part]))
                     tell(f"{part.name}: job {running[part].job_id}")
                 for part in [part for part, job in running.items() if job.done()]:
@@ -255,6 +263,20 @@ def elsewhere(
             f"{len(failed)} of {len(kept)} parts were not measured, {part.name} among them ({reason.rstrip('.')}): "
             f"the .err files in {folder / 'jobs'} say more, and the same command tries again."
         )
+
+
+@contextmanager
+def _told_apart(path: Path) -> Iterator[None]:
+    """Has processes that start here say in a file, and not on the terminal, how they were interrupted."""
+    kept = os.dup(2)
+    path.parent.mkdir(exist_ok=True)
+    try:
+        with path.open("ab") as file:
+            os.dup2(file.fileno(), 2)
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
 
 
 def _digest(part: Part, settings: str) -> str:

@@ -7,7 +7,7 @@ their weights are: of those the slope beside ratio 1 is what is judged.
 """
 
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +15,9 @@ import numpy as np
 
 from lpo.drifts.contract import Drift
 from scb.agents.ppo import MAX_LOG_RATIO
+
+if TYPE_CHECKING:
+    from lpo.objectives import Objective
 
 # As much as the advantages of a minibatch of 1000 correlate with any direction by chance, 1 / sqrt(1000).
 LARGEST_KINK = 0.03
@@ -83,24 +86,29 @@ class Certificate:
 
 
 def certify(
-    drift: Drift, parameters: Any, num_ratios: int = 2001, num_advantages: int = 401
+    drift: "Drift | Objective",
+    parameters: Any = None,
+    num_ratios: int = 2001,
+    num_advantages: int = 401,
 ) -> Certificate:
     """Evaluates a drift on a grid of ratios and advantages, and its slope around ratio 1.
 
     Args:
-      drift: any member of the contract.
-      parameters: its parameters.
+      drift: any member of the contract; an objective brings its parameters.
+      parameters: the drift's.
       num_ratios: points of log-ratio, in [-3, 3] and, a quarter as many, out to the bound that
         training clips at.
       num_advantages: points of advantage in [-10, 10], the tails of a normalised minibatch.
     """
+    if not isinstance(drift, Drift):
+        return certify(drift.drift, drift.parameters, num_ratios, num_advantages)
     inner = np.linspace(-3.0, 3.0, num_ratios | 1)
     outer = np.linspace(-MAX_LOG_RATIO, MAX_LOG_RATIO, (num_ratios // 4) | 1)
     log_ratios = jnp.asarray(np.union1d(inner, outer), jnp.float32)
     advantages = jnp.linspace(-10.0, 10.0, num_advantages | 1)
-    by_construction = getattr(drift, "always_holds", False)
+    by_construction = drift.always_holds
     # Most drifts are the same at every fraction of the training.
-    progress_values = np.linspace(0, 1, FRACTIONS if getattr(drift, "temporal", True) else 1)
+    progress_values = np.linspace(0, 1, FRACTIONS if drift.temporal else 1)
     # The whole grid, which takes long, tells of a drift by construction whether its weights are finite, and no more.
     on_whole_grid = progress_values[:: FRACTIONS // 2] if by_construction else progress_values
 

@@ -72,7 +72,7 @@ class MetaTrain(LongRun):
 
     Attributes:
       preset: quick (30 generations of 32) or paper (512 of 64); single flags override it.
-      family: what is learned: network, or another family of drifts that learns.
+      family: what is learned: network, mirror, or package.module:Class of one's own.
     """
 
     program = "lpo meta-train"
@@ -92,7 +92,12 @@ class MetaTrain(LongRun):
     def decided(cls, config: MetaTrainingConfig) -> dict[str, str]:
         temporal = {"temporal": ""} if config.drift.temporal else {}
         validate = {"validate": ""} if config.validation else {}
-        return {"tasks": ",".join(config.tasks), "drift": config.drift.name, **temporal, **validate}
+        return {
+            "tasks": ",".join(config.tasks),
+            "drift": config.drift.family(),
+            **temporal,
+            **validate,
+        }
 
     def growing(self) -> Collection[str]:
         return GENERATIONS

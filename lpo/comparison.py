@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from lpo.objectives import Objective, load_apart
+from lpo.objectives import Named, load_apart
 from scb.agents.ppo import DIAGNOSIS
 from scb.agents.spec import AgentSpec, environment_agent
 from scb.environments.registry import environment_spec
@@ -229,7 +229,7 @@ def _values(spec: AgentSpec) -> dict[str, Any]:
 
 def compare(
     environment: str,
-    objectives: Sequence[Objective | str | Path],
+    objectives: Sequence[Named],
     seeds: Sequence[int],
     spec: AgentSpec | None = None,
     backend: str | None = None,
@@ -304,7 +304,7 @@ def compare(
 
 
 def learning_curves(
-    environment: str, objective: Objective | str | Path, seeds: Sequence[int], **arguments: Any
+    environment: str, objective: Named, seeds: Sequence[int], **arguments: Any
 ) -> LearningCurves:
     """`compare` with a single objective."""
     (curves,) = compare(environment, [objective], seeds, **arguments).curves

@@ -17,7 +17,6 @@ from scb.agents.agent import evaluated_after
 from scb.agents.ppo import PPOConfig, PPOHyperparameters
 from scb.agents.spec import AgentSpec, check_lists, environment_agent
 from scb.command_line import listed, numbers, text
-from scb.environments.custom import own_code
 from scb.environments.registry import check_backend, environment_spec
 from scb.environments.zoo import bandit_metadata
 from scb.errors import UserError, at_least, of_classes, one_of, positive, unused
@@ -25,6 +24,7 @@ from scb.evolution import EnvironmentSteps, EvolutionConfig
 from scb.keys import named_key, root_key, split_key
 from scb.lists import read_values, write_values
 from scb.measurement import Judge, spaced, train_and_judge
+from scb.own import code_of, module_code
 
 _OF_BANDITS = ("contexts", "reward_noise")
 POINTS = 5  # of the curve that the area is under
@@ -182,8 +182,8 @@ class MetaTrainingConfig:
         }
 
     def checksums(self) -> dict[str, str]:
-        """The same, and of the code of environments of one's own."""
-        return self.weights() | own_code({*self.tasks, *self.homes})
+        """The same, and of the code of environments and drifts of one's own."""
+        return self.weights() | module_code({*self.tasks, *self.homes}) | code_of(self.drift)
 
     def at_home(self) -> "MetaTrainingConfig":
         """The same on the tasks' evaluation environments themselves."""

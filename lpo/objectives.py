@@ -1,18 +1,19 @@
 """Objectives by name or file: PPO's clip, DPO, no drift, the learned ones of the zoo, and formulas."""
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
 
 from lpo.certificate import Certificate, certify
 from lpo.drifts import ClipDrift, DPODrift, Drift, NoDrift, drift_from_config
-from scb import artefacts
+from lpo.drifts.surrogate import SurrogateDrift
+from scb import artefacts, own
 from scb.environments.registry import environment_spec
 from scb.errors import UserError
 from scb.keys import root_key
@@ -22,12 +23,12 @@ KNOWN: dict[str, Drift] = {"ppo": ClipDrift(), "dpo": DPODrift(), "none": NoDrif
 CLIPS = ("ppo-0.1", "ppo", "ppo-0.3", "ppo-0.5", "ppo-1")  # among which a tuned one is looked for
 _SUGGESTED = tuple(dict.fromkeys((*KNOWN, *CLIPS, "dpo-4-1.2")))  # to who mistypes a name
 _ZOO = Path(__file__).parent / "zoo"
-_NUMBER = r"(\d*\.?\d+)"
+_NUMBER = r"(\d*\.?\d+(?:e-?\d+)?)"
 _CLIP_NAME = re.compile(f"ppo-{_NUMBER}$")
 _DPO_NAME = re.compile(f"dpo-{_NUMBER}-{_NUMBER}$")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)  # parameters are arrays: `same_drift` compares
 class Objective:
     """A drift with its parameters: what `scb.PPO` and its hyperparameters take.
 
@@ -37,12 +38,26 @@ class Objective:
         parameters say which it is.
       parameters: traced, passed as `PPOHyperparameters.drift`.
       metadata: of a learned objective, what its artefact says.
+
+    Raises:
+      UserError: the drift is of no family.
     """
 
     name: str
     drift: Drift
     parameters: Any
     metadata: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.drift, Drift):
+            raise UserError(
+                f"the drift of the objective {self.name} is of the class {type(self.drift).__name__}: give an "
+                "lpo.Drift, or a function of ratio and advantage to lpo.load_objective."
+            )
+
+    def __repr__(self) -> str:
+        sizes = [x.size for x in jax.tree.leaves(self.parameters) if hasattr(x, "size")]
+        return f"Objective({self.name!r}, {self.drift!r}, {sum(sizes)} parameters)"
 
     @property
     def learned_on(self) -> tuple[str, ...]:
@@ -66,21 +81,44 @@ def zoo_names() -> list[str]:
     return artefacts.names_in(_ZOO)
 
 
-def load_objective(name: "str | Path | Objective") -> Objective:
-    """An objective by name ("ppo", "ppo-0.3", "dpo", "dpo-4-1.2", "none", a zoo name) or file (path.npz, or path).
+Named: TypeAlias = "str | Path | Objective | Drift | Callable[..., Any]"
 
-    The number after PPO is its clip, those after DPO its alpha and beta. An objective is itself.
+
+def load_objective(name: Named) -> Objective:
+    """An objective by name, from a file, or of one's own.
+
+    Args:
+      name: one of
+        "ppo", "ppo-0.3" (its clip), "dpo", "dpo-4-1.2" (its alpha and beta), "none", or a name of the zoo;
+        a file: path.npz, or path;
+        "package.module:attribute", of a module that Python finds from here, of any of the following;
+        a function of ratio, advantage, and what else `SurrogateDrift` names, which returns what PPO is to maximise;
+        an `lpo.Drift`, or its class, with the parameters that it starts with; an `Objective` is itself.
 
     Raises:
       UserError: unknown name (with near matches), a file that is no learned objective, or something else.
     """
     if isinstance(name, Objective):
         return name
+    if isinstance(name, type) and issubclass(name, Drift):
+        name = name()
+    if isinstance(name, Drift):
+        return closed_form(name.name, name)
+    if callable(name):
+        return closed_form(getattr(name, "__name__", "surrogate"), SurrogateDrift(name))
     if not isinstance(name, str | Path):
         raise UserError(
-            f"something of the class {type(name).__name__} is no objective: give a name, a file, or "
-            "lpo.Objective(name, drift, parameters)."
+            f"something of the class {type(name).__name__} is no objective: give a name, a file, a function of ratio "
+            "and advantage, or lpo.Objective(name, drift, parameters)."
         )
+    if own.is_own(str(name)):
+        mine = own.imported(str(name), "objective", "function")
+        if isinstance(mine, str | Path):
+            raise UserError(
+                f"objective {str(name)!r} is a {type(mine).__name__}: give a function of ratio and advantage, an "
+                "lpo.Drift, or an lpo.Objective."
+            )
+        return replace(load_objective(mine), name=str(name))
     text = str(name)
     if text in KNOWN:
         return closed_form(text, KNOWN[text])
@@ -108,7 +146,7 @@ def same_drift(one: Objective, other: Objective) -> bool:
     )
 
 
-def load_apart(names: Iterable[str | Path | Objective]) -> list[Objective]:
+def load_apart(names: Iterable[Named]) -> list[Objective]:
     """Objectives by what `load_objective` takes, with names of their own.
 
     Files of one name go by what was typed.
@@ -116,14 +154,14 @@ def load_apart(names: Iterable[str | Path | Objective]) -> list[Objective]:
     Raises:
       UserError: as for `load_objective`, or one stands there twice.
     """
-    if isinstance(names, str | Path | Objective):
+    if isinstance(names, str | Path | Objective | Drift) or callable(names):
         raise UserError("the objectives are a single one: give a list of them.")
     names = list(names)
     loaded = [load_objective(name) for name in names]
     known = [objective.name for objective in loaded]
     loaded = [
         objective
-        if known.count(objective.name) == 1 or isinstance(typed, Objective)
+        if known.count(objective.name) == 1 or not isinstance(typed, str | Path)
         else replace(objective, name=str(typed))
         for objective, typed in zip(loaded, names, strict=True)
     ]
@@ -201,8 +239,8 @@ def save_objective(
     told = drift.with_parameters(parameters)
     if told != drift:  # trained on: what its text says now is what is saved
         drift, parameters = told, told.init(root_key(0))
-    own = artefacts.Artefact(drift.name, parameters, {"kind": KIND})
-    artefacts.expect_shapes(own, drift.shapes())
+    held = artefacts.Artefact(drift.name, parameters, {"kind": KIND})
+    artefacts.expect_shapes(held, drift.shapes())
     certificate = certify(drift, parameters)
     config = {**metadata.get("config", {}), "drift": drift.to_config()}
     full = {**metadata, "kind": KIND, "config": config, "certificate": certificate.as_dict()}

@@ -11,7 +11,6 @@ at ±`MAX_LOG_RATIO`, and advantages that the caller has normalised over the min
 import importlib
 from collections.abc import Callable, Mapping
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import jax
@@ -20,7 +19,7 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from lpo.drifts import Drift
-from lpo.objectives import Objective, load_objective
+from lpo.objectives import Named, Objective, load_objective
 from scb.agents.ppo import MAX_LOG_RATIO
 from scb.errors import UserError
 
@@ -31,7 +30,7 @@ if TYPE_CHECKING:
 
 
 def drift_function(
-    objective: Objective | str | Path,
+    objective: Named,
 ) -> Callable[..., jax.Array]:
     """The drift of an objective, its parameters filled in, for JAX: pure, to be jitted and differentiated.
 
@@ -55,7 +54,7 @@ def drift_function(
 
 
 def numpy_drift(
-    objective: Objective | str | Path,
+    objective: Named,
 ) -> Callable[..., np.ndarray]:
     """The drift of an objective for NumPy; arguments and errors as for `drift_function`.
 
@@ -68,7 +67,7 @@ def numpy_drift(
     return partial(_in_numpy, objective.drift, _host_parameters(objective))
 
 
-def torch_drift(objective: Objective | str | Path) -> "TorchFunction":
+def torch_drift(objective: Named) -> "TorchFunction":
     """The drift of an objective for PyTorch, differentiable; arguments and errors as for `drift_function`.
 
     It takes tensors and computes in log_ratio's type and on its device.
@@ -79,7 +78,7 @@ def torch_drift(objective: Objective | str | Path) -> "TorchFunction":
     return _for_torch(_in_torch, objective)
 
 
-def torch_loss(objective: Objective | str | Path) -> "TorchFunction":
+def torch_loss(objective: Named) -> "TorchFunction":
     """What takes the place of PPO's policy loss in PyTorch: the mean of drift - ratio * advantage, to be minimised.
 
     Arguments and errors as for `torch_drift`; what is returned gives a scalar. The gradient of a
@@ -93,7 +92,7 @@ def _policy_loss(xp: Any, penalty: Any, log_ratio: Any, advantage: Any) -> Any:
     return (penalty - ratio * advantage).mean()
 
 
-def _for_torch(function: "TorchFunction", objective: Objective | str | Path) -> "TorchFunction":
+def _for_torch(function: "TorchFunction", objective: Named) -> "TorchFunction":
     try:
         importlib.import_module("torch")
     except ImportError as error:
@@ -126,6 +125,8 @@ def _in_torch(
                 f"{name} is no tensor of PyTorch but of the class {type(value).__name__}: give a tensor, such as "
                 "torch.as_tensor makes, or use lpo.numpy_drift or lpo.drift_function."
             )
+    if not log_ratio.is_floating_point():  # which would cut the advantage's decimals off
+        log_ratio = log_ratio.to(advantage if advantage.is_floating_point() else torch.float32)
     return _evaluate(torch, drift, parameters, log_ratio, advantage.to(log_ratio), progress)
 
 
@@ -135,7 +136,7 @@ def _loss_in_torch(
     penalty = _in_torch(drift, parameters, log_ratio, advantage, progress)
     import torch
 
-    return _policy_loss(torch, penalty, log_ratio, advantage.to(log_ratio))
+    return _policy_loss(torch, penalty, log_ratio.to(penalty), advantage.to(penalty))
 
 
 def _converted(

@@ -10,7 +10,6 @@ from scb.agents.spec import ALGORITHMS
 from scb.agents.tables import Lists, Values
 from scb.command_line import GENERATIONS, listed, text
 from scb.curriculum import CurriculumConfig, read_curriculum
-from scb.environments.custom import own_code
 from scb.environments.synthetic import BanditConfig
 from scb.environments.synthetic_mdp import PARAMETERIZATIONS
 from scb.environments.zoo import bandit_metadata
@@ -18,6 +17,7 @@ from scb.errors import UserError, at_least, of_classes, one_of, positive, unused
 from scb.evolution import EvolutionConfig
 from scb.fitting import check_linear
 from scb.lists import read_configs, read_lists, write_lists
+from scb.own import module_code
 from scb.refinement import RefinementConfig
 from scb.strategies import REMEMBERING
 from scb.warm_start import WarmStartConfig
@@ -120,7 +120,7 @@ class DiscoveryConfig:
     def checksums(self) -> dict[str, str]:
         """{name: SHA-256} of what a name does not tell: a bandit that it starts from, an environment of one's own."""
         start = {} if self.start is None else {self.start: bandit_metadata(self.start)["sha256"]}
-        return start | own_code([self.environment])
+        return start | module_code([self.environment])
 
     @property
     def fitted(self) -> bool:

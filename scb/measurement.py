@@ -20,7 +20,6 @@ from jax.typing import ArrayLike
 
 from scb.agents.agent import Agent, evaluated_after
 from scb.agents.spec import AgentSpec
-from scb.environments.custom import own_code
 from scb.environments.registry import environment_spec
 from scb.errors import UserError, at_least, one_of
 from scb.evaluation import Episodes
@@ -29,6 +28,7 @@ from scb.files import plain
 from scb.keys import root_key, split_key
 from scb.machine import package_versions
 from scb.objectives import Objective, programs_for
+from scb.own import code_of, module_code
 from scb.rows import Row, Rows
 
 MODE, SAMPLED = "mode", "sampled"
@@ -191,7 +191,7 @@ def check_seeds(seeds: Sequence[int]) -> list[int]:
       UserError: there are none, one is no whole number of 32 bits, or is there twice.
     """
     given: object = seeds
-    if not isinstance(given, Sequence | np.ndarray) or isinstance(given, str):
+    if not isinstance(given, Sequence | np.ndarray | jax.Array) or isinstance(given, str):
         raise UserError(f"the seeds are {given!r}: give a list, such as [0, 1] or range(10).")
     if not len(seeds):
         raise UserError("no seeds: give at least one.")
@@ -250,6 +250,12 @@ def measure(
     Raises:
       UserError: the rows hold such agents measured under another configuration.
     """
+    given: object = spec
+    if not isinstance(given, AgentSpec):
+        raise UserError(
+            f"the spec is of the class {type(given).__name__}: give what scb.environment_agent returns, with_values of "
+            "yours."
+        )
     at_least(1, points=points, episodes=episodes, side_by_side=side_by_side)
     actions = (actions,) if isinstance(actions, str) else actions
     for kind in actions:
@@ -279,7 +285,7 @@ def measure(
         "trained_in": params[0],
         "judged_in": params[1],
         "physics": train_in.backend,
-        "code": own_code([train_in.name, judge_in.name]),
+        "code": module_code([train_in.name, judge_in.name]),
         # Drawn agents share the values of lists out: of another number each has others.
         "drawn": len(agents.names) if agents.drawn else None,
         "points": points,
@@ -292,7 +298,7 @@ def measure(
     cells = {
         name: rows.cell(
             columns | {"objective": name},
-            configuration | {"objective": objective and (objective.drift, objective.parameters)},
+            configuration | {"objective": objective and _told(objective)},
             len(steps) * len(actions),
         )
         for name, objective in named.items()
@@ -348,6 +354,12 @@ def measure(
             done = sum(agents.names[i] in cells[name].done for name, i in wanted)
             tell(f"{', '.join([judge_in.name, *parameters])}: {done} of {len(wanted)} agents")
     return [row for cell in cells.values() for one in agents.names for row in cell.done[one]]
+
+
+def _told(objective: Objective) -> tuple[Any, ...]:
+    """What tells an objective from others of its name."""
+    code = code_of(objective.drift)
+    return (objective.drift, objective.parameters, *([code] if code else []))
 
 
 def _program_of(

@@ -5,8 +5,9 @@ inside the mirror-learning framework (Kuba et al., 2022), whose members all impr
 PPO maximises `mean(ratio * advantage - f)`. PPO's clip, DPO's closed form and what was learned are
 members of one contract, so that a training loop cannot tell them apart.
 
-A new family is a module with a subclass of `Drift`, and its line in `DRIFTS`. Files, `lpo meta-train
---drift NAME`, certificates and the forms in NumPy and PyTorch follow from that.
+A new family is a subclass of `Drift`, with its line in `DRIFTS` or in somebody's own module, whose family is named
+`package.module:Class`. Files, `lpo meta-train --drift NAME`, certificates and the forms in NumPy and PyTorch follow
+from that.
 """
 
 from collections.abc import Mapping
@@ -17,6 +18,7 @@ from lpo.drifts.formula import ClosedFormDrift
 from lpo.drifts.known import ClipDrift, DPODrift, NoDrift
 from lpo.drifts.mirror import MirrorDrift
 from lpo.drifts.network import LearnedDrift
+from scb import own
 from scb.errors import UserError, one_of
 
 DRIFTS: dict[str, type[Drift]] = {
@@ -32,17 +34,42 @@ DRIFTS: dict[str, type[Drift]] = {
 }
 
 
+def own_family(name: str) -> type[Drift]:
+    """Somebody's own family by `package.module:Class`.
+
+    Raises:
+      UserError: it cannot be imported, or is none.
+    """
+    found = own.imported(name, "drift", "Class")
+    if not (isinstance(found, type) and issubclass(found, Drift)):
+        kind = found.__name__ if isinstance(found, type) else type(found).__name__
+        raise UserError(f"the drift {name} is a {kind}: it must be a subclass of lpo.Drift.")
+    settings = vars(found).get("__dataclass_params__")
+    if settings is None or not settings.frozen:
+        raise UserError(
+            f"the drift {name} is no frozen dataclass, as which programs are told apart: write "
+            "@dataclasses.dataclass(frozen=True) above it."
+        )
+    return found
+
+
 def learned_drift(name: str, **settings: Any) -> Drift:
     """A drift that meta-training can evolve, by its family's name.
 
     Args:
-      name: of a family in `DRIFTS` that is `learned`.
+      name: of a family in `DRIFTS` that is `learned`, or of one's own (`own_family`).
       settings: of its fields, which are its flags on the command line; the rest keep their defaults.
 
     Raises:
       UserError: the family is unknown, does not learn, or has no such setting.
     """
     learned = {family: drift for family, drift in DRIFTS.items() if drift.learned}
+    if own.is_own(name):
+        learned[name] = own_family(name)
+        if not learned[name].learned:
+            raise UserError(
+                f"the drift {name} does not learn: give its class learned = True, and parameters to init."
+            )
     one_of("learned drift", name, learned)
     for setting in settings:
         if setting not in learned[name].settings():
@@ -61,5 +88,7 @@ def drift_from_config(config: Mapping[str, Any]) -> Drift:
       UserError: an unknown family, or numbers that make no drift.
     """
     name = config["family"]
+    if own.is_own(name):
+        return own_family(name).from_config(config)
     one_of("drift", name, DRIFTS)
     return DRIFTS[name].from_config(config)

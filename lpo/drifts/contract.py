@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lpo.drifts.bases import BASES
+from scb import own
 from scb.agents.ppo import relu
 from scb.errors import at_least, one_of, positive
 from scb.keys import root_key
@@ -23,7 +24,7 @@ class Drift(ABC):
     """A family of drifts: a frozen dataclass, which is static, and parameters, traced, so that a population vmaps.
 
     Attributes:
-      name: of the family, in files and after `--drift`. The dataclass's fields are its settings.
+      name: of the family; a subclass's own name where it says none. The dataclass's fields are its settings.
       learned: whether `lpo meta-train` evolves it.
       always_holds: whether the conditions of mirror learning hold by construction, whatever the
         parameters are, as long as they are finite.
@@ -32,6 +33,10 @@ class Drift(ABC):
     name: ClassVar[str]
     learned: ClassVar[bool] = False
     always_holds: ClassVar[bool] = False
+
+    def __init_subclass__(cls) -> None:
+        if not hasattr(cls, "name"):
+            cls.name = cls.__name__
 
     @property
     def temporal(self) -> bool:
@@ -66,8 +71,17 @@ class Drift(ABC):
         """
 
     def to_config(self) -> dict[str, Any]:
-        """What a file says of it: the family and its settings."""
-        return {"family": self.name, **asdict(self)}  # type: ignore[call-overload]
+        """What a file says of it: the family and its settings.
+
+        Raises:
+          UserError: one's own family, which no import finds.
+        """
+        return {"family": self.family(), **asdict(self)}  # type: ignore[call-overload]
+
+    @classmethod
+    def family(cls) -> str:
+        """Its name in files and after `--drift`: package.module:Class of one's own."""
+        return cls.name if cls.__module__.startswith("lpo.") else own.reference(cls, "drift")
 
     @classmethod
     def from_config(cls, config: Mapping[str, Any]) -> Self:

@@ -1,26 +1,17 @@
 """Environments that are in no registry: `package.module:factory`, imported when one is made."""
 
-import ast
-import contextlib
-import hashlib
-import importlib
 import inspect
-import re
-import sys
-from collections.abc import Iterable, Sequence
-from pathlib import Path
-from types import ModuleType
+from collections.abc import Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 from gymnax.environments import environment, spaces
 
+from scb import own
 from scb.environments.spec import Family, Made
 from scb.errors import UserError, first_line
 from scb.keys import root_key
-
-_NAME = re.compile(r"[^\W\d][\w.]*:[^\W\d]\w*")
 
 
 class CustomFamily(Family):
@@ -35,17 +26,10 @@ class CustomFamily(Family):
         return ()
 
     def owns(self, name: str) -> bool:
-        return _NAME.fullmatch(name) is not None
+        return own.is_own(name)
 
     def make(self, name: str, **arguments: Any) -> Made:
-        try:
-            function = getattr(_module(name), name.partition(":")[2])
-        # Whatever a module does that is not ours.
-        except Exception as error:
-            raise UserError(
-                f"environment {name!r} cannot be imported ({error}): give package.module:factory, of a module that "
-                "Python finds from here."
-            ) from error
+        function = own.imported(name, "environment", "factory")
         if isinstance(function, environment.Environment) and not arguments:
             made: Any = function
         elif not callable(function):
@@ -72,27 +56,6 @@ class CustomFamily(Family):
         params = env.default_params if params is None else params
         _check(name, env, params)
         return env, params
-
-
-def _module(name: str) -> ModuleType:
-    here = str(Path.cwd())
-    if here not in sys.path:
-        sys.path.append(here)
-    return importlib.import_module(name.partition(":")[0])
-
-
-def own_code(names: Iterable[str]) -> dict[str, str]:
-    """{name: SHA-256} of environments of one's own: of what the factory's module says, without comments and layout.
-
-    What that module imports does not count, nor one without source.
-    """
-    found = {}
-    for name in filter(CustomFamily().owns, names):
-        # A module that cannot be imported is told of where the environment is made.
-        with contextlib.suppress(Exception):
-            said = ast.unparse(ast.parse(inspect.getsource(_module(name))))
-            found[name] = hashlib.sha256(said.encode()).hexdigest()
-    return found
 
 
 def _check(name: str, env: environment.Environment[Any, Any], params: Any) -> None:

@@ -16,12 +16,14 @@ GRID = {"num_ratios": 61, "num_advantages": 11}
 
 
 @dataclass(frozen=True)
-class Formula:
+class Formula(Drift):
     """A drift by formula: (log ratio, advantage, progress) -> penalty."""
+
+    temporal = True
 
     formula: Callable[[jax.Array, jax.Array, jax.Array], jax.Array]
 
-    def init(self, key: jax.Array) -> Any:
+    def init(self, key: jax.Array, scale: float = 1.0) -> Any:
         return ()
 
     def __call__(self, parameters, log_ratio, advantage, progress):
@@ -149,10 +151,10 @@ def test_a_certificate_says_on_which_grid():
 
 
 def test_the_kink_is_the_rise_of_the_penalty_around_ratio_one():
-    class Absolute:
+    class Absolute(Drift):
         """Half of |log r|, for every advantage."""
 
-        def init(self, key):
+        def init(self, key, scale=1.0):
             return jnp.zeros(())
 
         def __call__(self, parameters, log_ratio, advantage, progress):

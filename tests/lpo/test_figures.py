@@ -14,6 +14,7 @@ from matplotlib.collections import FillBetweenPolyCollection, QuadMesh
 
 from lpo import drift_figures, figures, search_figures
 from lpo.comparison import LearningCurves
+from lpo.drifts import Drift
 from lpo.inner_loop import MetaTrainingConfig
 from lpo.objectives import Objective, load_objective
 from lpo.update_regions import surface
@@ -62,13 +63,11 @@ def meshes(figure):
 
 
 @dataclass(frozen=True)
-class SpikeDrift:
+class SpikeDrift(Drift):
     """Nothing but one enormous corner."""
 
-    def init(self, key: jax.Array) -> Any:
+    def init(self, key: jax.Array, scale: float = 1.0) -> Any:
         return jnp.zeros(())
-
-    temporal = False
 
     def __call__(self, parameters, log_ratio, advantage, progress):
         return jnp.where((log_ratio > jnp.log(1.79)) & (advantage > 2.9), 1000.0, 0.0)

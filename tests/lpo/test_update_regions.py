@@ -12,7 +12,7 @@ from matplotlib.collections import QuadMesh
 
 from experiments import understanding
 from lpo import drift_figures
-from lpo.drifts import LearnedDrift
+from lpo.drifts import Drift, LearnedDrift
 from lpo.objectives import Objective, load_objective
 from lpo.update_regions import REGIONS, Analysis, analyze, classify, midpoints, surface
 from scb.errors import UserError
@@ -23,12 +23,12 @@ GRID = {"log_ratios": np.log(RATIOS), "advantages": np.array([-1.0, 1.0])}
 
 
 @dataclass(frozen=True)
-class Formula:
+class Formula(Drift):
     """A drift by formula: (log ratio, advantage, progress) -> penalty."""
 
     formula: Callable[..., jax.Array]
 
-    def init(self, key: jax.Array) -> Any:
+    def init(self, key: jax.Array, scale: float = 1.0) -> Any:
         return ()
 
     def __call__(self, parameters, log_ratio, advantage, progress):

@@ -9,7 +9,7 @@ from lpo.comparison import compare, ppo_spec
 from lpo.inner_loop import MetaTrainingConfig
 from scb.cli import main
 from scb.discovery import BanditDiscovery, DiscoveryConfig
-from scb.environments.custom import own_code
+from scb.own import module_code
 from scb.environments.registry import check_backend, environment_spec, make
 from scb.environments.zoo import bandit_metadata
 from scb.errors import UserError
@@ -143,9 +143,9 @@ def test_the_code_of_an_environment_counts_and_its_comments_do_not(tmp_path, mon
         names, (MODULE, "# Mine.\n" + MODULE, MODULE + "number = 4"), strict=True
     ):
         (tmp_path / f"{name}.py").write_text(said)
-    one, same, other = (own_code([f"{x}:alone", "Pendulum-v1"])[f"{x}:alone"] for x in names)
+    one, same, other = (module_code([f"{x}:alone", "Pendulum-v1"])[f"{x}:alone"] for x in names)
     assert one == same != other
-    assert own_code(["Pendulum-v1", "nowhere.at_all:make", "C:/nothing"]) == {}
+    assert module_code(["Pendulum-v1", "nowhere.at_all:make", "C:/nothing"]) == {}
 
 
 def test_what_was_begun_with_other_code_does_not_go_on(module, tmp_path, monkeypatch):
@@ -159,7 +159,7 @@ def test_what_was_begun_with_other_code_does_not_go_on(module, tmp_path, monkeyp
         return compare(name, ["ppo"], seeds, spec, points=1, episodes=1, rows=tmp_path / "a.jsonl")
 
     rows([0])
-    monkeypatch.setattr("scb.measurement.own_code", lambda names: dict.fromkeys(names, "other"))
+    monkeypatch.setattr("scb.measurement.module_code", lambda names: dict.fromkeys(names, "other"))
     with pytest.raises(UserError, match="under another configuration"):
         rows([0, 1])
 

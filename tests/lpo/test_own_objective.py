@@ -1,0 +1,241 @@
+"""Objectives of one's own: functions of ratio and advantage, and families of drifts, by object and by name."""
+
+import importlib
+import sys
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import lpo
+import scb
+from lpo import cli
+from lpo.drifts import learned_drift
+from lpo.drifts.surrogate import SurrogateDrift
+from lpo.objectives import load_apart, load_objective, save_objective
+from scb.errors import UserError
+from scb.own import code_of
+
+MODULE = '''
+from dataclasses import dataclass
+import jax
+import jax.numpy as jnp
+import lpo
+
+def clipped(ratio, advantage, xp):
+    return xp.minimum(ratio * advantage, xp.clip(ratio, 0.8, 1.2) * advantage)
+
+def squared(ratio, advantage):
+    return ratio * advantage - 0.5 * (ratio - 1) ** 2
+
+@dataclass(frozen=True)
+class Power(lpo.Drift):
+    """A power of the log-ratio.
+
+    Attributes:
+      power: which.
+    """
+
+    learned = True
+    power: int = 2
+
+    def init(self, key, scale=1.0):
+        return {"w": 1.0 + scale * jax.random.normal(key, (1,))}
+
+    def __call__(self, parameters, log_ratio, advantage, progress, xp=jnp):
+        return xp.abs(parameters["w"][0]) * log_ratio**self.power
+
+class Thawed(lpo.Drift):
+    init = __call__ = None
+
+mine = lpo.Objective("another name", Power(4), {"w": jnp.ones(1)})
+number = 3
+text = "ppo"
+'''
+LOG_RATIO = np.array([-0.5, 0.0, 0.1, 0.6])
+ADVANTAGE = np.array([-1.0, -2.0, 3.0, 0.5])
+
+
+@pytest.fixture
+def module(tmp_path, monkeypatch):
+    """A module that Python finds in the working directory, and what writes another into its place."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    sys.modules.pop("own_module", None)
+    (tmp_path / "own_module.py").write_text(MODULE)
+
+    def changed(old: str, new: str) -> None:
+        assert old in MODULE
+        (tmp_path / "own_module.py").write_text(MODULE.replace(old, new) + "# longer\n")
+        importlib.invalidate_caches()
+        sys.modules.pop("own_module", None)
+
+    yield changed
+    sys.modules.pop("own_module", None)
+
+
+def tiny_spec():
+    spec = scb.environment_agent("ppo", "Pendulum-v1").on_bandit(20)
+    return spec.with_steps(40)
+
+
+def test_a_function_of_ratio_and_advantage_is_an_objective(module):
+    ours, ppo = load_objective("own_module:clipped"), load_objective("ppo")
+    assert ours.name == "own_module:clipped"
+    theirs = lpo.numpy_drift(ppo)(LOG_RATIO, ADVANTAGE)
+    assert (theirs[[0, 3]] > 0.1).all()
+    in_jax = np.asarray(lpo.drift_function(ours)(LOG_RATIO, ADVANTAGE))
+    assert in_jax == pytest.approx(theirs, abs=1e-6)
+    assert lpo.numpy_drift(ours)(LOG_RATIO, ADVANTAGE) == pytest.approx(theirs, abs=1e-6)
+    assert lpo.certify(ours).holds
+
+
+def test_the_same_in_pytorch(module):
+    torch = pytest.importorskip("torch")
+    given = torch.as_tensor(LOG_RATIO), torch.as_tensor(ADVANTAGE)
+    ours = lpo.torch_loss("own_module:clipped")(*given)
+    assert ours.item() == pytest.approx(lpo.torch_loss("ppo")(*given).item())
+    # One that says nothing of its arrays' library needs none.
+    assert torch.isfinite(lpo.torch_loss("own_module:squared")(*given))
+    whole = torch.tensor([1, 2]), torch.ones(2)
+    assert lpo.torch_loss("ppo")(*whole).item() == pytest.approx(-1.2)
+    of_jax = load_objective(lambda ratio, advantage: jnp.minimum(ratio, 1.0) * advantage)
+    with pytest.raises(UserError, match=r"does not compute with torch .*: let it take xp"):
+        lpo.torch_drift(of_jax)(*given)
+
+
+def test_agents_train_with_it_as_with_the_same_of_ours(module):
+    comparison = lpo.compare(
+        "Synthetic-Pendulum-v1",
+        ["ppo", "own_module:clipped", SurrogateDrift(lambda ratio, advantage: ratio * advantage)],
+        [0, 1],
+        spec=tiny_spec(),
+        points=1,
+        episodes=2,
+    )
+    ppo, ours, free = comparison.curves
+    assert [ours.objective, free.objective] == ["own_module:clipped", "surrogate"]
+    assert ours.final == pytest.approx(ppo.final, abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("function", "message"),
+    [
+        (lambda r, a: r, "takes r, a: let it take advantage"),
+        (lambda ratio: ratio, "takes ratio: let it take advantage"),
+        (lambda ratio, advantage: (ratio * advantage).mean(), r"returns the shape \(\)"),
+        (lambda ratio, advantage: 1.0, "returns the shape 1.0"),
+    ],
+)
+def test_functions_that_are_none(function, message):
+    with pytest.raises(UserError, match=message):
+        lpo.drift_function(function)(LOG_RATIO, ADVANTAGE)
+
+
+def test_it_may_depend_on_the_fraction_of_training_done():
+    def fading(ratio, advantage, progress):
+        return ratio * advantage - progress * (ratio - 1) ** 2
+
+    drift = lpo.drift_function(fading)
+    assert (drift(LOG_RATIO, ADVANTAGE, 0.0) == 0).all()
+    assert drift(LOG_RATIO, ADVANTAGE, 1.0)[0] > 0
+    with pytest.raises(UserError, match="depends on the fraction of training done"):
+        drift(LOG_RATIO, ADVANTAGE)
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("own_module:nothing", "cannot be imported"),
+        ("no_such_module:thing", "cannot be imported"),
+        ("own_module:number", "of the class int is no objective"),
+        ("own_module:text", "is a str"),
+    ],
+)
+def test_names_that_stand_for_none(module, name, message):
+    with pytest.raises(UserError, match=message):
+        load_objective(name)
+
+
+def test_an_objective_a_drift_or_its_class_is_found_by_name(module):
+    found = load_apart(["own_module:mine", "own_module:Power"])
+    assert [o.name for o in found] == ["own_module:mine", "own_module:Power"]
+    assert [o.drift.power for o in found] == [4, 2]
+    with pytest.raises(UserError, match="is of the class function"):
+        lpo.Objective("f", lambda *_: 0.0, ())
+
+
+def test_rows_of_what_a_module_said_before_are_refused(module, tmp_path):
+    def measured():
+        arguments = {"spec": tiny_spec(), "points": 1, "episodes": 2}
+        rows = tmp_path / "rows.jsonl"
+        name = "own_module:squared"
+        return lpo.compare("Synthetic-Pendulum-v1", [name], [0], rows=rows, **arguments).curves[0]
+
+    before = measured()
+    module("import lpo\n", "import lpo  # a comment\n\n\n")
+    assert (measured().returns == before.returns).all()
+    module("0.5 * (ratio", "50 * (ratio")
+    with pytest.raises(UserError, match="hold another objective with the name own_module:squared"):
+        measured()
+
+
+def test_what_is_ours_or_has_no_source_is_told_too():
+    assert code_of(load_objective("lpo-pendulum").drift) == {}
+    typed: dict = {"__name__": "__main__"}
+    for body in ("1.0", "2.0"):
+        exec(f"def f{body[0]}(ratio, advantage): return {body} * ratio", typed)
+    one, two = (code_of(typed[name]) for name in ("f1", "f2"))
+    assert set(one.values()) != set(two.values())
+
+
+def test_a_file_names_the_family(module):
+    power = learned_drift("own_module:Power", power=4)
+    save_objective("p.npz", power, power.init(jax.random.key(0)))
+    assert load_objective("p.npz").drift == power
+    module("class Power(", "class Other(")
+    with pytest.raises(UserError, match=r"drift 'own_module:Power' cannot be imported"):
+        load_objective("p.npz")
+
+
+def test_what_no_import_finds_is_not_saved(module, tmp_path):
+    @dataclass(frozen=True)
+    class Hidden(lpo.NoDrift):
+        def init(self, key, scale=1.0):
+            return {"w": jnp.ones(1)}
+
+    with pytest.raises(UserError, match="is defined where no import finds it"):
+        save_objective(tmp_path / "x.npz", Hidden(), {"w": jnp.ones(1)})
+    function = load_objective("own_module:squared")
+    with pytest.raises(UserError, match="surrogate is its settings"):
+        save_objective(tmp_path / "x.npz", function.drift, function.parameters)
+    assert not list(tmp_path.glob("x*"))
+
+
+def test_a_family_of_ones_own_is_learned_and_its_run_continued(module, capsys):
+    words = "meta-train --drift own_module:Power --power 4 --generations 1 --population-size 2"
+    rest = " --agents-per-candidate 1 --mean-evaluations 2 --contexts 20 --out run"
+    assert cli.main((words + rest).split()) == 0
+    assert load_objective("run/objective.npz").drift.power == 4
+    resumed = ["meta-train", "--resume", "run", "--generations", "2"]
+    module("xp.abs(parameters", "2 * xp.abs(parameters")
+    assert cli.main(resumed) != 0
+    assert "own_module:Power is not what it was" in capsys.readouterr().err
+    module("import lpo\n", "import lpo\n\n")
+    assert cli.main(resumed) == 0
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("own_module:squared", "is a function: it must be a subclass of lpo.Drift"),
+        ("own_module:Thawed", "is no frozen dataclass"),
+        ("lpo.drifts:NoDrift", "does not learn"),
+        ("nothing", "unknown learned drift"),
+    ],
+)
+def test_families_that_do_not_learn(module, name, message):
+    with pytest.raises(UserError, match=message):
+        learned_drift(name)
