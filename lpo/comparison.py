@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -22,6 +22,9 @@ from scb.files import plain
 from scb.measurement import MODE, SAMPLED, Place, as_random, measure
 from scb.rows import Rows, pivot
 from scb.statistics import DECIDING, Estimate, estimate, paired_difference
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 _ARRAYS = ("lengths", "speeds", "diagnosis")
 
@@ -131,10 +134,21 @@ class Comparison:
 
     curves: list[LearningCurves]
 
-    def differences(self) -> dict[str, Estimate]:
-        """{objective: difference of final IQM to the reference}, of the seeds of both; positive where it is better."""
-        both = {c.objective: c.paired(self.curves[0]) for c in self.curves[1:]}
+    def differences(self, of: str = "final") -> dict[str, Estimate]:
+        """{objective: difference of IQM to the reference}, of the seeds of both; positive where it is better.
+
+        Args:
+          of: "final", "early", "late" or "area" returns, as `LearningCurves` has them.
+        """
+        one_of("kind of return", of, ("final", "early", "late", "area"))
+        both = {c.objective: c.paired(self.curves[0], of) for c in self.curves[1:]}
         return {name: paired_difference(*x) for name, x in both.items() if x[0].size}
+
+    def figure(self) -> "Figure":
+        """Interquartile mean returns along the training, and each seed's at its end, with 95 % intervals."""
+        from lpo.figures import learning_curves  # which takes long to import
+
+        return learning_curves(self.curves)
 
     @property
     def caution(self) -> str:

@@ -52,6 +52,18 @@ def test_a_difference_is_positive_where_the_objective_is_better_than_the_referen
     assert differences["none"].value == -4
 
 
+def test_differences_are_of_what_is_asked_for():
+    found = Comparison([curves("ppo", [[0, 0, -5.0]] * 4), curves("dpo", [[0, 4, -3.0]] * 4)])
+    # Over the training (4 - 3) / 2 = 0.5, and (0 - 5) / 2 = -2.5.
+    assert found.differences("area")["dpo"].value == 3
+    with pytest.raises(UserError, match="kind of return"):
+        found.differences("middle")
+    assert [axes.get_ylabel() for axes in found.figure().axes] == [
+        "return (interquartile mean)",
+        "final return",
+    ]
+
+
 def test_agents_that_diverge_count_as_random_actions_and_are_told(monkeypatch):
     def measured(*_, objectives, agents, **__):
         ends = {7: -200.0, 8: None, 9: -300.0}

@@ -9,11 +9,11 @@ from lpo.comparison import compare, ppo_spec
 from lpo.inner_loop import MetaTrainingConfig
 from scb.cli import main
 from scb.discovery import BanditDiscovery, DiscoveryConfig
-from scb.own import module_code
 from scb.environments.registry import check_backend, environment_spec, make
 from scb.environments.zoo import bandit_metadata
 from scb.errors import UserError
 from scb.measurement import Place, as_random
+from scb.own import module_code
 
 MODULE = """
 import gymnax, jax.numpy as jnp
