@@ -4,6 +4,9 @@ import re
 import sys
 from pathlib import Path
 
+import jax.numpy as jnp
+
+from examples.own_objective import TwoSided
 from scb.environments.registry import environment_spec, make
 from scb.environments.spec import EnvironmentSpec
 
@@ -36,6 +39,28 @@ def test_objectives_are_compared_under_settings_of_ones_own(capsys):
     code = block("objectives.md").replace("20_000", "2_000").replace("range(10)", "range(2)")
     exec(compile(code, "objectives.md", "exec"), {})
     assert "(n=2)" in capsys.readouterr().out
+
+
+def test_an_objective_of_ones_own_is_compared_and_its_family_is_the_examples(
+    tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    compared, family = blocks("own_objective.md")
+    small = {"range(10)": "range(2)", "policy_output_scale=0.01": "total_steps=10_000"}
+    for full, less in small.items():
+        assert full in compared
+        compared = compared.replace(full, less)
+    # Source is looked for in a file, as in a module or a notebook.
+    (tmp_path / "guide.py").write_text(compared)
+    exec(compile(compared, "guide.py", "exec"), {"__name__": "guide"})
+    assert "(n=2)" in capsys.readouterr().out and (tmp_path / "spo.png").stat().st_size
+    assert (tmp_path / "spo.jsonl").exists()
+    shown: dict = {"__name__": "guide"}
+    exec(compile(family, "guide.py", "exec"), shown)
+    one, same = shown["TwoSided"](), TwoSided()
+    given = jnp.array([-0.5, 0.3]), jnp.array([1.0, -2.0]), jnp.zeros(2)
+    strengths = {"log_strength": jnp.log(jnp.array([1.0, 3.0]))}
+    assert (one(strengths, *given) == same(strengths, *given)).all()
 
 
 def test_an_environment_of_ones_own_is_made(tmp_path, monkeypatch):
