@@ -41,7 +41,7 @@ class Options:
     horizons: tuple[float, ...] = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
     """lengths, in trainings of the search"""
     agents: int = 64
-    """of each objective, for every length"""
+    """of each objective, for every length; 10 at least, for an interval"""
 
     def __post_init__(self) -> None:
         at_least(10, self, "agents")

@@ -25,7 +25,7 @@ __all__ = list(_HOME)
 
 
 def __dir__() -> list[str]:
-    return [*globals(), *_HOME]
+    return [*_HOME]
 
 
 def __getattr__(name: str) -> Any:

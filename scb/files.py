@@ -1,14 +1,18 @@
 """Files and folders that commands write."""
 
+import contextlib
+import errno
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NoReturn
 
 import numpy as np
 
 from scb.errors import UserError
+
+_REFUSED = (errno.ENOENT, errno.EACCES, errno.EPERM, errno.ENOTDIR)
 
 
 def make_folder(folder: Path, flag: str = "--out") -> None:
@@ -31,6 +35,17 @@ def cannot_write(folder: Path, flag: str = "--out", reason: str | None = None) -
     return UserError(
         f"cannot write to {folder}{said}: choose another {flag}, a folder that you may write to."
     )
+
+
+@contextlib.contextmanager
+def refusing(folder: Path) -> Iterator[None]:
+    """Within it a folder that is not there, or may not be written to, is a UserError."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno not in _REFUSED:
+            raise
+        raise cannot_write(folder, "place", error.strerror) from error
 
 
 def strict_json(text: str | bytes) -> Any:
@@ -65,7 +80,7 @@ def write_together(contents: Mapping[Path, bytes]) -> None:
     *others, last = contents
     try:
         for path, content in contents.items():
-            with fresh[path].open("wb") as file:
+            with refusing(path.parent), fresh[path].open("wb") as file:
                 file.write(content)
                 file.flush()
                 os.fsync(file.fileno())

@@ -177,7 +177,17 @@ class SyntheticVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Begins new episodes; of `options`, "reset_mask" [num_envs] says where, all being left out."""
+        """Begins new episodes; of `options`, "reset_mask" [num_envs] says where, all being left out.
+
+        Raises:
+          UserError: a seed for each, where all draw from one generator.
+        """
+        given: object = seed
+        if isinstance(given, list | tuple | np.ndarray):
+            raise UserError(
+                f"the seed is {given!r}: these environments draw from one generator, so give one whole number, or make "
+                "them with vectorization_mode='sync', each with its own."
+            )
         super().reset(seed=seed)
         self._begun = True
         mask = (options or {}).get("reset_mask")

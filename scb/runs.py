@@ -30,7 +30,7 @@ from tensorboardX.summary import scalar
 
 from scb import termination
 from scb.errors import UserError
-from scb.files import cannot_write, make_folder, plain, write_json, write_text
+from scb.files import cannot_write, make_folder, plain, refusing, write_json, write_text
 from scb.machine import machine_description
 
 _LOCK = ".lock"
@@ -277,7 +277,8 @@ def _lock(path: Path, of: Path) -> None:
     """
     if fcntl is None or path.resolve() in _held:
         return
-    file = path.open("a+")
+    with refusing(path.parent):
+        file = path.open("a+")
     try:
         fcntl.lockf(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except (BlockingIOError, PermissionError) as error:

@@ -39,8 +39,14 @@ def environment_spec(name: str | Path) -> EnvironmentSpec:
         synthetic MDP, or "package.module:factory" (see `scb.environments.custom`).
 
     Raises:
-      UserError: unknown name (with near matches), or a file that is none of these.
+      UserError: unknown name (with near matches), a file that is none of these, or no name.
     """
+    given: object = name
+    if not isinstance(given, str | Path):
+        raise UserError(
+            f"the environment is of the class {type(given).__name__}: give a name, such as Pendulum-v1, or of one of "
+            "your own package.module:factory, where the attribute may be the environment itself."
+        )
     name = str(name)
     for family in _FAMILIES.values():
         if family.owns(name):

@@ -149,6 +149,9 @@ class SyntheticEnvironment(environment.Environment[_State, _Params]):
         self.latent_size = config.latent_size or observation_size
         self._weights = weights
 
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({self._name!r})"
+
     @property
     def name(self) -> str:
         return self._name

@@ -405,3 +405,8 @@ def test_with_next_step_every_other_step_of_a_bandit_is_a_reset():
 def test_what_cannot_be_made_is_refused(made, message):
     with pytest.raises(UserError, match=message):
         made()
+
+
+def test_a_vector_takes_one_seed():
+    with pytest.raises(UserError, match="draw from one generator, so give one whole number"):
+        gymnasium.make_vec(BANDIT, num_envs=2).reset(seed=[3, 4])

@@ -55,3 +55,10 @@ def test_near_names_come_closest_first_and_at_most_three():
     message = str(unknown_name("animal", "hoper", names))
     assert message.startswith("unknown animal 'hoper': did you mean hopper or chopper or ")
     assert message.count(" or ") == 2
+
+
+def test_an_object_is_no_name_of_an_environment():
+    env, _ = make("Synthetic-Pendulum-v1")
+    assert repr(env) == "SyntheticBandit('Synthetic-Pendulum-v1')"
+    with pytest.raises(UserError, match="is of the class SyntheticBandit: give a name"):
+        make(env)

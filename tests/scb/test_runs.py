@@ -8,7 +8,7 @@ import pytest
 
 from scb.checkpoints import Checkpoints
 from scb.errors import UserError
-from scb.files import write_json
+from scb.files import write_json, write_text
 from scb.machine import machine_description
 from scb.runs import Run, Stopwatch, first_difference, held, read_config, released
 from tests.locking import is_locked
@@ -389,3 +389,10 @@ def test_a_setting_that_an_earlier_version_had_not_is_as_good_as_an_empty_one():
     assert first_difference({"a": {}, "b": None}, {}) == ""
     assert first_difference({}, {"a": 0}) == "a (None there, 0 now)"
     assert first_difference({"a": {"b": 1}}, {}) == "a ({'b': 1} there, None now)"
+
+
+def test_where_nothing_can_be_written_is_told(tmp_path):
+    with pytest.raises(UserError, match=r"cannot write to .*gone .*choose another place"):
+        write_text(tmp_path / "gone" / "x.json", "")
+    with pytest.raises(UserError, match=r"cannot write to .*gone"), held(tmp_path / "gone" / "x"):
+        pass
