@@ -1,7 +1,7 @@
 """Two objectives of one's own: a function, and a family with numbers to be learned.
 
 lpo evaluate --objectives ppo examples.own_objective:spo --seeds 10
-lpo meta-train --drift examples.own_objective:TwoSided --out runs/two-sided
+lpo meta-train --drift examples.own_objective:TwoSided --sigma 0.2 --learning-rate 0.1 --out runs/two-sided
 
 From the folder above this one, or with the module's name as Python finds it.
 """
@@ -31,7 +31,8 @@ class TwoSided(lpo.Drift):
     strength: float = 2.5
 
     def init(self, key, scale=1.0):
-        return {"log_strength": jnp.log(self.strength) + scale * jax.random.normal(key, (2,))}
+        start = jnp.log(self.strength)
+        return {"log_strength": start + scale * jax.random.normal(key, (2,))}
 
     def __call__(self, parameters, log_ratio, advantage, progress, xp=jnp):
         """[B] what PPO is charged."""
