@@ -72,3 +72,10 @@ def test_agents_are_trained_for_as_long_as_is_asked(monkeypatch, tmp_path):
     for wrong in ({"horizons": ()}, {"horizons": (0.0,)}, {"agents": 3}):
         with pytest.raises(UserError):
             module.Options(**wrong)
+
+
+def test_all_names_are_read_before_the_first_is_measured():
+    report = {}
+    with pytest.raises(UserError, match="unknown objective 'nope'"):
+        next(module.parts(module.Options(("dpo", "nope")), report))
+    assert not report.get("objectives")

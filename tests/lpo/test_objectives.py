@@ -70,7 +70,7 @@ def sign(path: Path) -> None:
 
 def test_closed_forms_load_by_name():
     # One drift for each family, so that one program trains all its members: what differs are the parameters.
-    clips = {"ppo": 0.2, "ppo-0.3": 0.3, "ppo-1": 1.0}
+    clips = {"ppo": 0.2, "ppo-0.3": 0.3, "ppo-1": 1.0, "ppo-1e-3": 1e-3}
     constants = {"dpo": (2.0, 0.6), "dpo-4-1.2": (4.0, 1.2), "dpo-1-.5": (1.0, 0.5)}
     for name, clip in clips.items():
         assert load_objective(name).drift == ClipDrift()
