@@ -105,7 +105,8 @@ def load_objective(name: Named) -> Objective:
     if isinstance(name, Drift):
         return closed_form(name.name, name)
     if callable(name):
-        return closed_form(getattr(name, "__name__", "surrogate"), SurrogateDrift(name))
+        surrogate = SurrogateDrift(name)
+        return closed_form(surrogate.called, surrogate)
     if not isinstance(name, str | Path):
         raise UserError(
             f"something of the class {type(name).__name__} is no objective: give a name, a file, a function of ratio "

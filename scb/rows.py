@@ -8,6 +8,7 @@ import hashlib
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -175,7 +176,9 @@ def _description(value: Any) -> Any:
         return {"class": type(value).__name__, **parts}
     if isinstance(value, Mapping):
         return dict(value)
-    # A function, whose representation is another in every process.
+    # Functions, whose representation is another in every process.
+    if isinstance(value, partial):
+        return {"partial": value.func, "arguments": value.args, "named": value.keywords}
     if hasattr(value, "__qualname__"):
         return f"{value.__module__}.{value.__qualname__}"
     array = np.asarray(value)

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from lpo.drifts.contract import Array, Drift
+from scb import own
 from scb.errors import UserError, first_line
 
 ARGUMENTS = ("ratio", "log_ratio", "advantage", "progress", "xp")
@@ -32,20 +33,23 @@ class SurrogateDrift(Drift):
     function: Callable[..., Array]
 
     def __post_init__(self) -> None:
-        if not callable(self.function):
+        # Of an object that can be called nothing says what it holds.
+        if own.plain_function(self.function) is None:
             raise UserError(
-                f"the surrogate is of the class {type(self.function).__name__}: give a function of ratio and advantage."
+                f"the surrogate is of the class {type(self.function).__name__}: give a function of ratio and "
+                "advantage, or a functools.partial of one."
             )
         strange = [name for name in self._takes if name not in ARGUMENTS]
         if strange or "advantage" not in self._takes:
             raise UserError(
-                f"the surrogate {self._called} takes {', '.join(self._takes) or 'nothing'}: let it take advantage, and "
+                f"the surrogate {self.called} takes {', '.join(self._takes) or 'nothing'}: let it take advantage, and "
                 f"what it needs of {', '.join(ARGUMENTS)}, by these names."
             )
 
     @property
-    def _called(self) -> str:
-        return getattr(self.function, "__name__", repr(self.function))
+    def called(self) -> str:
+        """The function's name."""
+        return str(getattr(own.plain_function(self.function), "__name__", "surrogate"))
 
     @property
     def _takes(self) -> list[str]:
@@ -71,12 +75,12 @@ class SurrogateDrift(Drift):
             if xp is jnp:
                 raise
             raise UserError(
-                f"the surrogate {self._called} does not compute with {xp.__name__} ({first_line(error)}): let it take "
+                f"the surrogate {self.called} does not compute with {xp.__name__} ({first_line(error)}): let it take "
                 "xp, and call xp.minimum and the like."
             ) from error
         if getattr(surrogate, "shape", None) != log_ratio.shape:
             raise UserError(
-                f"the surrogate {self._called} returns the shape {getattr(surrogate, 'shape', surrogate)} for "
+                f"the surrogate {self.called} returns the shape {getattr(surrogate, 'shape', surrogate)} for "
                 f"{tuple(log_ratio.shape)} ratios: return a number for each, of which PPO takes the mean."
             )
         return ratio * advantage - surrogate

@@ -3,6 +3,7 @@
 import importlib
 import sys
 from dataclasses import dataclass
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -189,6 +190,51 @@ def test_what_is_ours_or_has_no_source_is_told_too():
         exec(f"def f{body[0]}(ratio, advantage): return {body} * ratio", typed)
     one, two = (code_of(typed[name]) for name in ("f1", "f2"))
     assert set(one.values()) != set(two.values())
+
+
+def squared(strength):
+    def surrogate(ratio, advantage):
+        return ratio * advantage - strength * (ratio - 1) ** 2
+
+    return surrogate
+
+
+def power(ratio, advantage, strength=1.0):
+    return squared(strength)(ratio, advantage)
+
+
+@pytest.mark.parametrize("made", [squared, lambda x: partial(power, strength=x)])
+def test_values_that_a_function_was_made_with_count(made, tmp_path):
+    def measured(objective):
+        arguments = {"spec": tiny_spec(), "points": 1, "episodes": 2, "rows": tmp_path / "r.jsonl"}
+        return lpo.compare("Synthetic-Pendulum-v1", [objective], [0], **arguments)
+
+    measured(made(0.5))
+    measured(made(0.5))
+    with pytest.raises(UserError, match="hold another objective with the name"):
+        measured(made(0.7))
+
+
+def test_functions_in_wrappers_are_themselves():
+    for wrapped in (partial(power, strength=1.0), jax.jit(power)):
+        assert load_objective(wrapped).name == "power"
+        assert list(code_of(load_objective(wrapped).drift)) == [f"{__name__}:power"]
+    for wrong in (max, lpo.compare.__call__, (1).__add__):
+        with pytest.raises(UserError, match="give a function of ratio and advantage"):
+            load_objective(wrong)
+
+
+def test_a_family_counts_with_what_it_inherits_from(module, tmp_path):
+    heir = "from own_module import Power\n\nclass Heir(Power):\n    pass\n"
+    (tmp_path / "heirs.py").write_text(heir)
+    try:
+        before = code_of(load_objective("heirs:Heir").drift)
+        assert list(before) == ["heirs:Heir", "own_module:Power"]
+        sys.modules.pop("heirs")
+        module("log_ratio**self.power", "log_ratio**2")
+        assert code_of(load_objective("heirs:Heir").drift) != before
+    finally:
+        sys.modules.pop("heirs", None)
 
 
 def test_a_file_names_the_family(module):
