@@ -92,7 +92,8 @@ def load_objective(name: Named) -> Objective:
         "ppo", "ppo-0.3" (its clip), "dpo", "dpo-4-1.2" (its alpha and beta), "none", or a name of the zoo;
         a file: path.npz, or path;
         "package.module:attribute", of a module that Python finds from here, of any of the following;
-        a function of ratio, advantage, and what else `SurrogateDrift` names, which returns what PPO is to maximise;
+        a function that returns [B] what PPO is to maximise the mean of, and takes by these names what it needs of
+        ratio, log_ratio, advantage, progress, [B] each, and xp (`jax.numpy`, `numpy` or `torch`);
         an `lpo.Drift`, or its class, with the parameters that it starts with; an `Objective` is itself.
 
     Raises:
