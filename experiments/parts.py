@@ -268,11 +268,11 @@ def elsewhere(
 @contextmanager
 def _told_apart(path: Path) -> Iterator[None]:
     """Has processes that start here say in a file, and not on the terminal, how they were interrupted."""
-    kept = os.dup(2)
     path.parent.mkdir(exist_ok=True)
+    with path.open("ab") as file:
+        kept = os.dup(2)
+        os.dup2(file.fileno(), 2)
     try:
-        with path.open("ab") as file:
-            os.dup2(file.fileno(), 2)
         yield
     finally:
         os.dup2(kept, 2)

@@ -17,7 +17,7 @@ from lpo.drifts.contract import Drift
 from scb.agents.ppo import MAX_LOG_RATIO
 
 if TYPE_CHECKING:
-    from lpo.objectives import Objective
+    from lpo.objectives import Named
 
 # As much as the advantages of a minibatch of 1000 correlate with any direction by chance, 1 / sqrt(1000).
 LARGEST_KINK = 0.03
@@ -86,7 +86,7 @@ class Certificate:
 
 
 def certify(
-    drift: "Drift | Objective",
+    drift: "Named",
     parameters: Any = None,
     num_ratios: int = 2001,
     num_advantages: int = 401,
@@ -94,14 +94,17 @@ def certify(
     """Evaluates a drift on a grid of ratios and advantages, and its slope around ratio 1.
 
     Args:
-      drift: any member of the contract; an objective brings its parameters.
-      parameters: the drift's.
+      drift: any member of the contract, with its parameters; or without these what `load_objective` takes.
+      parameters: as from the drift's `init`.
       num_ratios: points of log-ratio, in [-3, 3] and, a quarter as many, out to the bound that
         training clips at.
       num_advantages: points of advantage in [-10, 10], the tails of a normalised minibatch.
     """
-    if not isinstance(drift, Drift):
-        return certify(drift.drift, drift.parameters, num_ratios, num_advantages)
+    if parameters is None or not isinstance(drift, Drift):
+        from lpo.objectives import load_objective  # which certifies what it saves
+
+        objective = load_objective(drift)
+        drift, parameters = objective.drift, objective.parameters
     inner = np.linspace(-3.0, 3.0, num_ratios | 1)
     outer = np.linspace(-MAX_LOG_RATIO, MAX_LOG_RATIO, (num_ratios // 4) | 1)
     log_ratios = jnp.asarray(np.union1d(inner, outer), jnp.float32)

@@ -184,7 +184,8 @@ def certify_command(objective: tyro.conf.Positional[str]) -> None:
     slope and kink. Exits with 1 where a condition fails, or where the kink may hold a policy still.
 
     Args:
-      objective: ppo, ppo-0.3, dpo, dpo-4-1.2, none, a zoo name, or path.npz.
+      objective: ppo, ppo-0.3, dpo, dpo-4-1.2, none, a zoo name, path.npz, or
+        package.module:function of your own.
     """
     loaded = load_objective(objective)
     certificate = certify(loaded.drift, loaded.parameters)

@@ -243,7 +243,7 @@ def _values(spec: AgentSpec) -> dict[str, Any]:
 
 def compare(
     environment: str,
-    objectives: Sequence[Named],
+    objectives: Sequence[Named] | Mapping[str, Named],
     seeds: Sequence[int],
     spec: AgentSpec | None = None,
     backend: str | None = None,
@@ -258,8 +258,8 @@ def compare(
 
     Args:
       environment: a name that `scb.make` takes.
-      objectives: what replaces PPO's surrogate, or names and files as `load_objective` takes them; the first is
-        what the others are compared with.
+      objectives: what replaces PPO's surrogate, as `load_objective` takes it, or {name: objective}; the first is what
+        the others are compared with.
       seeds: one agent each; the same seeds pair agents of different objectives.
       spec: PPO's; the environment's own where None.
       backend: of an environment with a choice of physics, such as "spring" in Brax.

@@ -15,7 +15,7 @@ from lpo.drifts import ClipDrift, DPODrift, Drift, NoDrift, drift_from_config
 from lpo.drifts.surrogate import SurrogateDrift
 from scb import artefacts, own
 from scb.environments.registry import environment_spec
-from scb.errors import UserError
+from scb.errors import UserError, first_line
 from scb.keys import root_key
 
 KIND = "drift"
@@ -32,6 +32,8 @@ _DPO_NAME = re.compile(f"dpo-{_NUMBER}-{_NUMBER}$")
 class Objective:
     """A drift with its parameters: what `scb.PPO` and its hyperparameters take.
 
+    Two are equal where they are the same object; `lpo.objectives.same_drift` compares what they say.
+
     Attributes:
       name: as on the command line; a file's is its own, or of the objective.npz of a run its folder's.
       drift: the family, passed to `PPO(env, config, drift)`; of a clip or DPO it has the default settings, and the
@@ -40,7 +42,7 @@ class Objective:
       metadata: of a learned objective, what its artefact says.
 
     Raises:
-      UserError: the drift is of no family.
+      UserError: the drift is of no family, or of one that is no frozen dataclass.
     """
 
     name: str
@@ -53,6 +55,12 @@ class Objective:
             raise UserError(
                 f"the drift of the objective {self.name} is of the class {type(self.drift).__name__}: give an "
                 "lpo.Drift, or a function of ratio and advantage to lpo.load_objective."
+            )
+        settings = getattr(self.drift, "__dataclass_params__", None)
+        if settings is None or not settings.frozen:
+            raise UserError(
+                f"the drift {type(self.drift).__name__} is no frozen dataclass, as which programs are told apart: "
+                "write @dataclasses.dataclass(frozen=True) above it."
             )
 
     def __repr__(self) -> str:
@@ -102,10 +110,17 @@ def load_objective(name: Named) -> Objective:
     if isinstance(name, Objective):
         return name
     if isinstance(name, type) and issubclass(name, Drift):
-        name = name()
+        family = name
+        try:
+            name = family()
+        except TypeError as error:
+            raise UserError(
+                f"the drift {family.__name__} cannot be made as it is ({first_line(error)}): give an instance with its "
+                "settings."
+            ) from error
     if isinstance(name, Drift):
         return closed_form(name.name, name)
-    if callable(name):
+    if callable(name) and not isinstance(name, type):
         surrogate = SurrogateDrift(name)
         return closed_form(surrogate.called, surrogate)
     if not isinstance(name, str | Path):
@@ -137,7 +152,8 @@ def check_names(objectives: Sequence[Objective]) -> None:
     repeated = sorted({name for name in names if names.count(name) > 1})
     if repeated:
         raise UserError(
-            f"objective {repeated[0]!r} is there twice: give each once, and each a name of its own."
+            f"objective {repeated[0]!r} is there twice: give each once, and each a name of its own, in Python by a "
+            "dict {name: objective}."
         )
 
 
@@ -148,16 +164,18 @@ def same_drift(one: Objective, other: Objective) -> bool:
     )
 
 
-def load_apart(names: Iterable[Named]) -> list[Objective]:
+def load_apart(names: Iterable[Named] | Mapping[str, Named]) -> list[Objective]:
     """Objectives by what `load_objective` takes, with names of their own.
 
-    Files of one name go by what was typed.
+    Files of one name go by what was typed, and those of a mapping by its keys.
 
     Raises:
       UserError: as for `load_objective`, or one stands there twice.
     """
     if isinstance(names, str | Path | Objective | Drift) or callable(names):
         raise UserError("the objectives are a single one: give a list of them.")
+    if isinstance(names, Mapping):
+        return [replace(load_objective(of), name=name) for name, of in names.items()]
     names = list(names)
     loaded = [load_objective(name) for name in names]
     known = [objective.name for objective in loaded]

@@ -26,7 +26,8 @@ def show_command(
     """Show what an objective does to an update: where it stops one, lets it go on, or turns it round.
 
     Args:
-      objective: ppo, ppo-0.3, dpo, dpo-4-1.2, none, a zoo name, or path.npz.
+      objective: ppo, ppo-0.3, dpo, dpo-4-1.2, none, a zoo name, path.npz, or
+        package.module:function of your own.
       beside: other objectives to show with it.
       progress: fraction of training done, from 0 to 1, for objectives that change with it.
       out: folder for show.png, show.json and show.html; runs/show/NAME where left out, of a run's objective.npz

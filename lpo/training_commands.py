@@ -89,7 +89,8 @@ class TrainConfig(JudgedConfig):
     """What `lpo train` does.
 
     Attributes:
-      objective: ppo, ppo-0.3 (clip 0.3), dpo, dpo-4-1.2 (its alpha and beta), none, a zoo name, or path.npz.
+      objective: ppo, ppo-0.3 (clip 0.3), dpo, dpo-4-1.2 (its alpha and beta), none, a zoo name, path.npz, or
+        package.module:function of your own.
     """
 
     objective: str = "ppo"
@@ -102,8 +103,8 @@ class EvaluateConfig(JudgedConfig):
     Attributes:
       suite: train in every environment of classic, minatar, brax or all, and aggregate normalised
         scores; a folder given as --out that holds a part of them already is completed.
-      objectives: any of ppo, ppo-0.3, dpo, dpo-4-1.2, none, zoo names, files; the first is the
-        reference of the differences.
+      objectives: any of ppo, ppo-0.3, dpo, dpo-4-1.2, none, zoo names, files, package.module:function of your
+        own; the first is the reference of the differences.
     """
 
     seeds: int = 10

@@ -298,7 +298,7 @@ def measure(
     cells = {
         name: rows.cell(
             columns | {"objective": name},
-            configuration | {"objective": objective and _told(objective)},
+            configuration | _told(objective),
             len(steps) * len(actions),
         )
         for name, objective in named.items()
@@ -356,10 +356,13 @@ def measure(
     return [row for cell in cells.values() for one in agents.names for row in cell.done[one]]
 
 
-def _told(objective: Objective) -> tuple[Any, ...]:
+def _told(objective: Objective | None) -> dict[str, Any]:
     """What tells an objective from others of its name."""
+    if objective is None:
+        return {"objective": None}
     code = code_of(objective.drift)
-    return (objective.drift, objective.parameters, *([code] if code else []))
+    told = {"objective": (objective.drift, objective.parameters)}
+    return told | ({"objective_code": code} if code else {})
 
 
 def _program_of(

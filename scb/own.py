@@ -2,25 +2,29 @@
 
 import ast
 import contextlib
+import dis
 import hashlib
 import importlib
 import inspect
+import json
 import re
 import sys
-import textwrap
-from collections.abc import Iterable
+import sysconfig
+from collections.abc import Iterable, Mapping
 from dataclasses import fields, is_dataclass
 from functools import partial
 from pathlib import Path
-from types import FunctionType
+from types import CodeType, FunctionType, MethodType, ModuleType
 from typing import Any
 
+import jax
 import numpy as np
 
 from scb.errors import UserError
 
 _NAME = re.compile(r"[^\W\d][\w.]*:[^\W\d]\w*")
 _OURS = ("scb", "lpo")
+_LIBRARIES = {Path(path) for name, path in sysconfig.get_paths().items() if name.endswith("lib")}
 
 
 def is_own(name: str) -> bool:
@@ -80,68 +84,151 @@ def module_code(names: Iterable[str]) -> dict[str, str]:
     for name in filter(is_own, names):
         # A module that cannot be imported is told of where the thing is made.
         with contextlib.suppress(Exception):
-            said = _layout_free(inspect.getsource(_module(name.partition(":")[0])))
-            found[name] = hashlib.sha256(said.encode()).hexdigest()
+            found[name] = _digest(inspect.getsource(_module(name.partition(":")[0])))
     return found
-
-
-def plain_function(function: Any) -> FunctionType | None:
-    """What a `functools.partial` or a decorator such as `jax.jit` was made of; None where that is no function."""
-    while isinstance(function, partial) or hasattr(function, "__wrapped__"):
-        function = function.func if isinstance(function, partial) else function.__wrapped__
-    return function if isinstance(function, FunctionType) else None
 
 
 def code_of(thing: Any) -> dict[str, str]:
-    """{name: SHA-256} of what is somebody's own: a function, or an object's classes and the functions among its fields.
+    """{name: SHA-256} of what somebody's own functions and classes compute, of which an object is made; empty for none.
 
-    Of what their module says, as `module_code`; of the script that runs, or a notebook, what they say themselves. With
-    a function the values count that it was made with: arguments of a partial, and variables of the function around it.
+    By their compiled code, in which comments and layout are not. With it count defaults, what partials, decorators and
+    functions around them hold, base classes, and the functions, classes and values of their modules that they name;
+    of libraries and of this one nothing does.
     """
-    if plain_function(thing) is not None:
-        return _code_of_function(thing)
-    found: dict[str, str] = {}
-    for part in type(thing).__mro__:
-        found |= _code(part)
-    for field in fields(thing) if is_dataclass(thing) else ():
-        if plain_function(value := getattr(thing, field.name)) is not None:
-            found |= _code_of_function(value)
-    return found
+    reading = _Reading()
+    said = json.dumps(reading.of(thing))
+    return {reading.own[0]: hashlib.sha256(said.encode()).hexdigest()} if reading.own else {}
 
 
-def _code_of_function(function: Any) -> dict[str, str]:
-    plain = plain_function(function)
-    values: list[Any] = [cell.cell_contents for cell in plain.__closure__ or ()] if plain else []
-    if isinstance(function, partial):
-        values += [*function.args, *sorted(function.keywords.items())]
-    return _code(plain, "".join(map(_value, values)))
+class _Reading:
+    """What things say, as nested lists of texts that are the same in every process.
+
+    Attributes:
+      own: names of somebody's own functions and classes that were met.
+    """
+
+    def __init__(self) -> None:
+        self.own: list[str] = []
+        self._met: set[int] = set()
+
+    def of(self, value: Any) -> Any:
+        match value:
+            case None | bool() | int() | float() | complex() | str() | bytes():
+                return repr(value)
+            case tuple() | list():
+                return [type(value).__name__, *map(self.of, value)]
+            case set() | frozenset():
+                return ["set", *sorted(map(repr, value))]
+            case Mapping():
+                return ["mapping", *([repr(k), self.of(value[k])] for k in sorted(value, key=repr))]
+            case CodeType():
+                return self._code(value)
+            case ModuleType():
+                return value.__name__
+        if id(value) in self._met:
+            return "as before"
+        self._met.add(id(value))
+        match value:
+            case FunctionType():
+                return self._function(value)
+            case type():
+                return self._class(value)
+            case MethodType() | staticmethod() | classmethod():
+                return [
+                    "method",
+                    self.of(value.__func__),
+                    self.of(getattr(value, "__self__", None)),
+                ]
+            case property():
+                return ["property", *map(self.of, (value.fget, value.fset))]
+            case partial():
+                return ["partial", *map(self.of, (value.func, value.args, value.keywords))]
+            case np.ndarray() | np.generic() | jax.Array():
+                array = np.asarray(value)
+                return [
+                    str(array.dtype),
+                    str(array.shape),
+                    hashlib.sha256(array.tobytes()).hexdigest(),
+                ]
+        if hasattr(value, "__wrapped__"):  # by a decorator such as jax.jit
+            return ["wrapped", self.of(value.__wrapped__)]
+        held = vars(value) if hasattr(value, "__dict__") and _is_somebodys(type(value)) else {}
+        if is_dataclass(value):
+            held = {f.name: getattr(value, f.name) for f in fields(value)}
+        return [self.of(type(value)), self.of(held)]
+
+    def _function(self, function: FunctionType) -> Any:
+        if not _is_somebodys(function):
+            return _called(function)
+        self.own.append(_called(function))
+        cells = []
+        for cell in function.__closure__ or ():
+            with contextlib.suppress(ValueError):  # of what is assigned later
+                cells.append(self.of(cell.cell_contents))
+        named = {
+            n: function.__globals__[n]
+            for n in _names(function.__code__) & function.__globals__.keys()
+        }
+        code = self._code(function.__code__)
+        held = self.of((function.__defaults__, function.__kwdefaults__, named))
+        return ["function", code, held, cells]
+
+    def _code(self, code: CodeType) -> Any:
+        # Not its bytes, which a docstring that comes or goes would move.
+        return [[x.opname, self.of(x.argval)] for x in dis.get_instructions(code)]
+
+    def _class(self, made: type) -> Any:
+        if not _is_somebodys(made):
+            return _called(made)
+        self.own.append(_called(made))
+        kinds = (
+            FunctionType,
+            staticmethod,
+            classmethod,
+            property,
+            partial,
+            bool,
+            int,
+            float,
+            str,
+            tuple,
+        )
+        said = {
+            k: x for k, x in vars(made).items() if isinstance(x, kinds) and k not in _ABOUT_CLASSES
+        }
+        return ["class", self.of(said), *map(self.of, made.__bases__)]
 
 
-def _code(part: Any, values: str = "") -> dict[str, str]:
-    """{name: SHA-256} of a class or function and values, where it is no part of Python or this library."""
-    home = part.__module__
-    if home.partition(".")[0] in (*_OURS, *sys.stdlib_module_names) and home != "__main__":
-        return {}
-    module = None if home == "__main__" else sys.modules.get(home)
-    try:
-        said = _layout_free(inspect.getsource(part if module is None else module))
-    except (OSError, TypeError):  # no source is kept of what is typed at a prompt
-        code = getattr(part, "__code__", None)
-        said = repr((code.co_code, code.co_consts)) if code else ""
-    return {f"{home}:{part.__qualname__}": hashlib.sha256((said + values).encode()).hexdigest()}
+_ABOUT_CLASSES = (
+    "__doc__",
+    "__module__",
+    "__qualname__",
+    "__firstlineno__",
+    "__static_attributes__",
+)
 
 
-def _value(value: Any) -> str:
-    """What tells a value from others in every process: itself, or of what holds code its name."""
-    if isinstance(value, tuple | list):
-        return "".join(map(_value, value))
-    array = np.asarray(value)
-    if array.dtype != object:
-        return f"{array.dtype}{array.shape}{array.tobytes().hex()}"
-    return str(getattr(value, "__qualname__", type(value).__qualname__))
+def _names(code: CodeType) -> set[str]:
+    """The globals and attributes that code names, that inside of it too."""
+    inner = (_names(x) for x in code.co_consts if isinstance(x, CodeType))
+    return set(code.co_names).union(*inner)
 
 
-def _layout_free(source: str) -> str:
-    with contextlib.suppress(SyntaxError):  # of a lambda, which is the line that it stands in
-        return ast.unparse(ast.parse(textwrap.dedent(source)))
-    return source
+def _called(thing: Any) -> str:
+    return f"{thing.__module__}:{thing.__qualname__}"
+
+
+def _is_somebodys(thing: Any) -> bool:
+    """Whether a function or class is neither Python's, nor this library's, nor that of a package that is installed."""
+    home = thing.__module__ or ""
+    if home.partition(".")[0] in (*_OURS, "builtins"):
+        return False
+    file = getattr(sys.modules.get(home), "__file__", None)
+    if home == "__main__" or file is None:  # typed, or Python's and without a file
+        return home not in sys.builtin_module_names
+    return not any(Path(file).is_relative_to(library) for library in _LIBRARIES)
+
+
+def _digest(source: str) -> str:
+    said = ast.unparse(ast.parse(source))
+    return hashlib.sha256(said.encode()).hexdigest()

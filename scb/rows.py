@@ -8,7 +8,6 @@ import hashlib
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -86,7 +85,7 @@ class Rows:
             stored = self._configurations[other]
             # What an earlier version did not write down is not compared.
             known = {name: described.get(name) for name in stored}
-            if stored.get("objective") != known.get("objective"):
+            if any(stored.get(x) != known.get(x) for x in ("objective", "objective_code")):
                 raise UserError(
                     f"{self.path or 'the rows'} hold another objective with the name {columns['objective']}: give this "
                     "one a name of its own, or choose another file."
@@ -176,11 +175,10 @@ def _description(value: Any) -> Any:
         return {"class": type(value).__name__, **parts}
     if isinstance(value, Mapping):
         return dict(value)
-    # Functions, whose representation is another in every process.
-    if isinstance(value, partial):
-        return {"partial": value.func, "arguments": value.args, "named": value.keywords}
-    if hasattr(value, "__qualname__"):
-        return f"{value.__module__}.{value.__qualname__}"
+    # A function, whose representation is another in every process.
+    if callable(value):
+        named = value if hasattr(value, "__qualname__") else type(value)
+        return f"{named.__module__}.{named.__qualname__}"
     array = np.asarray(value)
     if array.dtype == object:
         return repr(value)

@@ -44,12 +44,6 @@ def own_family(name: str) -> type[Drift]:
     if not (isinstance(found, type) and issubclass(found, Drift)):
         kind = found.__name__ if isinstance(found, type) else type(found).__name__
         raise UserError(f"the drift {name} is a {kind}: it must be a subclass of lpo.Drift.")
-    settings = vars(found).get("__dataclass_params__")
-    if settings is None or not settings.frozen:
-        raise UserError(
-            f"the drift {name} is no frozen dataclass, as which programs are told apart: write "
-            "@dataclasses.dataclass(frozen=True) above it."
-        )
     return found
 
 

@@ -2,7 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass, fields
 from typing import Any, ClassVar, Self, TypeAlias
 
 import chex
@@ -13,7 +13,7 @@ import numpy as np
 from lpo.drifts.bases import BASES
 from scb import own
 from scb.agents.ppo import relu
-from scb.errors import at_least, one_of, positive
+from scb.errors import UserError, at_least, one_of, positive
 from scb.keys import root_key
 
 # Any: an array of JAX, NumPy or PyTorch; `xp` below is its library.
@@ -24,7 +24,7 @@ class Drift(ABC):
     """A family of drifts: a frozen dataclass, which is static, and parameters, traced, so that a population vmaps.
 
     Attributes:
-      name: of the family; a subclass's own name where it says none. The dataclass's fields are its settings.
+      name: of the family; of one's own the class's, where it says none. The dataclass's fields are its settings.
       learned: whether `lpo meta-train` evolves it.
       always_holds: whether the conditions of mirror learning hold by construction, whatever the
         parameters are, as long as they are finite.
@@ -35,7 +35,7 @@ class Drift(ABC):
     always_holds: ClassVar[bool] = False
 
     def __init_subclass__(cls) -> None:
-        if not hasattr(cls, "name"):
+        if "name" not in vars(cls) and not cls.__module__.startswith("lpo."):
             cls.name = cls.__name__
 
     @property
@@ -74,9 +74,16 @@ class Drift(ABC):
         """What a file says of it: the family and its settings.
 
         Raises:
-          UserError: one's own family, which no import finds.
+          UserError: one's own family, which no import finds, or a function among its settings.
         """
-        return {"family": self.family(), **asdict(self)}  # type: ignore[call-overload]
+        settings = {name: getattr(self, name) for name in self.settings()}
+        for name, value in settings.items():
+            if callable(value):
+                raise UserError(
+                    f"the setting {name} of the drift {self.name} is a function, which no file holds: make it a "
+                    "part of the class."
+                )
+        return {"family": self.family(), **settings}
 
     @classmethod
     def family(cls) -> str:

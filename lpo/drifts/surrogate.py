@@ -3,13 +3,13 @@
 import inspect
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
 
 from lpo.drifts.contract import Array, Drift
-from scb import own
 from scb.errors import UserError, first_line
 
 ARGUMENTS = ("ratio", "log_ratio", "advantage", "progress", "xp")
@@ -33,28 +33,34 @@ class SurrogateDrift(Drift):
     function: Callable[..., Array]
 
     def __post_init__(self) -> None:
-        # Of an object that can be called nothing says what it holds.
-        if own.plain_function(self.function) is None:
+        try:
+            parameters = inspect.signature(self.function).parameters.values()
+        except (TypeError, ValueError) as error:  # of what is written in C
             raise UserError(
-                f"the surrogate is of the class {type(self.function).__name__}: give a function of ratio and "
-                "advantage, or a functools.partial of one."
-            )
-        strange = [name for name in self._takes if name not in ARGUMENTS]
+                f"the surrogate {self.called} does not say what it takes: give a function of ratio and advantage."
+            ) from error
+        strange = [x.name for x in parameters if x.kind in (x.POSITIONAL_ONLY, x.VAR_POSITIONAL)]
+        strange += [name for name in self._takes if name not in ARGUMENTS]
         if strange or "advantage" not in self._takes:
+            taken = ", ".join(x.name for x in parameters) or "nothing"
             raise UserError(
-                f"the surrogate {self.called} takes {', '.join(self._takes) or 'nothing'}: let it take advantage, and "
-                f"what it needs of {', '.join(ARGUMENTS)}, by these names."
+                f"the surrogate {self.called} takes {taken}: let it take advantage, and what it needs of "
+                f"{', '.join(ARGUMENTS)}, by these names."
             )
 
     @property
     def called(self) -> str:
         """The function's name."""
-        return str(getattr(own.plain_function(self.function), "__name__", "surrogate"))
+        function: Any = self.function
+        while isinstance(function, partial):
+            function = function.func
+        return str(getattr(function, "__name__", type(function).__name__))
 
     @property
     def _takes(self) -> list[str]:
         parameters = inspect.signature(self.function).parameters.values()
-        return [x.name for x in parameters if x.default is x.empty or x.name in ARGUMENTS]
+        by_name = (x for x in parameters if x.kind in (x.POSITIONAL_OR_KEYWORD, x.KEYWORD_ONLY))
+        return [x.name for x in by_name if x.default is x.empty or x.name in ARGUMENTS]
 
     @property
     def temporal(self) -> bool:
@@ -72,10 +78,10 @@ class SurrogateDrift(Drift):
         try:
             surrogate = self.function(**{name: given[name] for name in self._takes})
         except TypeError as error:
-            if xp is jnp:
+            if xp.__name__ != "torch" or "xp" in self._takes:
                 raise
             raise UserError(
-                f"the surrogate {self.called} does not compute with {xp.__name__} ({first_line(error)}): let it take "
+                f"the surrogate {self.called} does not compute with PyTorch ({first_line(error)}): let it take "
                 "xp, and call xp.minimum and the like."
             ) from error
         if getattr(surrogate, "shape", None) != log_ratio.shape:

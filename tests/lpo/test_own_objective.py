@@ -1,9 +1,11 @@
 """Objectives of one's own: functions of ratio and advantage, and families of drifts, by object and by name."""
 
 import importlib
+import json
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
+from functools import partial, wraps
 
 import jax
 import jax.numpy as jnp
@@ -48,9 +50,6 @@ class Power(lpo.Drift):
     def __call__(self, parameters, log_ratio, advantage, progress, xp=jnp):
         return xp.abs(parameters["w"][0]) * log_ratio**self.power
 
-class Thawed(lpo.Drift):
-    init = __call__ = None
-
 mine = lpo.Objective("another name", Power(4), {"w": jnp.ones(1)})
 number = 3
 text = "ppo"
@@ -90,7 +89,7 @@ def test_a_function_of_ratio_and_advantage_is_an_objective(module):
     in_jax = np.asarray(lpo.drift_function(ours)(LOG_RATIO, ADVANTAGE))
     assert in_jax == pytest.approx(theirs, abs=1e-6)
     assert lpo.numpy_drift(ours)(LOG_RATIO, ADVANTAGE) == pytest.approx(theirs, abs=1e-6)
-    assert lpo.certify(ours).holds
+    assert lpo.certify("own_module:clipped").holds
 
 
 def test_the_same_in_pytorch(module):
@@ -183,13 +182,80 @@ def test_rows_of_what_a_module_said_before_are_refused(module, tmp_path):
         measured()
 
 
-def test_what_is_ours_or_has_no_source_is_told_too():
-    assert code_of(load_objective("lpo-pendulum").drift) == {}
-    typed: dict = {"__name__": "__main__"}
-    for body in ("1.0", "2.0"):
-        exec(f"def f{body[0]}(ratio, advantage): return {body} * ratio", typed)
-    one, two = (code_of(typed[name]) for name in ("f1", "f2"))
-    assert set(one.values()) != set(two.values())
+def code(thing):
+    """What is told of an objective's code."""
+    return code_of(load_objective(thing).drift)
+
+
+def typed(text, name="f", **given):
+    """A function or class of code that is in no file."""
+    space = {"__name__": "__main__", "lpo": lpo, "dataclass": dataclass, "jnp": jnp, **given}
+    exec(text, space)
+    return space[name]
+
+
+FUNCTION = """def f(ratio, advantage, xp):
+    return xp.minimum(ratio * advantage, sum((lambda z: z)(x) for x in [1.0]))
+"""
+FAMILY = """@dataclass(frozen=True)
+class F(lpo.NoDrift):
+    def __call__(self, parameters, log_ratio, advantage, progress, xp=jnp):
+        return 1.0 * log_ratio**2
+"""
+
+
+@pytest.mark.parametrize(
+    ("text", "name", "old", "new", "layout"),
+    [
+        (FUNCTION, "f", "minimum", "maximum", "    return"),
+        (FUNCTION, "f", "[1.0]", "[2.0]", "    return"),
+        (FAMILY, "F", "1.0 *", "2.0 *", "        return"),
+    ],
+)
+def test_code_that_is_in_no_file_is_told_apart(text, name, old, new, layout):
+    same = text.replace(layout, f'{layout.replace("return", "")}"""Says."""\n\n{layout}')
+    assert code(typed(text, name)) == code(typed(same, name)) != {}
+    assert code(typed(text, name)) != code(typed(text.replace(old, new), name))
+
+
+def scaled(factor):
+    def decorated(function):
+        @wraps(function)
+        def inner(*given, **named):
+            return factor * function(*given, **named)
+
+        return inner
+
+    return decorated
+
+
+def with_default(strength):
+    def surrogate(ratio, advantage, strength=strength):
+        return strength * ratio * advantage
+
+    return surrogate
+
+
+class Called:
+    def __init__(self, strength):
+        self.strength = strength
+
+    def __call__(self, ratio, advantage):
+        return self.strength * ratio * advantage
+
+
+def of_a_global(strength):
+    return typed("def f(ratio, advantage): return LIMIT * ratio * advantage", LIMIT=strength)
+
+
+def of_a_table(strength):
+    table = {"strength": np.array([strength])}
+    return lambda ratio, advantage: table["strength"] * ratio * advantage
+
+
+def of_a_helper(strength):
+    helper = typed(f"def f(x): return {strength} * x")
+    return typed("def f(ratio, advantage): return helper(ratio) * advantage", helper=helper)
 
 
 def squared(strength):
@@ -203,7 +269,33 @@ def power(ratio, advantage, strength=1.0):
     return squared(strength)(ratio, advantage)
 
 
-@pytest.mark.parametrize("made", [squared, lambda x: partial(power, strength=x)])
+@pytest.mark.parametrize(
+    "made",
+    [
+        squared,
+        with_default,
+        Called,
+        of_a_global,
+        of_a_table,
+        of_a_helper,
+        lambda x: partial(power, strength=x),
+        lambda x: jax.jit(partial(power, strength=x)),
+        lambda x: scaled(x)(power),
+        lambda x: Called(x).__call__,
+    ],
+)
+def test_what_a_function_was_made_with_counts(made):
+    assert code(made(0.5)) == code(made(0.5)) != {}
+    assert code(made(0.5)) != code(made(0.7))
+
+
+def test_of_ours_and_libraries_nothing_counts():
+    assert code("lpo-pendulum") == code("dpo") == {}
+    (only,) = code(lambda ratio, advantage: jnp.tanh(ratio) * advantage)
+    assert only == f"{__name__}:test_of_ours_and_libraries_nothing_counts.<locals>.<lambda>"
+
+
+@pytest.mark.parametrize("made", [squared, Called, lambda x: partial(power, strength=x)])
 def test_values_that_a_function_was_made_with_count(made, tmp_path):
     def measured(objective):
         arguments = {"spec": tiny_spec(), "points": 1, "episodes": 2, "rows": tmp_path / "r.jsonl"}
@@ -218,21 +310,78 @@ def test_values_that_a_function_was_made_with_count(made, tmp_path):
 def test_functions_in_wrappers_are_themselves():
     for wrapped in (partial(power, strength=1.0), jax.jit(power)):
         assert load_objective(wrapped).name == "power"
-        assert list(code_of(load_objective(wrapped).drift)) == [f"{__name__}:power"]
-    for wrong in (max, lpo.compare.__call__, (1).__add__):
-        with pytest.raises(UserError, match="give a function of ratio and advantage"):
-            load_objective(wrong)
+        assert next(iter(code(wrapped))) == f"{__name__}:power"
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        (max, "max does not say what it takes"),
+        (int, "of the class type is no objective"),
+        (lpo.Drift, "Drift cannot be made as it is"),
+        (SurrogateDrift, "SurrogateDrift cannot be made as it is"),
+    ],
+)
+def test_callables_that_are_none(wrong, message):
+    with pytest.raises(UserError, match=message):
+        load_objective(wrong)
+
+
+def test_several_of_one_function_have_names_by_a_dict():
+    strengths = {f"square {x}": partial(power, strength=x) for x in (0.5, 1.0)}
+    assert [o.name for o in load_apart(strengths)] == ["square 0.5", "square 1.0"]
+    with pytest.raises(UserError, match=r"is there twice: .* by a dict {name: objective}"):
+        load_apart(strengths.values())
+
+
+def test_rows_of_before_code_was_told_go_on(tmp_path):
+    def measured():
+        arguments = {"spec": tiny_spec(), "points": 1, "episodes": 2, "rows": tmp_path / "r.jsonl"}
+        (curve,) = lpo.compare("Synthetic-Pendulum-v1", [power], [0], **arguments).curves
+        return curve.returns.tolist()
+
+    before, described = measured(), tmp_path / "r.json"
+    told = json.loads(described.read_text())
+    (configuration,) = told.values()
+    assert configuration.pop("objective_code")
+    described.write_text(json.dumps(told))
+    assert measured() == before
+
+
+def test_a_family_inside_of_another_has_a_name_of_its_own():
+    @dataclass(frozen=True)
+    class Base(lpo.NoDrift):
+        pass
+
+    @dataclass(frozen=True)
+    class Sub(Base):
+        function: Callable = power
+
+    assert [o.name for o in load_apart([Base, Sub])] == ["Base", "Sub"]
+    with pytest.raises(UserError, match="setting function of the drift Sub is a function"):
+        Sub().to_config()
+
+    class Thawed(lpo.Drift):
+        init = __call__ = lambda self, *_: jnp.zeros(())
+
+    with pytest.raises(UserError, match="Thawed is no frozen dataclass"):
+        load_objective(Thawed)
+
+
+def test_certificates_are_of_whatever_is_an_objective():
+    found = [lpo.certify(x) for x in ("ppo", load_objective("ppo").drift, load_objective("ppo"))]
+    assert found[0] == found[1] == found[2]
 
 
 def test_a_family_counts_with_what_it_inherits_from(module, tmp_path):
     heir = "from own_module import Power\n\nclass Heir(Power):\n    pass\n"
     (tmp_path / "heirs.py").write_text(heir)
     try:
-        before = code_of(load_objective("heirs:Heir").drift)
-        assert list(before) == ["heirs:Heir", "own_module:Power"]
+        before = code("heirs:Heir")
+        assert list(before) == ["heirs:Heir"]
         sys.modules.pop("heirs")
         module("log_ratio**self.power", "log_ratio**2")
-        assert code_of(load_objective("heirs:Heir").drift) != before
+        assert code("heirs:Heir") != before
     finally:
         sys.modules.pop("heirs", None)
 
@@ -277,7 +426,6 @@ def test_a_family_of_ones_own_is_learned_and_its_run_continued(module, capsys):
     ("name", "message"),
     [
         ("own_module:squared", "is a function: it must be a subclass of lpo.Drift"),
-        ("own_module:Thawed", "is no frozen dataclass"),
         ("lpo.drifts:NoDrift", "does not learn"),
         ("nothing", "unknown learned drift"),
     ],
