@@ -7,7 +7,7 @@ their weights are: of those the slope beside ratio 1 is what is judged.
 """
 
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -15,9 +15,9 @@ import numpy as np
 
 from lpo.drifts.contract import Drift
 from scb.agents.ppo import MAX_LOG_RATIO
-
-if TYPE_CHECKING:
-    from lpo.objectives import Named
+from scb.errors import UserError
+from scb.keys import root_key
+from scb.objectives import Objective
 
 # As much as the advantages of a minibatch of 1000 correlate with any direction by chance, 1 / sqrt(1000).
 LARGEST_KINK = 0.03
@@ -86,7 +86,7 @@ class Certificate:
 
 
 def certify(
-    drift: "Named",
+    drift: Drift | Objective,
     parameters: Any = None,
     num_ratios: int = 2001,
     num_advantages: int = 401,
@@ -94,17 +94,20 @@ def certify(
     """Evaluates a drift on a grid of ratios and advantages, and its slope around ratio 1.
 
     Args:
-      drift: any member of the contract, with its parameters; or without these what `load_objective` takes.
-      parameters: as from the drift's `init`.
+      drift: any member of the contract, or an objective, which has its parameters.
+      parameters: of a drift; what it starts with where they are left out.
       num_ratios: points of log-ratio, in [-3, 3] and, a quarter as many, out to the bound that
         training clips at.
       num_advantages: points of advantage in [-10, 10], the tails of a normalised minibatch.
     """
-    if parameters is None or not isinstance(drift, Drift):
-        from lpo.objectives import load_objective  # which certifies what it saves
-
-        objective = load_objective(drift)
-        drift, parameters = objective.drift, objective.parameters
+    if not isinstance(drift, Drift):
+        if not isinstance(getattr(drift, "drift", None), Drift):
+            raise UserError(
+                f"something of the class {type(drift).__name__} is no drift: give one with its parameters, or what "
+                "lpo.load_objective returns."
+            )
+        return certify(drift.drift, drift.parameters, num_ratios, num_advantages)
+    parameters = drift.init(root_key(0)) if parameters is None else parameters
     inner = np.linspace(-3.0, 3.0, num_ratios | 1)
     outer = np.linspace(-MAX_LOG_RATIO, MAX_LOG_RATIO, (num_ratios // 4) | 1)
     log_ratios = jnp.asarray(np.union1d(inner, outer), jnp.float32)

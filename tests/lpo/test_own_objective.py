@@ -89,7 +89,7 @@ def test_a_function_of_ratio_and_advantage_is_an_objective(module):
     in_jax = np.asarray(lpo.drift_function(ours)(LOG_RATIO, ADVANTAGE))
     assert in_jax == pytest.approx(theirs, abs=1e-6)
     assert lpo.numpy_drift(ours)(LOG_RATIO, ADVANTAGE) == pytest.approx(theirs, abs=1e-6)
-    assert lpo.certify("own_module:clipped").holds
+    assert lpo.certify(ours).holds
 
 
 def test_the_same_in_pytorch(module):
@@ -368,9 +368,11 @@ def test_a_family_inside_of_another_has_a_name_of_its_own():
         load_objective(Thawed)
 
 
-def test_certificates_are_of_whatever_is_an_objective():
-    found = [lpo.certify(x) for x in ("ppo", load_objective("ppo").drift, load_objective("ppo"))]
-    assert found[0] == found[1] == found[2]
+def test_certificates_are_of_drifts_and_objectives():
+    ppo = load_objective("ppo")
+    assert lpo.certify(ppo) == lpo.certify(ppo.drift) == lpo.certify(ppo.drift, ppo.parameters)
+    with pytest.raises(UserError, match="of the class str is no drift: give one"):
+        lpo.certify("ppo")
 
 
 def test_a_family_counts_with_what_it_inherits_from(module, tmp_path):
