@@ -109,7 +109,7 @@ class _Reading:
 
     def __init__(self) -> None:
         self.own: list[str] = []
-        self._met: set[int] = set()
+        self._met: dict[int, Any] = {}  # held, so that nothing else comes to be where one was
 
     def of(self, value: Any) -> Any:
         match value:
@@ -127,7 +127,7 @@ class _Reading:
                 return value.__name__
         if id(value) in self._met:
             return "as before"
-        self._met.add(id(value))
+        self._met[id(value)] = value
         match value:
             case FunctionType():
                 return self._function(value)

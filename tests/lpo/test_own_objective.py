@@ -102,7 +102,7 @@ def test_the_same_in_pytorch(module):
     whole = torch.tensor([1, 2]), torch.ones(2)
     assert lpo.torch_loss("ppo")(*whole).item() == pytest.approx(-1.2)
     of_jax = load_objective(lambda ratio, advantage: jnp.minimum(ratio, 1.0) * advantage)
-    with pytest.raises(UserError, match=r"does not compute with torch .*: let it take xp"):
+    with pytest.raises(UserError, match=r"does not compute with PyTorch .*: let it take xp"):
         lpo.torch_drift(of_jax)(*given)
 
 
