@@ -207,9 +207,9 @@ def elsewhere(
     Raises:
       UserError: some of them failed; what the others found is in the report.
     """
+    make_folder(folder)
     # Two that stand in one place are one: its job would only wait for the other's.
     named = {part.name: part for part in parts if not part.there(report)}
-    make_folder(folder)
     kept = {part: folder / f"{_digest(part, settings)}.json" for part in named.values()}
 
     def taken(part: Part) -> bool:

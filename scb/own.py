@@ -12,7 +12,7 @@ import sys
 import sysconfig
 from collections.abc import Iterable, Mapping
 from dataclasses import fields, is_dataclass
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from types import CodeType, FunctionType, MethodType, ModuleType
 from typing import Any
@@ -65,7 +65,7 @@ def reference(thing: Any, kind: str) -> str:
     Raises:
       UserError: no import finds it: it is defined inside of a function, in a notebook or in the script that runs.
     """
-    name = f"{thing.__module__}:{thing.__qualname__}"
+    name = _called(thing)
     there = getattr(sys.modules.get(thing.__module__), thing.__qualname__, None)
     if is_own(name) and thing.__module__ != "__main__" and there is thing:
         return name
@@ -84,7 +84,8 @@ def module_code(names: Iterable[str]) -> dict[str, str]:
     for name in filter(is_own, names):
         # A module that cannot be imported is told of where the thing is made.
         with contextlib.suppress(Exception):
-            found[name] = _digest(inspect.getsource(_module(name.partition(":")[0])))
+            said = ast.unparse(ast.parse(inspect.getsource(_module(name.partition(":")[0]))))
+            found[name] = hashlib.sha256(said.encode()).hexdigest()
     return found
 
 
@@ -141,6 +142,8 @@ class _Reading:
                 ]
             case property():
                 return ["property", *map(self.of, (value.fget, value.fset))]
+            case cached_property():
+                return ["property", self.of(value.func)]
             case partial():
                 return ["partial", *map(self.of, (value.func, value.args, value.keywords))]
             case np.ndarray() | np.generic() | jax.Array():
@@ -181,21 +184,7 @@ class _Reading:
         if not _is_somebodys(made):
             return _called(made)
         self.own.append(_called(made))
-        kinds = (
-            FunctionType,
-            staticmethod,
-            classmethod,
-            property,
-            partial,
-            bool,
-            int,
-            float,
-            str,
-            tuple,
-        )
-        said = {
-            k: x for k, x in vars(made).items() if isinstance(x, kinds) and k not in _ABOUT_CLASSES
-        }
+        said = {k: x for k, x in vars(made).items() if k not in _ABOUT_CLASSES}
         return ["class", self.of(said), *map(self.of, made.__bases__)]
 
 
@@ -227,8 +216,3 @@ def _is_somebodys(thing: Any) -> bool:
     if home == "__main__" or file is None:  # typed, or Python's and without a file
         return home not in sys.builtin_module_names
     return not any(Path(file).is_relative_to(library) for library in _LIBRARIES)
-
-
-def _digest(source: str) -> str:
-    said = ast.unparse(ast.parse(source))
-    return hashlib.sha256(said.encode()).hexdigest()

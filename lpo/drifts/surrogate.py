@@ -3,7 +3,7 @@
 import inspect
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from typing import Any, ClassVar
 
 import jax
@@ -56,7 +56,7 @@ class SurrogateDrift(Drift):
             function = function.func
         return str(getattr(function, "__name__", type(function).__name__))
 
-    @property
+    @cached_property  # a training loop in PyTorch calls this for every minibatch
     def _takes(self) -> list[str]:
         parameters = inspect.signature(self.function).parameters.values()
         by_name = (x for x in parameters if x.kind in (x.POSITIONAL_OR_KEYWORD, x.KEYWORD_ONLY))

@@ -5,7 +5,7 @@ import json
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial, wraps
+from functools import cached_property, partial, wraps
 
 import jax
 import jax.numpy as jnp
@@ -189,7 +189,8 @@ def code(thing):
 
 def typed(text, name="f", **given):
     """A function or class of code that is in no file."""
-    space = {"__name__": "__main__", "lpo": lpo, "dataclass": dataclass, "jnp": jnp, **given}
+    space = {"__name__": "__main__", "lpo": lpo, "dataclass": dataclass, "jnp": jnp}
+    space |= {"cached_property": cached_property, **given}
     exec(text, space)
     return space[name]
 
@@ -199,6 +200,12 @@ FUNCTION = """def f(ratio, advantage, xp):
 """
 FAMILY = """@dataclass(frozen=True)
 class F(lpo.NoDrift):
+    TABLE = {"weights": jnp.ones(3)}
+
+    @cached_property
+    def strength(self):
+        return 5.0
+
     def __call__(self, parameters, log_ratio, advantage, progress, xp=jnp):
         return 1.0 * log_ratio**2
 """
@@ -210,6 +217,8 @@ class F(lpo.NoDrift):
         (FUNCTION, "f", "minimum", "maximum", "    return"),
         (FUNCTION, "f", "[1.0]", "[2.0]", "    return"),
         (FAMILY, "F", "1.0 *", "2.0 *", "        return"),
+        (FAMILY, "F", "jnp.ones", "jnp.zeros", "        return"),
+        (FAMILY, "F", "5.0", "6.0", "        return"),
     ],
 )
 def test_code_that_is_in_no_file_is_told_apart(text, name, old, new, layout):
