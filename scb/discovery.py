@@ -25,6 +25,7 @@ from scb.agents.spec import (
     check_algorithms,
     configured,
 )
+from scb.analysis.optimal_actions import optimal_policy
 from scb.curriculum import EpisodeLengths, check_curriculum, paper_curriculum
 from scb.discovery_config import DiscoveryConfig as DiscoveryConfig
 from scb.environments.registry import environment_spec
@@ -32,6 +33,7 @@ from scb.environments.synthetic import SyntheticBandit, Weights
 from scb.environments.synthetic_mdp import synthetic_for
 from scb.environments.zoo import bandit_metadata, load_bandit, save_bandit
 from scb.errors import UserError, one_of
+from scb.evaluation import evaluate
 from scb.evolution import EnvironmentSteps, Outcome, evolve
 from scb.fitting import standardize_reward
 from scb.judgement import check_fits
@@ -42,6 +44,8 @@ from scb.runs import Run, config_dict, run_of
 from scb.spaces import check_bounded, kind_of_actions
 from scb.strategies import strategy_for
 from scb.warm_start import expert_agent, warm_start
+
+OPTIMAL_POLICY = "optimal policy"  # in logs, beside the algorithms
 
 
 class BanditDiscovery:
@@ -216,12 +220,15 @@ class BanditDiscovery:
             )
 
         names = list(self.specs)
+        own: dict[str, jax.Array] = {}
+        if config.optimal_policy_episodes:
+            own = {OPTIMAL_POLICY: self._own(candidate, key, env_params, limit)[None]}
         if config.mode == "all":
             returns = {
                 # The first has the generation's own key, as where it is alone.
                 name: returns_of(name, named_key(key, name) if i else key)
                 for i, name in enumerate(names)
-            }
+            } | own
             means = {f"fitness/{name}": r.mean() for name, r in returns.items()}
             return {"fitness": jnp.concatenate(list(returns.values())), **means}
         # The generation is no member of the population, so this stays a branch and trains one
@@ -229,12 +236,12 @@ class BanditDiscovery:
         turns = jnp.asarray([names.index(name) for name in config.algorithms])
         turn = turns[generation % len(config.algorithms)]
         branches = [lambda key, name=name: returns_of(name, key) for name in names]
-        fitness = jax.lax.switch(turn, branches, key)
+        returns = jax.lax.switch(turn, branches, key)
         logged = {
-            f"fitness/{name}": jnp.where(turn == i, fitness.mean(), jnp.nan)
+            f"fitness/{name}": jnp.where(turn == i, returns.mean(), jnp.nan)
             for i, name in enumerate(names)
-        }
-        return {"fitness": fitness, **logged}
+        } | {f"fitness/{name}": r.mean() for name, r in own.items()}
+        return {"fitness": jnp.concatenate([returns, *own.values()]), **logged}
 
     def _earned(
         self,
@@ -256,6 +263,16 @@ class BanditDiscovery:
         )
         return earned["return"].returns.mean()
 
+    def _own(
+        self, weights: Weights, key: jax.Array, env_params: Any, limit: ArrayLike | None = None
+    ) -> jax.Array:
+        """[] mean return in the evaluation environment of a candidate's own optimal policy."""
+        assert isinstance(self.bandit, SyntheticBandit)
+        policy = optimal_policy(self.bandit, self.bandit.params(weights))
+        key_own, number = named_key(key, OPTIMAL_POLICY), self.config.optimal_policy_episodes
+        episodes = evaluate(self.place.env, env_params, policy, key_own, number, limit)
+        return episodes.returns.mean()
+
     def evaluate_mean(self, candidate: Weights, key: jax.Array) -> dict[str, jax.Array]:
         results = {}
         for i, (name, spec) in enumerate(self.specs.items()):
@@ -264,6 +281,8 @@ class BanditDiscovery:
             results[f"fitness/{name}"] = self._earned(
                 name, candidate, drawn, key_agent, self.place.params
             )
+        if self.config.optimal_policy_episodes:
+            results[f"fitness/{OPTIMAL_POLICY}"] = self._own(candidate, key, self.place.params)
         return {"fitness": jnp.stack(list(results.values())).mean(), **results}
 
     def steps(self, generation: int = 0) -> EnvironmentSteps:
@@ -272,15 +291,17 @@ class BanditDiscovery:
         names: Sequence[str] = list(self.specs)
         if config.mode == "sequential":
             names = [config.algorithms[generation % len(config.algorithms)]]
-        episodes = len(names) * config.evaluation_episodes
-        return config.agents_per_candidate * EnvironmentSteps(
-            training=sum(self.specs[name].steps for name in names),
-            evaluation=episodes * self._lengths.steps(generation),
+        agents, length = config.agents_per_candidate, self._lengths.steps(generation)
+        episodes = agents * len(names) * config.evaluation_episodes
+        return EnvironmentSteps(
+            training=agents * sum(self.specs[name].steps for name in names),
+            evaluation=(episodes + config.optimal_policy_episodes) * length,
         )
 
     def judgement_steps(self) -> EnvironmentSteps:
-        """Of one agent of each algorithm, in episodes of the environment's own length."""
+        """Of one agent of each algorithm, and the optimal policy, in episodes of the environment's own length."""
         episodes = len(self.specs) * self.config.evaluation_episodes
+        episodes += self.config.optimal_policy_episodes
         return EnvironmentSteps(
             training=sum(spec.steps for spec in self.specs.values()),
             evaluation=episodes * int(self.place.params.max_steps_in_episode),

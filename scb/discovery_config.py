@@ -61,6 +61,10 @@ class DiscoveryConfig:
       agents_per_candidate: agents of each trained algorithm whose returns are a candidate's fitness.
       evaluation_episodes: of each agent in the evaluation environment.
       mode_actions: evaluate the most likely actions during the search, rather than sampled ones.
+      optimal_policy_episodes: of a candidate's own optimal policy in the evaluation environment, whose mean return
+        counts as much as an agent's. It costs no training, and stands for agents that learn the bandit well
+        but are not trained in the search. 0 leaves it out. Cheap of linear bandits and discrete actions; of
+        networks with continuous ones every step climbs the reward.
       curriculum: of the evaluation episodes' length: paper, none, or
         SHAPE:INITIAL:FINAL:BEGIN:TRANSITION such as linear:100:1000:20:160 (lengths in steps, then
         generations).
@@ -96,6 +100,7 @@ class DiscoveryConfig:
     agents_per_candidate: int = 4
     evaluation_episodes: int = 16
     mode_actions: bool = False
+    optimal_policy_episodes: int = 0
     curriculum: Annotated[CurriculumConfig | str | None, _Curriculum] = None
     init: str = "expert"
     start: Annotated[str | None, tyro.conf.arg(name="from-bandit")] = None
@@ -211,3 +216,9 @@ class DiscoveryConfig:
                 f"reward_std is for bandits, and parameterization {self.parameterization} is none: leave it out."
             )
         at_least(1, self, "agents_per_candidate", "evaluation_episodes")
+        at_least(0, self, "optimal_policy_episodes")
+        if self.optimal_policy_episodes and self.parameterization != "I":
+            raise UserError(
+                f"parameterization {self.parameterization} is no bandit, whose optimal policy is read off its reward: "
+                "leave optimal_policy_episodes out."
+            )

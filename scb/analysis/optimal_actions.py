@@ -2,7 +2,7 @@
 
 In a bandit the reward is the Q-function (Liesen et al., 2024, eq. 2), so the optimal policy is an
 argmax over actions: all of them where they are discrete, a grid or a gradient ascent where they are
-continuous.
+continuous. In a linear bandit it is written down.
 """
 
 from collections.abc import Callable
@@ -14,6 +14,7 @@ import numpy as np
 import optax
 from gymnax.environments import spaces
 
+from scb.environments.linear import PolicyDistanceParts
 from scb.environments.synthetic import BanditParams, SyntheticBandit
 from scb.errors import UserError, one_of
 from scb.evaluation import Policy
@@ -34,8 +35,9 @@ def optimal_actions(
     Args:
       bandit: whose noiseless reward is maximised.
       params: its parameters; its own where None.
-      method: for continuous actions. "gradient" climbs from the centre and 15 random actions and keeps
-        the best; "grid" tries 101 values in each dimension. Discrete actions are all tried.
+      method: for continuous actions of a bandit with networks. "gradient" climbs from the centre and 15 random
+        actions and keeps the best; "grid" tries 101 values in each dimension. A linear bandit's best
+        action is written in its weights, and discrete actions are all tried.
 
     Returns:
       [O] context -> action within the bounds, of the action space's shape. To be jitted and vmapped
@@ -51,6 +53,8 @@ def optimal_actions(
         candidates = jnp.arange(space.n)
     elif method == "grid":
         candidates = _grid(space)
+    elif bandit.linear:
+        return _read_off(bandit, params, space)
     else:
         return _ascent(bandit, params, space)
 
@@ -88,6 +92,13 @@ def _grid(space: spaces.Box) -> jax.Array:
         )
     axes = np.meshgrid(*np.linspace(low, high, GRID_POINTS).T, indexing="ij")
     return jnp.asarray(np.stack([x.ravel() for x in axes], axis=1).reshape(number, *space.shape))
+
+
+def _read_off(
+    bandit: SyntheticBandit, params: BanditParams, space: spaces.Box
+) -> Callable[[jax.Array], jax.Array]:
+    parts = PolicyDistanceParts.of(params.weights["reward"], *bandit.bounds)
+    return lambda context: jnp.reshape(parts.action(parts.best(context)), space.shape)
 
 
 def _ascent(

@@ -58,6 +58,18 @@ def test_gradient_is_no_worse_than_the_grid_in_a_discovered_bandit():
     assert float(np.min(rewards["gradient"] - rewards["grid"])) > -0.02 * spread
 
 
+def test_a_linear_bandits_optimum_is_read_off_its_weights():
+    bandit = load_bandit("Synthetic-MountainCarContinuous-v0")
+    contexts = jnp.asarray(bandit_states(bandit, jax.random.key(1), 50))
+    read, tried = (
+        jax.jit(jax.vmap(optimal_actions(bandit, method=method)))(contexts)
+        for method in ("gradient", "grid")
+    )
+    assert read.shape == (50, 1)
+    np.testing.assert_allclose(read, tried, atol=0.011)
+    assert float(jnp.ptp(read)) > 1  # they are no constant
+
+
 def test_discrete_optimum_is_the_argmax_over_all_actions():
     bandit = load_bandit("Synthetic-Acrobot-v1")
     contexts = jnp.asarray(bandit_states(bandit, jax.random.key(1), 50))

@@ -9,6 +9,7 @@ from gymnax.environments import spaces
 from scb.agents.dqn import DQNConfig
 from scb.agents.ppo import PPOConfig, PPOHyperparameters
 from scb.agents.spec import AgentSpec, algorithms_for, bandit_agent
+from scb.analysis.optimal_actions import optimal_policy
 from scb.curriculum import CurriculumConfig, paper_curriculum
 from scb.discovery import (
     BanditDiscovery,
@@ -25,10 +26,11 @@ from scb.environments.zoo import (
     zoo_names,
 )
 from scb.errors import UserError
-from scb.evaluation import Episodes
+from scb.evaluation import Episodes, evaluate
 from scb.evolution import EvolutionConfig, evaluated, map_population
 from scb.fitting import standardize_reward
 from scb.judgement import check_fits, judge
+from scb.keys import named_key
 from scb.measurement import Place
 from scb.runs import Run, config_dict
 from scb.statistics import iqm
@@ -307,6 +309,40 @@ def test_in_the_mode_sequential_the_mean_is_judged_by_every_algorithm(trained_in
     judged = trained_in_turns[2].metrics[0]
     both = judged["mean/fitness/ppo"] + judged["mean/fitness/dqn"]
     assert judged["mean/fitness"] == pytest.approx(both / 2, rel=1e-5)
+
+
+# -- the optimal policy
+# -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("mode", ["all", "sequential"])
+def test_a_candidates_own_optimal_policy_is_one_more_task(discovered, mode):
+    _, outcome = discovered
+    config = replace(CONFIG, mode=mode, agents_per_candidate=1, optimal_policy_episodes=2)
+    problem, without = (
+        BanditDiscovery(c) for c in (config, replace(config, optimal_policy_episodes=0))
+    )
+    key, place = jax.random.key(5), problem.place
+    made, agents = (
+        jax.jit(p.evaluate)(outcome.mean, key, jnp.int32(0)) for p in (problem, without)
+    )
+    np.testing.assert_array_equal(made["fitness"][:-1], agents["fitness"])
+    # It has the generation's own start states, and what it earns is no agent's.
+    policy = optimal_policy(problem.bandit, problem.bandit.params(outcome.mean))
+    episodes = evaluate(place.env, place.params, policy, named_key(key, "optimal policy"), 2)
+    assert made["fitness"][-1] == made["fitness/optimal policy"] == episodes.returns.mean()
+    judged = problem.evaluate_mean(outcome.mean, key)
+    both = judged["fitness/ppo"] + judged["fitness/optimal policy"]
+    assert float(judged["fitness"]) == pytest.approx(float(both) / 2, rel=1e-6)
+    # It trains nothing, and CartPole's episodes have 500 steps at most.
+    for steps in ("steps", "judgement_steps"):
+        more, fewer = (getattr(p, steps)() for p in (problem, without))
+        assert (more.training, more.evaluation) == (fewer.training, fewer.evaluation + 2 * 500)
+
+
+def test_a_synthetic_mdp_has_no_optimal_policy_to_judge():
+    with pytest.raises(UserError, match="leave optimal_policy_episodes out"):
+        replace(CONFIG, parameterization="TI", optimal_policy_episodes=1)
 
 
 class Killed(BaseException):
