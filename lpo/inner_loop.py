@@ -24,7 +24,7 @@ from scb.evolution import EnvironmentSteps, EvolutionConfig
 from scb.keys import named_key, root_key, split_key
 from scb.lists import read_values, write_values
 from scb.measurement import Judge, spaced, train_and_judge
-from scb.own import code_of, module_code
+from scb.own import code_of, code_of_names
 
 _OF_BANDITS = ("contexts", "reward_noise")
 POINTS = 5  # of the curve that the area is under
@@ -183,7 +183,7 @@ class MetaTrainingConfig:
 
     def checksums(self) -> dict[str, str]:
         """The same, and of the code of environments and drifts of one's own."""
-        return self.weights() | module_code({*self.tasks, *self.homes}) | code_of(self.drift)
+        return self.weights() | code_of_names({*self.tasks, *self.homes}) | code_of(self.drift)
 
     def at_home(self) -> "MetaTrainingConfig":
         """The same on the tasks' evaluation environments themselves."""

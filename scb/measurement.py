@@ -28,7 +28,7 @@ from scb.files import plain
 from scb.keys import root_key, split_key
 from scb.machine import package_versions
 from scb.objectives import Objective, programs_for
-from scb.own import code_of, module_code
+from scb.own import code_of, code_of_names
 from scb.rows import Row, Rows
 
 MODE, SAMPLED = "mode", "sampled"
@@ -285,7 +285,7 @@ def measure(
         "trained_in": params[0],
         "judged_in": params[1],
         "physics": train_in.backend,
-        "code": module_code([train_in.name, judge_in.name]),
+        "code": code_of_names([train_in.name, judge_in.name]),
         # Drawn agents share the values of lists out: of another number each has others.
         "drawn": len(agents.names) if agents.drawn else None,
         "points": points,

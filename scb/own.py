@@ -1,11 +1,9 @@
 """Somebody's own code by name, `package.module:attribute`, of a module that Python finds from the working directory."""
 
-import ast
 import contextlib
 import dis
 import hashlib
 import importlib
-import inspect
 import json
 import re
 import sys
@@ -75,30 +73,27 @@ def reference(thing: Any, kind: str) -> str:
     )
 
 
-def module_code(names: Iterable[str]) -> dict[str, str]:
-    """{name: SHA-256} of those of the names that are somebody's own: of what the module says, but comments and layout.
-
-    What that module imports does not count, nor one without source.
-    """
-    found = {}
-    for name in filter(is_own, names):
-        # A module that cannot be imported is told of where the thing is made.
-        with contextlib.suppress(Exception):
-            said = ast.unparse(ast.parse(inspect.getsource(_module(name.partition(":")[0]))))
-            found[name] = hashlib.sha256(said.encode()).hexdigest()
-    return found
-
-
 def code_of(thing: Any) -> dict[str, str]:
     """{name: SHA-256} of what somebody's own functions and classes compute, of which an object is made; empty for none.
 
     By their compiled code, in which comments and layout are not. With it count defaults, what partials, decorators and
     functions around them hold, base classes, and the functions, classes and values of their modules that they name;
-    of libraries and of this one nothing does.
+    of libraries and of this one nothing does, but what an object of theirs holds.
     """
     reading = _Reading()
-    said = json.dumps(reading.of(thing))
+    said = json.dumps(reading.whole(thing))
     return {reading.own[0]: hashlib.sha256(said.encode()).hexdigest()} if reading.own else {}
+
+
+def code_of_names(names: Iterable[str]) -> dict[str, str]:
+    """{name: SHA-256} of those of the names that stand for somebody's own code."""
+    found = {}
+    for name in filter(is_own, names):
+        # One that cannot be imported is told of where the thing is made.
+        with contextlib.suppress(UserError):
+            if code := code_of(imported(name, "code", "name")):
+                (found[name],) = code.values()
+    return found
 
 
 class _Reading:
@@ -110,7 +105,18 @@ class _Reading:
 
     def __init__(self) -> None:
         self.own: list[str] = []
-        self._met: dict[int, Any] = {}  # held, so that nothing else comes to be where one was
+        # Held, so that nothing else comes to be where one was.
+        self._met: dict[int, Any] = {}
+        self._whole: dict[int, Any] = {}
+
+    def whole(self, value: Any) -> Any:
+        """As `of`, but an object of a library, such as a wrapper, is what it holds, too."""
+        said, new = self.of(value), id(value) not in self._whole
+        self._whole[id(value)] = value
+        if not new or isinstance(value, type | FunctionType) or _is_somebodys(type(value)):
+            return said
+        held = {} if is_dataclass(value) else getattr(value, "__dict__", {})
+        return [said, *([k, self.whole(x)] for k, x in held.items())] if held else said
 
     def of(self, value: Any) -> Any:
         match value:
@@ -119,7 +125,7 @@ class _Reading:
             case tuple() | list():
                 return [type(value).__name__, *map(self.of, value)]
             case set() | frozenset():
-                return ["set", *sorted(map(repr, value))]
+                return ["set", *sorted(json.dumps(self.of(x)) for x in value)]
             case Mapping():
                 return ["mapping", *([repr(k), self.of(value[k])] for k in sorted(value, key=repr))]
             case CodeType():

@@ -13,7 +13,7 @@ from scb.environments.registry import check_backend, environment_spec, make
 from scb.environments.zoo import bandit_metadata
 from scb.errors import UserError
 from scb.measurement import Place, as_random
-from scb.own import module_code
+from scb.own import code_of_names
 
 MODULE = """
 import gymnax, jax.numpy as jnp
@@ -135,17 +135,58 @@ def test_an_environment_itself_is_taken_as_well_as_what_makes_it(module):
     assert env.name == "Pendulum-v1" and params.max_steps_in_episode == 200
 
 
-def test_the_code_of_an_environment_counts_and_its_comments_do_not(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "path", [*sys.path])
-    names = [f"{tmp_path.name.replace('-', '_')}_{i}" for i in range(3)]
-    for name, said in zip(
-        names, (MODULE, "# Mine.\n" + MODULE, MODULE + "number = 4"), strict=True
-    ):
-        (tmp_path / f"{name}.py").write_text(said)
-    one, same, other = (module_code([f"{x}:alone", "Pendulum-v1"])[f"{x}:alone"] for x in names)
-    assert one == same != other
-    assert module_code(["Pendulum-v1", "nowhere.at_all:make", "C:/nothing"]) == {}
+CODE = """
+import jax.numpy as jnp
+from gymnax.environments.classic_control.pendulum import Pendulum
+from gymnax.wrappers.purerl import FlattenObservationWrapper
+from helper import cost
+
+PULL = 2.0
+
+class Harder(Pendulum):
+    def step_env(self, key, state, action, params):
+        observation, state, reward, *others = super().step_env(key, state, action, params)
+        return observation, state, PULL * reward - cost(action), *others
+
+def made(length=7):
+    env = Harder()
+    return env, env.default_params.replace(max_steps_in_episode=length)
+
+instance = FlattenObservationWrapper(FlattenObservationWrapper(Harder()))
+"""
+HELPER = "def cost(action):\n    return 0.1 * abs(action.sum())\n"
+
+
+@pytest.mark.parametrize("attribute", ["made", "Harder", "instance"])
+@pytest.mark.parametrize(
+    ("before", "after", "counts"),
+    [
+        ("PULL = 2.0", "PULL = 2.0  # mine", False),
+        ("PULL = 2.0", "UNUSED = PULL = 2.0", False),
+        ("PULL = 2.0", "PULL = 3.0", True),
+        ("PULL * reward", "reward", True),
+        ("0.1 * abs", "0.2 * abs", True),  # of the module that it imports
+    ],
+)
+def test_what_an_environment_computes_is_its_code(
+    tmp_path, monkeypatch, before, after, counts, attribute
+):
+    found = []
+    for folder, edit in (("a", str), ("b", lambda text: text.replace(before, after))):
+        (tmp_path / folder).mkdir()
+        for name, text in (("edited", CODE), ("helper", HELPER)):
+            (tmp_path / folder / f"{name}.py").write_text(edit(text))
+            monkeypatch.delitem(sys.modules, name, raising=False)
+        monkeypatch.syspath_prepend(tmp_path / folder)
+        found.append(code_of_names([f"edited:{attribute}", "Pendulum-v1"]))
+    one, other = found
+    assert one.keys() == {f"edited:{attribute}"}
+    assert (one != other) == counts
+
+
+def test_code_that_is_nowhere_and_a_librarys_is_nobodys_own(module):
+    names = ["Pendulum-v1", "nowhere.at_all:make", "C:/nothing", f"{module}:instance"]
+    assert code_of_names([*names, "gymnax.environments.misc.reacher:Reacher"]) == {}
 
 
 def test_what_was_begun_with_other_code_does_not_go_on(module, tmp_path, monkeypatch):
@@ -159,7 +200,9 @@ def test_what_was_begun_with_other_code_does_not_go_on(module, tmp_path, monkeyp
         return compare(name, ["ppo"], seeds, spec, points=1, episodes=1, rows=tmp_path / "a.jsonl")
 
     rows([0])
-    monkeypatch.setattr("scb.measurement.module_code", lambda names: dict.fromkeys(names, "other"))
+    monkeypatch.setattr(
+        "scb.measurement.code_of_names", lambda names: dict.fromkeys(names, "other")
+    )
     with pytest.raises(UserError, match="under another configuration"):
         rows([0, 1])
 
