@@ -23,6 +23,9 @@ from scb.environments.synthetic_mdp import MDPConfig, SyntheticMDP
 from scb.environments.zoo import load_bandit, register_zoo, save_bandit
 from scb.errors import UserError
 from scb.gymnasium import register as register_with_gymnasium
+from scb.machine import package_versions
+
+__version__ = package_versions()["lpo"]
 
 register_zoo()
 register_with_gymnasium()

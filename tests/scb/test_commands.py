@@ -9,6 +9,7 @@ import shutil
 import subprocess
 import sys
 from dataclasses import fields
+from importlib import import_module
 from pathlib import Path
 
 import jax
@@ -541,7 +542,7 @@ def test_the_programs_say_their_version_and_complete_their_words():
         found = subprocess.run(
             [sys.executable, "-m", program, "--version"], capture_output=True, text=True, check=True
         )
-        assert found.stdout.startswith(f"{program} ")
+        assert found.stdout.startswith(f"{program} {import_module(program).__version__} ")
     completion = call("--tyro-print-completion", "bash")
     assert completion.code in (0, None)
     assert "discover" in completion.out and "--population-size" in completion.out
