@@ -29,6 +29,7 @@ from scb.runs import Run, Stopwatch
 from scb.seeds import VALIDATING, searching
 from scb.statistics import iqm
 from scb.strategies import (
+    DISTRIBUTIONS,
     GRADIENT_ESTIMATING,
     REMEMBERING,
     SCHEDULED,
@@ -55,6 +56,9 @@ class EvolutionConfig:
       learning_rate_limit: what it decays down to.
       combine: how a candidate's agents and tasks count: mean, or ranks (the mean over them of its rank
         among the candidates).
+      averaging: generations over which the search distribution's mean is averaged, exponentially, before it is judged
+        and taken as the result; 1 takes it as it is. The search itself does not see it. Where fitness is
+        noisy the mean wanders about what was found, and its average does so less.
       mean_evaluations: agents that judge the mean of the search distribution.
       evaluate_mean_every: generations between those judgements (and one after the last generation).
       checkpoint_every: generations between checkpoints.
@@ -71,6 +75,7 @@ class EvolutionConfig:
     learning_rate_decay: float = 1.0
     learning_rate_limit: float = 0.0
     combine: str = "mean"
+    averaging: int = 1
     mean_evaluations: int = 64
     evaluate_mean_every: int = 10
     checkpoint_every: int = 10
@@ -94,7 +99,14 @@ class EvolutionConfig:
                 f"{self.strategy} compares fitness with that of earlier generations, which ranks among candidates of "
                 "one do not allow: combine by mean, or choose another strategy, such as SNES."
             )
-        at_least(1, self, "mean_evaluations", "evaluate_mean_every", "checkpoint_every")
+        at_least(
+            1, self, "averaging", "mean_evaluations", "evaluate_mean_every", "checkpoint_every"
+        )
+        if self.averaging > 1 and self.strategy not in DISTRIBUTIONS:
+            raise UserError(
+                f"averaging is {self.averaging}, and {self.strategy} keeps a population and no mean: leave it out, or "
+                "choose a strategy such as SNES."
+            )
         searching(self.seed)
         positive(self, "sigma", "sigma_decay", "learning_rate", "learning_rate_decay")
         at_least(0, self, "sigma_limit", "learning_rate_limit")
@@ -170,7 +182,7 @@ class Outcome:
     """What an evolution ends with.
 
     Attributes:
-      mean: the mean of the final search distribution.
+      mean: of the final search distribution, averaged as the configuration says.
       best_mean: the mean at that generation whose evaluation (`evaluate_mean`, interquartile mean)
         was best. Chosen under noise: report it on fresh seeds only.
       best_mean_generation: which one that was; -1, and the mean that of the start, where none could be judged.
@@ -339,6 +351,12 @@ def evolve(
         "best_mean_fitness": jnp.float32(-jnp.inf),
         "best_mean_generation": jnp.int32(-1),
     }
+    if config.averaging > 1:
+        state["average"] = solution
+
+    def search_mean() -> Any:
+        return state["average"] if config.averaging > 1 else strategy.mean(state["strategy"])
+
     console = progress_console(quiet)
     checkpoints, first, state = continued(run.folder if run else None, state, console)
     if run and checkpoints:
@@ -365,7 +383,7 @@ def evolve(
     watch = Stopwatch()
 
     def judge_mean(generation: int) -> dict[str, float]:
-        mean = strategy.mean(state["strategy"])
+        mean = search_mean()
         # The same seeds at every judgement: means of different generations are then compared in
         # pairs.
         returns = judged(mean, key_mean)
@@ -411,6 +429,15 @@ def evolve(
             if finite.size:
                 told = rank_failed_last(combine_tasks(tasks, config.combine))
                 state["strategy"] = strategy.tell(key_tell, population, told, state["strategy"])
+                if config.averaging > 1:
+                    # Of fewer generations at first, all alike.
+                    share = 1 / min(generation + 1, config.averaging)
+                    mean = strategy.mean(state["strategy"])
+                    state["average"] = jax.tree.map(
+                        lambda old, new, share=share: old + share * (new - old),
+                        state["average"],
+                        mean,
+                    )
                 metrics |= {
                     "fitness/mean": finite.mean(),
                     "fitness/std": finite.std(),
@@ -445,7 +472,7 @@ def evolve(
     if checkpoints:
         checkpoints.close()
     return Outcome(
-        mean=jax.device_get(strategy.mean(state["strategy"])),
+        mean=jax.device_get(search_mean()),
         best_mean=jax.device_get(state["best_mean"]),
         best_mean_generation=int(state["best_mean_generation"]),
         metrics=history,

@@ -41,6 +41,8 @@ STRATEGIES: dict[str, Any] = {
     for name, algorithm in evosax.algorithms.algorithms.items()
     if name not in _UNSUPPORTED
 }
+# These have a search distribution with a mean; the others keep a population.
+DISTRIBUTIONS = set(evosax.algorithms.distribution_based_algorithms)
 # Of these the deviation follows a schedule; the others adapt it, or have none.
 SCHEDULED = {
     name
@@ -57,7 +59,7 @@ REMEMBERING = {
     "SimulatedAnnealing",
     "iAMaLGaM_Full",
     "iAMaLGaM_Univariate",
-    *(STRATEGIES.keys() - evosax.algorithms.distribution_based_algorithms.keys()),
+    *(STRATEGIES.keys() - DISTRIBUTIONS),
 }
 
 
@@ -68,8 +70,8 @@ class Strategy:
         algorithm = STRATEGIES[config.strategy]
         self._sigma, self._name = config.sigma, config.strategy
         self._size = config.population_size
-        # Others keep a population, and have no mean to judge before the first tell.
-        self.has_mean = config.strategy in evosax.algorithms.distribution_based_algorithms
+        # The others have no mean to judge before the first tell.
+        self.has_mean = config.strategy in DISTRIBUTIONS
         arguments: dict[str, Any] = {}
         if config.strategy in SCHEDULED:
             arguments["std_schedule"] = lambda generation: jnp.maximum(
@@ -166,6 +168,7 @@ def strategy_for(config: "EvolutionConfig", solution: Any) -> Strategy:
         config,
         num_generations=1,
         combine="mean",
+        averaging=1,
         mean_evaluations=1,
         evaluate_mean_every=1,
         checkpoint_every=1,

@@ -112,7 +112,8 @@ EVERY_FLAG = """--preset=paper --tasks=Synthetic-CartPole-v1,hopper --drift=netw
 --reward-noise=1.5 --agents-per-candidate=3 --evaluation-episodes=8 --backend=generalized --initial-scale=0.3
 --base=none --clip=0.3 --xi=0.001 --gate=0.2 --hidden-size=8 --strategy=ARS --population-size=6 --generations=7
 --sigma=0.2 --sigma-decay=0.9 --sigma-limit=0.1 --learning-rate=0.3 --learning-rate-decay=0.8
---learning-rate-limit=0.2 --combine=mean --mean-evaluations=5 --evaluate-mean-every=4 --checkpoint-every=3 --seed=9"""
+--learning-rate-limit=0.2 --combine=mean --averaging=6
+--mean-evaluations=5 --evaluate-mean-every=4 --checkpoint-every=3 --seed=9"""
 
 
 def test_every_flag_of_meta_train_reaches_the_configuration_and_its_command():
@@ -136,7 +137,7 @@ def test_the_command_of_every_zoo_entry_asks_for_what_its_json_holds(name):
     metadata = load_objective(name).metadata
     config = config_dict(asked_for(metadata["command"].removeprefix("lpo meta-train")))
     stored = metadata["config"]["meta_training"]
-    assert config["evolution"] == stored["evolution"]
+    assert config["evolution"] == {"averaging": 1, **stored["evolution"]}
     # An entry from before drifts had gates, or tasks were several, lacks what says so.
     for key in ("tasks", "fitness", "contexts", "horizons", "reward_noise", "validation"):
         assert config[key] == stored.get(key, config[key]), key

@@ -222,7 +222,8 @@ EVERY_FLAG = """--preset=paper --environment=MountainCar-v0 --backend=spring --m
 --aggregation-rounds=2 --aggregation-agents=3
 --refinement-rounds=1 --refinement-generations=2 --refinement-agents=4 --no-refinement-visits
 --strategy=Open_ES --population-size=6 --generations=9 --sigma=0.2 --sigma-decay=0.9 --sigma-limit=0.1
---learning-rate=0.3 --learning-rate-decay=0.8 --learning-rate-limit=0.2 --combine=ranks --mean-evaluations=5
+--learning-rate=0.3 --learning-rate-decay=0.8 --learning-rate-limit=0.2 --combine=ranks --averaging=6
+--mean-evaluations=5
 --evaluate-mean-every=4 --checkpoint-every=3 --seed=8"""
 
 
@@ -268,7 +269,7 @@ def test_the_command_of_every_zoo_entry_asks_for_what_its_json_holds(name):
     metadata = bandit_metadata(name)
     found, stored = shlex.split(metadata["command"]), metadata["config"]["discovery"]
     config = config_dict(asked_for(*found[2:]))
-    assert config["evolution"] == stored["evolution"]
+    assert config["evolution"] == {"averaging": 1, **stored["evolution"]}
     assert config["bandit"] == {"form": "networks", **stored["bandit"]}
     assert config["refinement"] == {
         **config["refinement"],
@@ -277,9 +278,8 @@ def test_the_command_of_every_zoo_entry_asks_for_what_its_json_holds(name):
     }
     # What has another name by now, or was not there then, kept its default.
     different = {k for k in config.keys() & stored.keys() if config[k] != stored[k]}
-    assert (
-        different <= {"warm_start", "refinement", "bandit"} and not config["fixed_hyperparameters"]
-    )
+    assert different <= {"warm_start", "refinement", "bandit", "evolution"}
+    assert not config["fixed_hyperparameters"]
 
 
 # Tables "Hyperparameters for meta-training", "Number of generations for each environment" and

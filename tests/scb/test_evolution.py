@@ -84,6 +84,48 @@ def test_without_generations_a_search_ends_with_its_start():
     assert {cost[name] for name in cost if name.startswith("environment_steps")} == {0}
 
 
+def test_an_averaged_mean_is_of_the_search_distributions_that_were():
+    # A search of fewer generations ends where one of more was.
+    means = [
+        evolve(Parabola(), replace(CONFIG, num_generations=n), quiet=True).mean["x"]
+        for n in range(1, 6)
+    ]
+    expected = np.mean(means[:3], axis=0)
+    for mean in means[3:]:
+        expected = expected + (mean - expected) / 3
+    config = replace(CONFIG, num_generations=5, averaging=3, evaluate_mean_every=1)
+    outcome = evolve(Parabola(), config, quiet=True)
+    np.testing.assert_allclose(outcome.mean["x"], expected, rtol=1e-5)
+    # What is judged is the average, whose fitness the parabola says: after two generations, and at the end.
+    judged = [outcome.metrics[2]["mean/fitness"], outcome.metrics[-1]["final_mean/fitness"]]
+    after = [np.mean(means[:2], axis=0), expected]
+    np.testing.assert_allclose(judged, [-np.sum((x - 3.0) ** 2) for x in after], rtol=1e-4)
+
+
+class Scattered(Parabola):
+    """Its noise is a candidate's own."""
+
+    def evaluate(self, candidate, key, generation):
+        own = jax.random.fold_in(key, jax.lax.bitcast_convert_type(candidate["x"][0], jnp.int32))
+        return super().evaluate(candidate, own, generation)
+
+
+def test_where_fitness_is_noisy_the_average_is_closer_to_the_maximum_than_the_last_mean():
+    # Steps of one size, for ever.
+    config = with_strategy("Open_ES", num_generations=100, evaluate_mean_every=200)
+    config = replace(config, learning_rate=1.0)
+    last, average = (
+        np.mean(
+            [
+                distance(evolve(Scattered(noise=5.0), replace(c, seed=seed), quiet=True).mean)
+                for seed in range(4)
+            ]
+        )
+        for c in (config, replace(config, averaging=50))
+    )
+    assert average < 0.7 * last
+
+
 class Wide(Parabola):
     """Of 20 numbers."""
 
@@ -561,16 +603,20 @@ def fingerprint(folder, outcome):
     return weights, outcome.best_mean_generation, metrics
 
 
-STRATEGIES_RESUMED = ["SNES", "Open_ES", "SimpleGA"]
+RESUMED = {
+    "SNES": with_strategy("SNES"),
+    "Open_ES": with_strategy("Open_ES", averaging=4),
+    "SimpleGA": with_strategy("SimpleGA"),
+}
 
 
 @pytest.fixture(scope="module")
 def uninterrupted(tmp_path_factory):
     """{strategy: fingerprint} of runs that nobody disturbed."""
     fingerprints = {}
-    for strategy in STRATEGIES_RESUMED:
+    for strategy, config in RESUMED.items():
         folder = tmp_path_factory.mktemp(strategy) / "run"
-        outcome = evolve_in(folder, with_strategy(strategy))
+        outcome = evolve_in(folder, config)
         fingerprints[strategy] = fingerprint(folder, outcome)
     return fingerprints
 
@@ -592,8 +638,7 @@ def uninterrupted(tmp_path_factory):
 def test_a_run_that_was_killed_and_resumed_ends_with_the_same_bytes(
     tmp_path, uninterrupted, strategy, kills
 ):
-    config = with_strategy(strategy)
-    folder = tmp_path / "run"
+    config, folder = RESUMED[strategy], tmp_path / "run"
     for attempt, kill_at in enumerate(kills):
         with pytest.raises(Killed):
             evolve_in(folder, config, resume=attempt > 0, kill_at=kill_at)
@@ -721,6 +766,11 @@ def test_progress_says_fitness_failures_and_time_left(capsys):
         ({"population_size": 1}, "population_size is 1: .* at least 2"),
         ({"population_size": 5, "strategy": "Open_ES"}, "population_size is 5: .* must be even"),
         ({"num_generations": -1}, "num_generations is -1: it must be 0 or larger"),
+        ({"averaging": 0}, "averaging is 0: it must be at least 1"),
+        (
+            {"averaging": 2, "strategy": "SimpleGA"},
+            "averaging is 2, and SimpleGA keeps a population",
+        ),
         ({"mean_evaluations": 0}, "mean_evaluations is 0: it must be at least 1"),
         ({"evaluate_mean_every": 0}, "evaluate_mean_every is 0: it must be at least 1"),
         ({"checkpoint_every": 0}, "checkpoint_every is 0: it must be at least 1"),
