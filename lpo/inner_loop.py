@@ -18,13 +18,13 @@ from scb.agents.ppo import PPOConfig, PPOHyperparameters
 from scb.agents.spec import AgentSpec, check_lists, environment_agent
 from scb.command_line import listed, numbers, text
 from scb.environments.registry import check_backend, environment_spec
-from scb.environments.zoo import bandit_metadata
+from scb.environments.zoo import digests
 from scb.errors import UserError, at_least, of_classes, one_of, positive, unused
 from scb.evolution import EnvironmentSteps, EvolutionConfig
 from scb.keys import named_key, root_key, split_key
 from scb.lists import read_values, write_values
 from scb.measurement import Judge, spaced, train_and_judge
-from scb.own import code_of, code_of_names
+from scb.own import code_of
 
 _OF_BANDITS = ("contexts", "reward_noise")
 POINTS = 5  # of the curve that the area is under
@@ -175,15 +175,9 @@ class MetaTrainingConfig:
         """Where fitness is earned."""
         return self.homes if self.judgement.at_home else self.tasks
 
-    def weights(self) -> dict[str, str]:
-        """{task: SHA-256} of the bandits and synthetic MDPs, whose names do not say which weights they stand for."""
-        return {
-            x: bandit_metadata(x)["sha256"] for x in self.tasks if environment_spec(x).synthetic
-        }
-
     def checksums(self) -> dict[str, str]:
-        """The same, and of the code of environments and drifts of one's own."""
-        return self.weights() | code_of_names({*self.tasks, *self.homes}) | code_of(self.drift)
+        """{name: SHA-256} of the tasks' weights, and of the code of environments and drifts of one's own."""
+        return digests({*self.tasks, *self.homes}) | code_of(self.drift)
 
     def at_home(self) -> "MetaTrainingConfig":
         """The same on the tasks' evaluation environments themselves."""

@@ -23,6 +23,7 @@ from lpo.objectives import Objective, load_objective, save_objective
 from scb import processes
 from scb.command_line import GENERATIONS
 from scb.environments.registry import environment_spec
+from scb.environments.zoo import digests
 from scb.errors import UserError
 from scb.evolution import EnvironmentSteps, EvolutionConfig, Outcome, evolve
 from scb.keys import root_key, split_key
@@ -185,7 +186,7 @@ def _story(problem: MetaTraining, outcome: Outcome, mean: Any, command: str) -> 
         "config": {
             "meta_training": config_dict(problem.config),
             "homes": problem.config.homes,
-            "bandit_sha256": problem.config.weights(),
+            "bandit_sha256": digests(problem.config.tasks),
         },
         "seeds": {"meta_training": evolution.seed, "validation": VALIDATING.start},
         "results": {

@@ -17,6 +17,7 @@ from scb import artefacts, own
 from scb.environments.registry import environment_spec
 from scb.errors import UserError, first_line
 from scb.keys import root_key
+from scb.own import code_of
 
 KIND = "drift"
 KNOWN: dict[str, Drift] = {"ppo": ClipDrift(), "dpo": DPODrift(), "none": NoDrift()}
@@ -66,6 +67,12 @@ class Objective:
     def __repr__(self) -> str:
         sizes = [x.size for x in jax.tree.leaves(self.parameters) if hasattr(x, "size")]
         return f"Objective({self.name!r}, {self.drift!r}, {sum(sizes)} parameters)"
+
+    @property
+    def digests(self) -> dict[str, str]:
+        """{name: SHA-256} of what its name does not tell: a file's contents, and code of somebody's own."""
+        saved = {self.name: self.metadata["sha256"]} if "sha256" in self.metadata else {}
+        return saved | code_of(self.drift)
 
     @property
     def learned_on(self) -> tuple[str, ...]:

@@ -24,6 +24,7 @@ from scb import plotting
 from scb.command_line import Measuring, text
 from scb.console import console
 from scb.environments.registry import check_backend, environment_spec
+from scb.environments.zoo import digests
 from scb.errors import UserError, at_least
 from scb.files import write_json
 from scb.lists import read_settings, write_settings
@@ -95,6 +96,10 @@ class TrainConfig(JudgedConfig):
 
     objective: str = "ppo"
 
+    @property
+    def objectives(self) -> tuple[str, ...]:
+        return (self.objective,)
+
 
 @dataclass(frozen=True)
 class EvaluateConfig(JudgedConfig):
@@ -128,6 +133,13 @@ class Comparing(Measuring):
     def growing(self) -> Collection[str]:
         # A suite's --out that is there is completed, and grows by nothing but --resume.
         return () if self.output.out else ("seeds", "objectives")
+
+    def inputs(self) -> dict[str, str]:
+        environment = self.config.environment
+        told = digests([] if environment is None else [environment])
+        for objective in load_apart(self.config.objectives):
+            told |= objective.digests
+        return told
 
     def compare(self, objectives: Sequence[Objective]) -> Comparison:
         """Trains with the objectives, and leaves rows, comparison.json and curves.png where a folder is named."""

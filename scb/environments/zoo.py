@@ -6,7 +6,7 @@ imported, and read when one is made.
 """
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType
@@ -24,6 +24,7 @@ from scb.environments.spec import BANDIT, SYNTHETIC_MDP, Family, Made
 from scb.environments.synthetic import BanditConfig, SyntheticBandit, Weights
 from scb.environments.synthetic_mdp import MDPConfig, SyntheticMDP
 from scb.errors import UserError
+from scb.own import code_of_names
 from scb.spaces import flat_bounds
 
 PREFIX = "Synthetic-"
@@ -79,6 +80,13 @@ def register_zoo() -> None:
 def bandit_metadata(name: str | Path) -> Mapping[str, Any]:
     """What the .json of a bandit or synthetic MDP (a zoo name, or path.npz) says: config, seeds, results, cost."""
     return _read(name, BANDIT, SYNTHETIC_MDP)[1].metadata
+
+
+def digests(names: Iterable[str]) -> dict[str, str]:
+    """{name: SHA-256} of what environments' names do not tell: weights of synthetic ones, code of somebody's own."""
+    names = list(names)
+    weights = {x: bandit_metadata(x)["sha256"] for x in names if environment_spec(x).synthetic}
+    return weights | code_of_names(names)
 
 
 def load_bandit(name: str | Path) -> SyntheticBandit:

@@ -1,6 +1,7 @@
 """`lpo train`, `lpo evaluate` and `lpo align` as commands: what they print, keep, and go on with."""
 
 import json
+import sys
 
 import numpy as np
 import pytest
@@ -104,6 +105,23 @@ def test_a_resumed_evaluation_keeps_its_settings(
     interrupted_evaluation, refused, arguments, message
 ):
     assert message in refused(*arguments, "--resume", "o")
+
+
+def test_a_refused_resume_leaves_the_folder_as_it_was(
+    trained, working_folder, refused, monkeypatch, capsys
+):
+    for number in ("0.5", "0.25"):
+        (working_folder / number).mkdir()
+        text = f"def share(ratio, advantage):\n    return {number} * ratio * advantage\n"
+        (working_folder / number / "shares.py").write_text(text)
+    arguments = ["--objectives", "dpo", "shares:share", "--seeds=2"]
+    monkeypatch.syspath_prepend(working_folder / "0.5")
+    assert cli.main(["evaluate", *arguments, "--out=o"]) == 0
+    monkeypatch.delitem(sys.modules, "shares")
+    monkeypatch.syspath_prepend(working_folder / "0.25")
+    capsys.readouterr()
+    message = refused("evaluate", "--seeds=3", "--resume=o")
+    assert "cannot resume o: shares:share is not what it was when the run was started" in message
 
 
 @pytest.mark.parametrize("command", ["Train", "Evaluate", "Align"])
