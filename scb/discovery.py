@@ -25,7 +25,7 @@ from scb.agents.spec import (
     check_algorithms,
     configured,
 )
-from scb.analysis.optimal_actions import optimal_policy
+from scb.analysis.optimal_actions import optimal_actions
 from scb.curriculum import EpisodeLengths, check_curriculum, paper_curriculum
 from scb.discovery_config import DiscoveryConfig as DiscoveryConfig
 from scb.environments.registry import environment_spec
@@ -33,15 +33,16 @@ from scb.environments.synthetic import SyntheticBandit, Weights
 from scb.environments.synthetic_mdp import synthetic_for
 from scb.environments.zoo import bandit_metadata, load_bandit, save_bandit
 from scb.errors import UserError, one_of
-from scb.evaluation import evaluate
+from scb.evaluation import Episodes, evaluate
 from scb.evolution import EnvironmentSteps, Outcome, evolve
 from scb.fitting import standardize_reward
 from scb.judgement import check_fits
 from scb.keys import named_key, root_key, split_key
+from scb.linear_expert import erring
 from scb.measurement import Judge, Place, train_and_judge
 from scb.refinement import refined
 from scb.runs import Run, config_dict, run_of
-from scb.spaces import check_bounded, kind_of_actions
+from scb.spaces import check_bounded, clip_to_space, kind_of_actions
 from scb.strategies import strategy_for
 from scb.warm_start import expert_agent, warm_start
 
@@ -62,6 +63,11 @@ class BanditDiscovery:
             config = replace(config, curriculum=paper_curriculum(config.environment, generations))
         check_algorithms(config.algorithms, kind_of_actions(space))
         check_bounded(space)
+        if config.optimal_policy_errors and kind_of_actions(space) == "discrete":
+            raise UserError(
+                f"optimal_policy_errors are added to continuous actions, and those of {config.environment} are "
+                "discrete: leave them out."
+            )
         if config.mode == "all" and len(set(config.algorithms)) < len(config.algorithms):
             raise UserError(
                 f"an algorithm stands twice in {', '.join(config.algorithms)}: name each once, or use the mode "
@@ -268,10 +274,24 @@ class BanditDiscovery:
     ) -> jax.Array:
         """[] mean return in the evaluation environment of a candidate's own optimal policy."""
         assert isinstance(self.bandit, SyntheticBandit)
-        policy = optimal_policy(self.bandit, self.bandit.params(weights))
-        key_own, number = named_key(key, OPTIMAL_POLICY), self.config.optimal_policy_episodes
-        episodes = evaluate(self.place.env, env_params, policy, key_own, number, limit)
-        return episodes.returns.mean()
+        best = optimal_actions(self.bandit, self.bandit.params(weights))
+        number, scale = self.config.optimal_policy_episodes, self.config.optimal_policy_errors
+
+        def episodes(key: jax.Array, number: int) -> Episodes:
+            policy, space = best, self.bandit.action_space()
+            if scale:
+                policy = erring(best, self.bandit.observation_size, cast(Any, space), scale, key)
+
+            def act(observation: jax.Array, key: jax.Array) -> jax.Array:
+                return clip_to_space(policy(jnp.ravel(observation)), space)
+
+            return evaluate(self.place.env, env_params, act, key, number, limit)
+
+        # Errors are an episode's own.
+        key_own = named_key(key, OPTIMAL_POLICY)
+        if scale:
+            return jax.vmap(lambda k: episodes(k, 1).returns)(split_key(key_own, number)).mean()
+        return episodes(key_own, number).returns.mean()
 
     def evaluate_mean(self, candidate: Weights, key: jax.Array) -> dict[str, jax.Array]:
         results = {}

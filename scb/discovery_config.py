@@ -65,6 +65,9 @@ class DiscoveryConfig:
         counts as much as an agent's. It costs no training, and stands for agents that learn the bandit well
         but are not trained in the search. 0 leaves it out. Cheap of linear bandits and discrete actions; of
         networks with continuous ones every step climbs the reward.
+      optimal_policy_errors: the scale of errors on its continuous actions in these episodes, as a share of half their
+        range: a function of the observation, another one in each episode, as an agent errs. Without them
+        a policy is found that earns more and bears less than its agents need.
       curriculum: of the evaluation episodes' length: paper, none, or
         SHAPE:INITIAL:FINAL:BEGIN:TRANSITION such as linear:100:1000:20:160 (lengths in steps, then
         generations).
@@ -101,6 +104,7 @@ class DiscoveryConfig:
     evaluation_episodes: int = 16
     mode_actions: bool = False
     optimal_policy_episodes: int = 0
+    optimal_policy_errors: float = 0.0
     curriculum: Annotated[CurriculumConfig | str | None, _Curriculum] = None
     init: str = "expert"
     start: Annotated[str | None, tyro.conf.arg(name="from-bandit")] = None
@@ -216,7 +220,10 @@ class DiscoveryConfig:
                 f"reward_std is for bandits, and parameterization {self.parameterization} is none: leave it out."
             )
         at_least(1, self, "agents_per_candidate", "evaluation_episodes")
-        at_least(0, self, "optimal_policy_episodes")
+        at_least(0, self, "optimal_policy_episodes", "optimal_policy_errors")
+        if not self.optimal_policy_episodes:
+            because, instead = "the optimal policy has no episodes", "take at least 1"
+            unused(self, because, ("optimal_policy_errors",), instead)
         if self.optimal_policy_episodes and self.parameterization != "I":
             raise UserError(
                 f"parameterization {self.parameterization} is no bandit, whose optimal policy is read off its reward: "

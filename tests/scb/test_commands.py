@@ -212,7 +212,7 @@ def test_flags_become_a_configuration_and_what_is_left_out_keeps_its_default():
 EVERY_FLAG = """--preset=paper --environment=MountainCar-v0 --backend=spring --max-steps=5 --algorithms=ppo,dqn,ppo
 --mode=sequential '--hyperparameters={"ppo": {"learning_rate": [0.25]}}'
 '--configs={"ppo": {"num_steps": 50, "hidden_sizes": [8], "anneal_learning_rate": true}}' --agents-per-candidate=3
---evaluation-episodes=2 --optimal-policy-episodes=3 --mode-actions
+--evaluation-episodes=2 --optimal-policy-episodes=3 --optimal-policy-errors=0.5 --mode-actions
 --curriculum=linear:2:4:0:2 --init=expert --reward-std=4.0
 --select=best --form=linear
 --expert=sac --expert-noise=0.2 --expert-errors=0.3 --expert-pupils=2

@@ -9,7 +9,7 @@ from gymnax.environments import spaces
 from scb.agents.dqn import DQNConfig
 from scb.agents.ppo import PPOConfig, PPOHyperparameters
 from scb.agents.spec import AgentSpec, algorithms_for, bandit_agent
-from scb.analysis.optimal_actions import optimal_policy
+from scb.analysis.optimal_actions import optimal_actions, optimal_policy
 from scb.curriculum import CurriculumConfig, paper_curriculum
 from scb.discovery import (
     BanditDiscovery,
@@ -30,7 +30,8 @@ from scb.evaluation import Episodes, evaluate
 from scb.evolution import EvolutionConfig, evaluated, map_population
 from scb.fitting import standardize_reward
 from scb.judgement import check_fits, judge
-from scb.keys import named_key
+from scb.keys import named_key, split_key
+from scb.linear_expert import erring, noisy
 from scb.measurement import Place
 from scb.runs import Run, config_dict
 from scb.statistics import iqm
@@ -338,6 +339,39 @@ def test_a_candidates_own_optimal_policy_is_one_more_task(discovered, mode):
     for steps in ("steps", "judgement_steps"):
         more, fewer = (getattr(p, steps)() for p in (problem, without))
         assert (more.training, more.evaluation) == (fewer.training, fewer.evaluation + 2 * 500)
+
+
+def test_an_optimal_policy_errs_in_every_episode_by_another_function():
+    config = replace(
+        CONFIG, environment="Pendulum-v1", agents_per_candidate=1, optimal_policy_episodes=3
+    )
+    found, key = [], jax.random.key(6)
+    for errors in (0.0, 1e-3, 3.0):
+        problem = BanditDiscovery(replace(config, optimal_policy_errors=errors))
+        weights = problem.bandit.init_weights(jax.random.key(1))
+        found.append(
+            jax.jit(problem.evaluate)(weights, key, jnp.int32(0))["fitness/optimal policy"]
+        )
+    none, small, large = found
+    place, bandit = problem.place, problem.bandit
+    best, space = optimal_actions(bandit, bandit.params(weights)), bandit.action_space()
+    for scale, expected in ((1e-3, small), (3.0, large)):
+        returns = []
+        for of_episode in split_key(named_key(key, "optimal policy"), 3):
+            errs = erring(best, bandit.observation_size, space, scale, of_episode)
+            act = noisy(errs, space, 0.0)  # within the bounds
+            returns += [*evaluate(place.env, place.params, act, of_episode, 1).returns]
+        assert float(np.mean(returns)) == pytest.approx(float(expected), rel=1e-3)
+        assert len(set(map(float, returns))) == 3
+    assert none != small != large
+
+
+def test_errors_are_of_an_optimal_policys_continuous_actions():
+    with pytest.raises(UserError, match="the optimal policy has no episodes"):
+        replace(CONFIG, optimal_policy_errors=0.1)
+    config = replace(CONFIG, optimal_policy_episodes=1, optimal_policy_errors=0.1)
+    with pytest.raises(UserError, match="those of CartPole-v1 are discrete: leave them out"):
+        BanditDiscovery(config)
 
 
 def test_a_synthetic_mdp_has_no_optimal_policy_to_judge():
