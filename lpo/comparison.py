@@ -188,7 +188,7 @@ class Comparison:
 _APART = {
     "drift": "the objective's own",
     "horizon": "the length of the training, that is, steps",
-    "total_steps": "steps, which are given apart",
+    "total_steps": "the steps, which --steps gives, and in Python a spec",
 }
 
 

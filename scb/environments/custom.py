@@ -58,6 +58,12 @@ class CustomFamily(Family):
         return env, params
 
 
+def _has_limit(params: type) -> bool:
+    """Whether a class of parameters has a limit of its own, and not that of gymnax's base class."""
+    own = [c for c in params.__mro__ if not issubclass(environment.EnvParams, c)]
+    return any("max_steps_in_episode" in inspect.get_annotations(c) for c in own)
+
+
 def _check(name: str, env: environment.Environment[Any, Any], params: Any) -> None:
     """A UserError where it keeps another contract than gymnax 1.x's; what its own functions raise is theirs to say."""
 
@@ -68,10 +74,10 @@ def _check(name: str, env: environment.Environment[Any, Any], params: Any) -> No
         raise wrong(
             "has parameters without max_steps_in_episode, after which an episode ends: give them that field"
         )
-    if type(params) is environment.EnvParams and params == environment.EnvParams():
+    if params.max_steps_in_episode == 1 and not _has_limit(type(params)):
         raise wrong(
-            "has gymnax's own parameters, whose episodes end after one step: give it default_params with its "
-            "max_steps_in_episode"
+            "has parameters whose max_steps_in_episode is gymnax's own, so that its episodes end after one step: give "
+            "them that field with its value, though it be 1"
         )
     if params.max_steps_in_episode < 1:
         raise wrong(

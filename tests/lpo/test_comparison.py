@@ -242,7 +242,7 @@ def test_a_comparison_says_what_it_cannot_compare(objectives, seeds, message):
 
 def test_steps_and_drift_are_no_hyperparameters_of_a_comparison():
     for name, said in (
-        ("total_steps", "steps, which are given apart"),
+        ("total_steps", "the steps, which --steps gives"),
         ("drift", "the objective's own"),
     ):
         with pytest.raises(UserError, match=f"{name} is no hyperparameter here: it is {said}"):

@@ -17,6 +17,7 @@ from scb.own import code_of_names
 
 MODULE = """
 import gymnax, jax.numpy as jnp
+from flax import struct
 from gymnax.environments import environment, spaces
 from gymnax.environments.classic_control.pendulum import Pendulum
 
@@ -74,6 +75,18 @@ class NoParameters(Pendulum):
     def default_params(self):
         return environment.EnvParams()
 
+@struct.dataclass
+class Forgotten(environment.EnvParams):
+    g: float = 10.0
+
+class ForgottenLimit(Pendulum):
+    @property
+    def default_params(self):
+        return Forgotten()
+
+def one_step():
+    return Pendulum(), Pendulum().default_params.replace(max_steps_in_episode=1)
+
 class NoParts(environment.Environment):
     default_params = Pendulum().default_params
     observation_space, action_space = Pendulum().observation_space, Pendulum().action_space
@@ -128,6 +141,10 @@ def test_an_environment_is_what_the_factory_returns(module):
     spec = environment_spec(f"{module}:with_parameters")
     assert spec.episode_limit == 7 and spec.bandit == f"Synthetic-{module}-with_parameters"
     assert spec.random_return() < -5
+
+
+def test_an_environment_may_say_that_its_episodes_have_one_step(module):
+    assert make(f"{module}:one_step")[1].max_steps_in_episode == 1
 
 
 def test_an_environment_itself_is_taken_as_well_as_what_makes_it(module):
@@ -235,7 +252,11 @@ def test_the_physics_that_a_factory_takes_is_part_of_the_place(module):
         ("{}:ManyRewards", r"rewards of shape \(2,\)"),
         (
             "{}:NoParameters",
-            "gymnax's own parameters, whose episodes end after one step: give it d",
+            "parameters whose max_steps_in_episode is gymnax's own, so that its episodes end after",
+        ),
+        (
+            "{}:ForgottenLimit",
+            "parameters whose max_steps_in_episode is gymnax's own, so that its episodes end after",
         ),
         ("{}:NoParts", "lacks reset_env or step_env, which gymnax's own reset and step call"),
         ("{}:FloatTerminated", "returns a terminated of the type float32 from step_env: return a"),
