@@ -33,6 +33,8 @@ from scb.measurement import Place, check_seeds
 from scb.runs import config_dict
 from scb.statistics import estimate
 
+MOST_AGENTS = 100_000  # of an objective: more would not fit into memory before the first is trained
+
 
 def _tell(line: str) -> None:
     print(line, file=sys.stderr, flush=True)
@@ -62,6 +64,10 @@ class Agents:
         """Consecutive seeds; a UserError for none or a negative one."""
         at_least(1, self, self.number_field)
         at_least(0, self, "seed")
+        if (number := getattr(self, self.number_field)) > MOST_AGENTS:
+            raise UserError(
+                f"{self.number_field} is {number}: each is an agent to train, and at most {MOST_AGENTS} are taken."
+            )
         seeds = list(range(self.seed, self.seed + getattr(self, self.number_field)))
         check_seeds(seeds)
         return seeds

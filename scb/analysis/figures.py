@@ -85,7 +85,7 @@ def importance_bars(
     axes.set_yticks(positions, list(names))
     axes.invert_yaxis()
     axes.set_xlim(left=0.0)
-    axes.set_xlabel("share of the reward's variance", fontsize=9)
+    axes.set_xlabel("share of the reward's variance, alone or with others", fontsize=9)
 
 
 def trajectory_line(plane: Plane, states: NDArray[np.floating]) -> NDArray[np.floating]:

@@ -67,6 +67,10 @@ def test_an_unknown_name_is_answered_by_near_ones(refused, arguments, message):
         ("train --steps -100", "steps is -100: it must be at least 1"),
         ("evaluate --steps -100", "steps is -100: it must be at least 1"),
         ("train --seeds 0", "seeds is 0: it must be at least 1"),
+        (
+            "evaluate --seeds 100000000",
+            "seeds is 100000000: each is an agent to train, and at most",
+        ),
         ("evaluate --seeds -1", "seeds is -1: it must be at least 1"),
         ("train --seed -1", "seed is -1: it must be 0 or larger"),
         ("train --seed 4294967296", "a seed is 4294967296"),
