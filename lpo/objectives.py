@@ -71,8 +71,8 @@ class Objective:
     @property
     def digests(self) -> dict[str, str]:
         """{name: SHA-256} of what its name does not tell: a file's contents, and code of somebody's own."""
-        saved = {self.name: self.metadata["sha256"]} if "sha256" in self.metadata else {}
-        return saved | code_of(self.drift)
+        told = [*code_of(self.drift).values(), self.metadata.get("sha256")]
+        return {} if told == [None] else {self.name: " ".join(filter(None, told))}
 
     @property
     def learned_on(self) -> tuple[str, ...]:

@@ -303,7 +303,12 @@ class BanditDiscovery:
             )
         if self.config.optimal_policy_episodes:
             results[f"fitness/{OPTIMAL_POLICY}"] = self._own(candidate, key, self.place.params)
-        return {"fitness": jnp.stack(list(results.values())).mean(), **results}
+        # As in the search an optimal policy counts as one of a candidate's agents.
+        weights = [self.config.agents_per_candidate] * len(self.specs) + [1]
+        worth = jnp.average(
+            jnp.stack(list(results.values())), weights=jnp.array(weights[: len(results)])
+        )
+        return {"fitness": worth, **results}
 
     def steps(self, generation: int = 0) -> EnvironmentSteps:
         """Of one candidate; in the mode "sequential" of the algorithm whose turn it is."""

@@ -352,7 +352,7 @@ def evolve(
         "best_mean_generation": jnp.int32(-1),
     }
     if config.averaging > 1:
-        state["average"] = solution
+        state |= {"average": solution, "averaged": jnp.int32(0)}
 
     def search_mean() -> Any:
         return state["average"] if config.averaging > 1 else strategy.mean(state["strategy"])
@@ -430,8 +430,9 @@ def evolve(
                 told = rank_failed_last(combine_tasks(tasks, config.combine))
                 state["strategy"] = strategy.tell(key_tell, population, told, state["strategy"])
                 if config.averaging > 1:
-                    # Of fewer generations at first, all alike.
-                    share = 1 / min(generation + 1, config.averaging)
+                    # Of fewer generations at first, all alike, but those that failed.
+                    state["averaged"] = state["averaged"] + 1
+                    share = 1 / min(int(state["averaged"]), config.averaging)
                     mean = strategy.mean(state["strategy"])
                     state["average"] = jax.tree.map(
                         lambda old, new, share=share: old + share * (new - old),

@@ -11,11 +11,13 @@ import sysconfig
 from collections.abc import Iterable, Mapping
 from dataclasses import fields, is_dataclass
 from functools import cached_property, partial
+from operator import itemgetter
 from pathlib import Path
 from types import CodeType, FunctionType, MethodType, ModuleType
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from scb.errors import UserError
@@ -81,7 +83,7 @@ def code_of(thing: Any) -> dict[str, str]:
     of libraries and of this one nothing does, but what an object of theirs holds.
     """
     reading = _Reading()
-    said = json.dumps(reading.whole(thing))
+    said = json.dumps(reading.of(thing))
     return {reading.own[0]: hashlib.sha256(said.encode()).hexdigest()} if reading.own else {}
 
 
@@ -105,29 +107,15 @@ class _Reading:
 
     def __init__(self) -> None:
         self.own: list[str] = []
-        # Held, so that nothing else comes to be where one was.
-        self._met: dict[int, Any] = {}
-        self._whole: dict[int, Any] = {}
-
-    def whole(self, value: Any) -> Any:
-        """As `of`, but an object of a library, such as a wrapper, is what it holds, too."""
-        said, new = self.of(value), id(value) not in self._whole
-        self._whole[id(value)] = value
-        if not new or isinstance(value, type | FunctionType) or _is_somebodys(type(value)):
-            return said
-        held = {} if is_dataclass(value) else getattr(value, "__dict__", {})
-        return [said, *([k, self.whole(x)] for k, x in held.items())] if held else said
+        self._met: dict[int, Any] = {}  # held, so that nothing else comes to be where one was
+        self._around: set[int] = set()  # containers that are being read
 
     def of(self, value: Any) -> Any:
         match value:
             case None | bool() | int() | float() | complex() | str() | bytes():
                 return repr(value)
-            case tuple() | list():
-                return [type(value).__name__, *map(self.of, value)]
-            case set() | frozenset():
-                return ["set", *sorted(json.dumps(self.of(x)) for x in value)]
-            case Mapping():
-                return ["mapping", *([repr(k), self.of(value[k])] for k in sorted(value, key=repr))]
+            case tuple() | list() | set() | frozenset() | Mapping():
+                return self._container(value)
             case CodeType():
                 return self._code(value)
             case ModuleType():
@@ -153,7 +141,7 @@ class _Reading:
             case partial():
                 return ["partial", *map(self.of, (value.func, value.args, value.keywords))]
             case np.ndarray() | np.generic() | jax.Array():
-                array = np.asarray(value)
+                array = np.asarray(_plain(value))
                 return [
                     str(array.dtype),
                     str(array.shape),
@@ -161,10 +149,39 @@ class _Reading:
                 ]
         if hasattr(value, "__wrapped__"):  # by a decorator such as jax.jit
             return ["wrapped", self.of(value.__wrapped__)]
-        held = vars(value) if hasattr(value, "__dict__") and _is_somebodys(type(value)) else {}
+        held = getattr(value, "__dict__", {})
         if is_dataclass(value):
             held = {f.name: getattr(value, f.name) for f in fields(value)}
         return [self.of(type(value)), self.of(held)]
+
+    def _container(self, value: Any) -> Any:
+        if id(value) in self._around:
+            return "around"
+        self._around.add(id(value))
+        match value:
+            case Mapping():
+                pairs = sorted(((self._apart(k), k) for k in value), key=itemgetter(0))
+                said = ["mapping", *([name, self.of(value[k])] for name, k in pairs)]
+            case set() | frozenset():
+                said = ["set", *sorted(map(self._apart, value))]
+            case _:
+                said = [type(value).__name__, *map(self.of, value)]
+        self._around.discard(id(value))
+        return said
+
+    def _apart(self, value: Any) -> str:
+        """What a value says by itself, whatever was met before it: the order of sets is another in every process."""
+        reading = _Reading()
+        said = json.dumps(reading.of(value))
+        self.own += reading.own
+        return said
+
+    def _named(self, value: Any, names: set[str]) -> Any:
+        """A global; of somebody's own module what code names of it."""
+        if not isinstance(value, ModuleType) or not _is_of_somebody(value.__name__):
+            return self.of(value)
+        held = vars(value)
+        return [[n, self._named(held[n], names - {n})] for n in sorted(names & held.keys())]
 
     def _function(self, function: FunctionType) -> Any:
         if not _is_somebodys(function):
@@ -174,12 +191,10 @@ class _Reading:
         for cell in function.__closure__ or ():
             with contextlib.suppress(ValueError):  # of what is assigned later
                 cells.append(self.of(cell.cell_contents))
-        named = {
-            n: function.__globals__[n]
-            for n in _names(function.__code__) & function.__globals__.keys()
-        }
+        names, known = _names(function.__code__), function.__globals__
+        named = [[n, self._named(known[n], names - {n})] for n in sorted(names & known.keys())]
         code = self._code(function.__code__)
-        held = self.of((function.__defaults__, function.__kwdefaults__, named))
+        held = [self.of((function.__defaults__, function.__kwdefaults__)), named]
         return ["function", code, held, cells]
 
     def _code(self, code: CodeType) -> Any:
@@ -209,13 +224,24 @@ def _names(code: CodeType) -> set[str]:
     return set(code.co_names).union(*inner)
 
 
+def _plain(array: Any) -> Any:
+    """An array of numbers, which those of a random key are in another form."""
+    if isinstance(array, jax.Array) and jnp.issubdtype(array.dtype, jax.dtypes.prng_key):
+        return jax.random.key_data(array)
+    return array
+
+
 def _called(thing: Any) -> str:
     return f"{thing.__module__}:{thing.__qualname__}"
 
 
 def _is_somebodys(thing: Any) -> bool:
     """Whether a function or class is neither Python's, nor this library's, nor that of a package that is installed."""
-    home = thing.__module__ or ""
+    return _is_of_somebody(thing.__module__ or "")
+
+
+def _is_of_somebody(home: str) -> bool:
+    """The same of a module's name."""
     if home.partition(".")[0] in (*_OURS, "builtins"):
         return False
     file = getattr(sys.modules.get(home), "__file__", None)

@@ -1,7 +1,9 @@
 """Environments that nobody registered, by the name of what makes them."""
 
+import enum
 import sys
 
+import jax
 import numpy as np
 import pytest
 
@@ -13,7 +15,7 @@ from scb.environments.registry import check_backend, environment_spec, make
 from scb.environments.zoo import bandit_metadata
 from scb.errors import UserError
 from scb.measurement import Place, as_random
-from scb.own import code_of_names
+from scb.own import code_of, code_of_names
 
 MODULE = """
 import gymnax, jax.numpy as jnp
@@ -156,25 +158,28 @@ CODE = """
 import jax.numpy as jnp
 from gymnax.environments.classic_control.pendulum import Pendulum
 from gymnax.wrappers.purerl import FlattenObservationWrapper
-from helper import cost
+import helper
 
 PULL = 2.0
 
 class Harder(Pendulum):
     def step_env(self, key, state, action, params):
         observation, state, reward, *others = super().step_env(key, state, action, params)
-        return observation, state, PULL * reward - cost(action), *others
+        return observation, state, PULL * reward - helper.cost(action), *others
 
 def made(length=7):
     env = Harder()
     return env, env.default_params.replace(max_steps_in_episode=length)
 
 instance = FlattenObservationWrapper(FlattenObservationWrapper(Harder()))
+
+def held():
+    return instance, instance.default_params
 """
 HELPER = "def cost(action):\n    return 0.1 * abs(action.sum())\n"
 
 
-@pytest.mark.parametrize("attribute", ["made", "Harder", "instance"])
+@pytest.mark.parametrize("attribute", ["made", "Harder", "instance", "held"])
 @pytest.mark.parametrize(
     ("before", "after", "counts"),
     [
@@ -199,6 +204,26 @@ def test_what_an_environment_computes_is_its_code(
     one, other = found
     assert one.keys() == {f"edited:{attribute}"}
     assert (one != other) == counts
+
+
+class Gait(enum.Enum):
+    WALK, RUN, HOP = range(3)
+
+
+def test_code_is_the_same_whatever_the_order_of_a_set_and_whatever_it_holds():
+    def made(gaits, random_key, around):
+        around["itself"] = around
+        return code_of(lambda: (gaits, random_key, around))
+
+    one, same, other = (
+        made(gaits, jax.random.key(seed), {})
+        for gaits, seed in (
+            (dict.fromkeys([Gait.WALK, Gait.RUN]), 0),
+            (dict.fromkeys([Gait.RUN, Gait.WALK]), 0),
+            (dict.fromkeys([Gait.WALK, Gait.RUN]), 1),
+        )
+    )
+    assert one == same != other
 
 
 def test_code_that_is_nowhere_and_a_librarys_is_nobodys_own(module):

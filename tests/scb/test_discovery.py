@@ -319,7 +319,7 @@ def test_in_the_mode_sequential_the_mean_is_judged_by_every_algorithm(trained_in
 @pytest.mark.parametrize("mode", ["all", "sequential"])
 def test_a_candidates_own_optimal_policy_is_one_more_task(discovered, mode):
     _, outcome = discovered
-    config = replace(CONFIG, mode=mode, agents_per_candidate=1, optimal_policy_episodes=2)
+    config = replace(CONFIG, mode=mode, agents_per_candidate=3, optimal_policy_episodes=2)
     problem, without = (
         BanditDiscovery(c) for c in (config, replace(config, optimal_policy_episodes=0))
     )
@@ -333,8 +333,8 @@ def test_a_candidates_own_optimal_policy_is_one_more_task(discovered, mode):
     episodes = evaluate(place.env, place.params, policy, named_key(key, "optimal policy"), 2)
     assert made["fitness"][-1] == made["fitness/optimal policy"] == episodes.returns.mean()
     judged = problem.evaluate_mean(outcome.mean, key)
-    both = judged["fitness/ppo"] + judged["fitness/optimal policy"]
-    assert float(judged["fitness"]) == pytest.approx(float(both) / 2, rel=1e-6)
+    both = 3 * judged["fitness/ppo"] + judged["fitness/optimal policy"]
+    assert float(judged["fitness"]) == pytest.approx(float(both) / 4, rel=1e-6)
     # It trains nothing, and CartPole's episodes have 500 steps at most.
     for steps in ("steps", "judgement_steps"):
         more, fewer = (getattr(p, steps)() for p in (problem, without))
