@@ -71,8 +71,9 @@ class Objective:
     @property
     def digests(self) -> dict[str, str]:
         """{name: SHA-256} of what its name does not tell: a file's contents, and code of somebody's own."""
-        told = [*code_of(self.drift).values(), self.metadata.get("sha256")]
-        return {} if told == [None] else {self.name: " ".join(filter(None, told))}
+        told = [*code_of(self.drift).values()]
+        told += [self.metadata["sha256"]] if "sha256" in self.metadata else []
+        return {self.name: " ".join(told)} if told else {}
 
     @property
     def learned_on(self) -> tuple[str, ...]:

@@ -14,6 +14,7 @@ from typing import Any, cast
 import jax
 import jax.numpy as jnp
 import numpy as np
+from gymnax.environments import spaces
 from jax.typing import ArrayLike
 
 from scb import processes
@@ -25,7 +26,7 @@ from scb.agents.spec import (
     check_algorithms,
     configured,
 )
-from scb.analysis.optimal_actions import optimal_actions
+from scb.analysis.optimal_actions import optimal_actions, optimal_policy
 from scb.curriculum import EpisodeLengths, check_curriculum, paper_curriculum
 from scb.discovery_config import DiscoveryConfig as DiscoveryConfig
 from scb.environments.registry import environment_spec
@@ -33,16 +34,16 @@ from scb.environments.synthetic import SyntheticBandit, Weights
 from scb.environments.synthetic_mdp import synthetic_for
 from scb.environments.zoo import bandit_metadata, load_bandit, save_bandit
 from scb.errors import UserError, one_of
-from scb.evaluation import Episodes, evaluate
+from scb.evaluation import evaluate
 from scb.evolution import EnvironmentSteps, Outcome, evolve
 from scb.fitting import standardize_reward
 from scb.judgement import check_fits
 from scb.keys import named_key, root_key, split_key
-from scb.linear_expert import erring
+from scb.linear_expert import erring, noisy
 from scb.measurement import Judge, Place, train_and_judge
 from scb.refinement import refined
 from scb.runs import Run, config_dict, run_of
-from scb.spaces import check_bounded, clip_to_space, kind_of_actions
+from scb.spaces import check_bounded, kind_of_actions
 from scb.strategies import strategy_for
 from scb.warm_start import expert_agent, warm_start
 
@@ -226,15 +227,17 @@ class BanditDiscovery:
             )
 
         names = list(self.specs)
-        own: dict[str, jax.Array] = {}
+        optimal: dict[str, jax.Array] = {}
         if config.optimal_policy_episodes:
-            own = {OPTIMAL_POLICY: self._own(candidate, key, env_params, limit)[None]}
+            optimal = {
+                OPTIMAL_POLICY: self._optimal_return(candidate, key, env_params, limit)[None]
+            }
         if config.mode == "all":
             returns = {
                 # The first has the generation's own key, as where it is alone.
                 name: returns_of(name, named_key(key, name) if i else key)
                 for i, name in enumerate(names)
-            } | own
+            } | optimal
             means = {f"fitness/{name}": r.mean() for name, r in returns.items()}
             return {"fitness": jnp.concatenate(list(returns.values())), **means}
         # The generation is no member of the population, so this stays a branch and trains one
@@ -246,8 +249,8 @@ class BanditDiscovery:
         logged = {
             f"fitness/{name}": jnp.where(turn == i, returns.mean(), jnp.nan)
             for i, name in enumerate(names)
-        } | {f"fitness/{name}": r.mean() for name, r in own.items()}
-        return {"fitness": jnp.concatenate([returns, *own.values()]), **logged}
+        } | {f"fitness/{name}": r.mean() for name, r in optimal.items()}
+        return {"fitness": jnp.concatenate([returns, *optimal.values()]), **logged}
 
     def _earned(
         self,
@@ -269,29 +272,25 @@ class BanditDiscovery:
         )
         return earned["return"].returns.mean()
 
-    def _own(
+    def _optimal_return(
         self, weights: Weights, key: jax.Array, env_params: Any, limit: ArrayLike | None = None
     ) -> jax.Array:
         """[] mean return in the evaluation environment of a candidate's own optimal policy."""
         assert isinstance(self.bandit, SyntheticBandit)
-        best = optimal_actions(self.bandit, self.bandit.params(weights))
-        number, scale = self.config.optimal_policy_episodes, self.config.optimal_policy_errors
+        config, params = self.config, self.bandit.params(weights)
+        number, scale = config.optimal_policy_episodes, config.optimal_policy_errors
+        key, judge = named_key(key, OPTIMAL_POLICY), partial(evaluate, self.place.env, env_params)
+        if not scale:
+            return judge(optimal_policy(self.bandit, params), key, number, limit).returns.mean()
+        best, size = optimal_actions(self.bandit, params), self.bandit.observation_size
+        space = cast(spaces.Box, self.bandit.action_space())
 
-        def episodes(key: jax.Array, number: int) -> Episodes:
-            policy, space = best, self.bandit.action_space()
-            if scale:
-                policy = erring(best, self.bandit.observation_size, cast(Any, space), scale, key)
-
-            def act(observation: jax.Array, key: jax.Array) -> jax.Array:
-                return clip_to_space(policy(jnp.ravel(observation)), space)
-
-            return evaluate(self.place.env, env_params, act, key, number, limit)
+        def erred(key: jax.Array) -> jax.Array:
+            act = noisy(erring(best, size, space, scale, key), space, 0.0)
+            return judge(act, key, 1, limit).returns
 
         # Errors are an episode's own.
-        key_own = named_key(key, OPTIMAL_POLICY)
-        if scale:
-            return jax.vmap(lambda k: episodes(k, 1).returns)(split_key(key_own, number)).mean()
-        return episodes(key_own, number).returns.mean()
+        return jax.vmap(erred)(split_key(key, number)).mean()
 
     def evaluate_mean(self, candidate: Weights, key: jax.Array) -> dict[str, jax.Array]:
         results = {}
@@ -302,7 +301,9 @@ class BanditDiscovery:
                 name, candidate, drawn, key_agent, self.place.params
             )
         if self.config.optimal_policy_episodes:
-            results[f"fitness/{OPTIMAL_POLICY}"] = self._own(candidate, key, self.place.params)
+            results[f"fitness/{OPTIMAL_POLICY}"] = self._optimal_return(
+                candidate, key, self.place.params
+            )
         # As in the search an optimal policy counts as one of a candidate's agents.
         weights = [self.config.agents_per_candidate] * len(self.specs) + [1]
         worth = jnp.average(

@@ -12,12 +12,11 @@ from scb.command_line import GENERATIONS, listed, text
 from scb.curriculum import CurriculumConfig, read_curriculum
 from scb.environments.synthetic import BanditConfig
 from scb.environments.synthetic_mdp import PARAMETERIZATIONS
-from scb.environments.zoo import bandit_metadata
+from scb.environments.zoo import digests
 from scb.errors import UserError, at_least, of_classes, one_of, positive, unused
 from scb.evolution import EvolutionConfig
 from scb.fitting import check_linear
 from scb.lists import read_configs, read_lists, write_lists
-from scb.own import code_of_names
 from scb.refinement import RefinementConfig
 from scb.strategies import REMEMBERING
 from scb.warm_start import WarmStartConfig
@@ -128,8 +127,7 @@ class DiscoveryConfig:
 
     def checksums(self) -> dict[str, str]:
         """{name: SHA-256} of what a name does not tell: a bandit that it starts from, an environment of one's own."""
-        start = {} if self.start is None else {self.start: bandit_metadata(self.start)["sha256"]}
-        return start | code_of_names([self.environment])
+        return digests(filter(None, [self.environment, self.start]))
 
     @property
     def fitted(self) -> bool:
