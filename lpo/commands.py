@@ -68,7 +68,7 @@ def _meta_training(
 class MetaTrain(LongRun):
     """Learn an objective: evolve a drift on a bandit, or on an environment.
 
-    A resumed search may have more --generations.
+    A resumed search may have more --generations, or fewer than were asked for, to end early.
 
     Attributes:
       preset: quick (30 generations of 32) or paper (512 of 64); single flags override it.

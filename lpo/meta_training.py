@@ -117,7 +117,7 @@ def meta_train(
         dict; `dataclasses.replace(MetaTrainingConfig().evolution, num_generations=10)` keeps the rest of its default,
         which an EvolutionConfig made anew does not.
       run: a folder for logs and checkpoints. Killed, the same call goes on from the last checkpoint, also with more
-        generations; once it has ended, it returns the outcome. None: nothing is kept.
+        generations, or with fewer; once it has ended, it returns the outcome. None: nothing is kept.
       quiet: no line a generation.
 
     Returns:

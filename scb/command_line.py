@@ -155,7 +155,7 @@ class LongRun(ABC):
         return {}
 
     def growing(self) -> Collection[str]:
-        """Settings, such as "evolution.num_generations", of which a resumed run may have more than it had."""
+        """Settings, such as "evolution.num_generations", of which a resumed run may have more (`Run.open`)."""
         return ()
 
     @abstractmethod

@@ -107,7 +107,8 @@ class Judgement:
 class Discover(LongRun):
     """Discover a bandit: evolve one so that agents trained in it do well in an environment.
 
-    A resumed search may have more --generations, but not with --curriculum paper, which is stretched to them.
+    A resumed search may have more --generations, or fewer than were asked for, to end early; but not with
+    --curriculum paper, which is stretched to them.
 
     Attributes:
       preset: quick (150 generations of 32, PPO) or paper (the paper's tables for the environment);

@@ -344,7 +344,8 @@ def discover(
         `dataclasses.replace(DiscoveryConfig().evolution, num_generations=10)` keeps the rest of its default, which an
         EvolutionConfig made anew does not.
       run: a folder for logs and checkpoints. Killed, the same call goes on from the last checkpoint, also with more
-        generations but for the paper's curriculum; once it has ended, it returns the outcome. None: nothing is kept.
+        generations, or with fewer, but for the paper's curriculum; once it has ended, it returns the outcome. None:
+        nothing is kept.
       quiet: no line a generation.
 
     Returns:

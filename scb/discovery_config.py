@@ -122,7 +122,7 @@ class DiscoveryConfig:
 
     @property
     def growing(self) -> tuple[str, ...]:
-        """Settings of which a resumed search may have more: none where the paper's curriculum is stretched to it."""
+        """Settings of which a resumed search may have more (`Run.open`): none where the curriculum is "paper"."""
         return () if self.curriculum == "paper" else GENERATIONS
 
     def checksums(self) -> dict[str, str]:

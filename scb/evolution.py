@@ -314,8 +314,9 @@ def evolve(
 
     Every generation is a function of (config, generation, strategy state), so a run that was killed
     and resumed ends with the same bytes as one that was not, on the same machine, devices and
-    versions; and one that is resumed with more generations goes on to the same mean as one that had
-    them from the start. Its log, and what is best, know one judgement more: that of its first end.
+    versions; and one that is resumed with more generations, or fewer, goes on to the same mean as one that
+    had them from the start. Where they are more its log, and what is best, know one judgement more: that of its
+    first end.
 
     Args:
       problem: what is evolved.

@@ -16,6 +16,7 @@ import socket
 import time
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import asdict
+from functools import reduce
 from pathlib import Path
 from typing import IO, Any
 
@@ -65,8 +66,8 @@ class Run:
             "inputs", {name: digest} of files, is compared where the folder has one.
           resume: continue the run that is there. Its config must equal `config`.
           wandb_project: also log to this Weights & Biases project (extra `wandb`).
-          growing: entries, such as "config.seeds", that may be more than they were (`grown`). The folder
-            then stores the new config.
+          growing: entries, such as "config.seeds", that may be more than they were (`grown`); of a search's
+            num_generations, also fewer, as long as one is left to do. The folder then stores the new config.
 
         Raises:
           UserError: the folder can't be written, holds something already, isn't a run, is another
@@ -85,7 +86,8 @@ class Run:
                         f"cannot resume {folder}: {name} is not what it was when the run was started; put that back, "
                         "or start a new folder."
                     )
-            difference = first_difference(stored, asked, growing)
+            asked_before = _ending_early(folder, stored, asked, growing)
+            difference = first_difference(asked_before, asked, growing)
             if difference:
                 raise UserError(
                     f"cannot resume {folder}: its config differs at {difference}; resume with the config it was "
@@ -378,6 +380,36 @@ def first_difference(stored: Any, given: Any, growing: Collection[str] = (), pat
     if path in growing and grown(stored, given):
         return ""
     return f"{path} ({stored!r} there, {given!r} now)"
+
+
+def _ending_early(
+    folder: Path, stored: dict[str, Any], asked: dict[str, Any], growing: Collection[str]
+) -> dict[str, Any]:
+    """A stored config as if so few generations had been asked for at first as now are; itself, where these are more.
+
+    Raises:
+      UserError: the search has done more, or as many: the last one is judged as it is done.
+    """
+    stored = json.loads(json.dumps(stored))
+    for path in growing:
+        *parents, name = path.split(".")
+        before, now = (reduce(lambda x, k: x.get(k, {}), parents, x) for x in (stored, asked))
+        if name != "num_generations" or not now.get(name, 0) < before.get(name, 0):
+            continue
+        done = _generations_done(folder)
+        if now[name] <= done:
+            raise UserError(
+                f"cannot end {folder} after {now[name]} generations: of {before[name]} it has done {done}"
+                + (f"; take at least {done + 1}." if done < before[name] else ", and has ended.")
+            )
+        before[name] = now[name]
+    return stored
+
+
+def _generations_done(folder: Path) -> int:
+    """How many are in a run's newest checkpoint."""
+    saved = (folder / "checkpoints").glob("*")
+    return max((int(path.name) for path in saved if path.name.isdigit()), default=0)
 
 
 def grown(before: Any, now: Any) -> bool:

@@ -239,7 +239,6 @@ def interrupted(working_folder, monkeypatch, capsys) -> Path:
         (["--population-size", "6"], "config.evolution.population_size (4 there, 6 now)"),
         (["--reward-noise", "0"], "config.reward_noise (2.0 there, 0.0 now)"),
         (["--seed", "5"], "config.evolution.seed (0 there, 5 now)"),
-        (["--generations", "3"], "config.evolution.num_generations (30 there, 3 now)"),
     ],
 )
 def test_a_resumed_run_keeps_its_settings(refused, interrupted, flags, difference):

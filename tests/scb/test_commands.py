@@ -144,7 +144,9 @@ def test_a_finished_discovery_goes_on_with_more_generations(discovered, tmp_path
     assert after["sha256"] != before["sha256"]
     assert after["command"] == before["command"].replace("--generations=2", "--generations=3")
     result = call("discover", "--resume", folder, "--generations", "2")
-    assert "its config differs at config.evolution.num_generations (3 there, 2 now)" in result.err
+    assert (
+        f"cannot end {folder} after 2 generations: of 3 it has done 3, and has ended." in result.err
+    )
 
 
 def test_a_search_under_the_papers_curriculum_keeps_its_length(tmp_path):
@@ -152,6 +154,8 @@ def test_a_search_under_the_papers_curriculum_keeps_its_length(tmp_path):
     Discover.parse([*words, "--out", str(tmp_path / "run")]).open().close()
     result = call("discover", "--resume", tmp_path / "run", "--generations=5")
     assert "its config differs at config.evolution.num_generations (4 there, 5 now)" in result.err
+    result = call("discover", "--resume", tmp_path / "run", "--generations=3")
+    assert "its config differs at config.evolution.num_generations (4 there, 3 now)" in result.err
 
 
 def test_a_resumed_discovery_judges_as_it_was_told_to_at_first(tmp_path):

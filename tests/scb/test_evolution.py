@@ -680,6 +680,25 @@ def test_a_finished_run_goes_on_with_more_generations(tmp_path, uninterrupted):
     assert cost["environment_steps_judgements_training"] == 5 * one
 
 
+def test_a_killed_run_ends_with_fewer_generations_as_one_that_had_so_few(tmp_path, uninterrupted):
+    with pytest.raises(Killed):
+        evolve_in(tmp_path / "run", replace(CONFIG, num_generations=100), kill_at=6)
+    for few in (1, 6):  # as many as the newest checkpoint has
+        config = config_dict(replace(CONFIG, num_generations=few))
+        said = rf"after {few} generations: of 100 it has done 6; take at least 7\."
+        with pytest.raises(UserError, match=said):
+            Run.open(tmp_path / "run", config, resume=True, growing=["num_generations"])
+    other = config_dict(replace(CONFIG, sigma=0.4))
+    with pytest.raises(UserError, match=r"differs at sigma \(0.3 there, 0.4 now\)"):
+        Run.open(tmp_path / "run", other, resume=True, growing=["num_generations"])
+    config = config_dict(CONFIG)
+    run = Run.open(tmp_path / "run", config, resume=True, growing=["num_generations"])
+    outcome = evolve(Parabola(noise=0.5), CONFIG, run, quiet=True)
+    run.close()
+    assert fingerprint(tmp_path / "run", outcome) == uninterrupted["SNES"]
+    assert read_config(tmp_path / "run") == config
+
+
 def cut_in_half(folder):
     for path in [p for p in folder.rglob("*") if p.is_file()]:
         path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
