@@ -121,6 +121,7 @@ def claims(report: Report) -> list[Claim]:
                 f"CartPole's {kind} causes less than {HARDLY:.0%} (the share, negated)",
                 share,
                 -HARDLY,
+                places=3,
             )
         )
     never = nothing_done(environments["MountainCar-v0"]) < 0.01

@@ -19,7 +19,7 @@ from scb.agents.spec import AgentSpec, check_lists, environment_agent
 from scb.command_line import listed, numbers, text
 from scb.environments.registry import check_backend, environment_spec
 from scb.environments.zoo import digests
-from scb.errors import UserError, at_least, of_classes, one_of, positive, unused
+from scb.errors import UserError, agents_at_least, at_least, of_classes, one_of, positive, unused
 from scb.evolution import EnvironmentSteps, EvolutionConfig
 from scb.keys import named_key, root_key, split_key
 from scb.lists import read_values, write_values
@@ -156,7 +156,8 @@ class MetaTrainingConfig:
         if not any(environment_spec(name).is_bandit for name in self.tasks):
             noisy = _OF_BANDITS if self.reward_noise else _OF_BANDITS[:1]  # none is what there is
             unused(self, "none of the tasks is a bandit", noisy, "take a bandit")
-        at_least(1, self, "agents_per_candidate", "evaluation_episodes", "contexts")
+        agents_at_least(1, self, "agents_per_candidate")
+        at_least(1, self, "evaluation_episodes", "contexts")
         at_least(0, self, "reward_noise", "initial_scale")
 
     @property

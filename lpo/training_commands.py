@@ -25,15 +25,13 @@ from scb.command_line import Measuring, text
 from scb.console import console
 from scb.environments.registry import check_backend, environment_spec
 from scb.environments.zoo import digests
-from scb.errors import UserError, at_least
+from scb.errors import UserError, agents_at_least, at_least
 from scb.files import write_json
 from scb.lists import read_settings, write_settings
 from scb.machine import package_versions
 from scb.measurement import Place, check_seeds
 from scb.runs import config_dict
 from scb.statistics import estimate
-
-MOST_AGENTS = 100_000  # of an objective: more would not fit into memory before the first is trained
 
 
 def _tell(line: str) -> None:
@@ -62,12 +60,8 @@ class Agents:
 
     def seed_list(self) -> list[int]:
         """Consecutive seeds; a UserError for none or a negative one."""
-        at_least(1, self, self.number_field)
+        agents_at_least(1, self, self.number_field)
         at_least(0, self, "seed")
-        if (number := getattr(self, self.number_field)) > MOST_AGENTS:
-            raise UserError(
-                f"{self.number_field} is {number}: each is an agent to train, and at most {MOST_AGENTS} are taken."
-            )
         seeds = list(range(self.seed, self.seed + getattr(self, self.number_field)))
         check_seeds(seeds)
         return seeds

@@ -16,7 +16,7 @@ from scb.console import console
 from scb.discovery import BanditDiscovery, DiscoveryConfig
 from scb.environments.registry import environment_spec
 from scb.environments.zoo import bandit_metadata, load_synthetic, save_bandit
-from scb.errors import at_least
+from scb.errors import agents_at_least, at_least
 from scb.evolution import EvolutionConfig
 from scb.judgement import (
     BRAX_EPISODES,
@@ -94,7 +94,7 @@ class Judgement:
     judge_episodes: int | None = None
 
     def __post_init__(self) -> None:
-        at_least(0, self, "judge_agents")
+        agents_at_least(0, self, "judge_agents")
         at_least(1, self, "judge_episodes")
 
     def episodes_in(self, environment: str) -> int:
@@ -250,7 +250,8 @@ class TrainConfig:
     sampled_actions: bool = False
 
     def __post_init__(self) -> None:
-        at_least(1, self, "agents", "episodes")
+        agents_at_least(1, self, "agents")
+        at_least(1, self, "episodes")
         at_least(0, self, "seed")
 
 

@@ -13,7 +13,7 @@ from scb.curriculum import CurriculumConfig, read_curriculum
 from scb.environments.synthetic import BanditConfig
 from scb.environments.synthetic_mdp import PARAMETERIZATIONS
 from scb.environments.zoo import digests
-from scb.errors import UserError, at_least, of_classes, one_of, positive, unused
+from scb.errors import UserError, agents_at_least, at_least, of_classes, one_of, positive, unused
 from scb.evolution import EvolutionConfig
 from scb.fitting import check_linear
 from scb.lists import read_configs, read_lists, write_lists
@@ -217,7 +217,8 @@ class DiscoveryConfig:
             raise UserError(
                 f"reward_std is for bandits, and parameterization {self.parameterization} is none: leave it out."
             )
-        at_least(1, self, "agents_per_candidate", "evaluation_episodes")
+        agents_at_least(1, self, "agents_per_candidate")
+        at_least(1, self, "evaluation_episodes")
         at_least(0, self, "optimal_policy_episodes", "optimal_policy_errors")
         if not self.optimal_policy_episodes:
             because, instead = "the optimal policy has no episodes", "take at least 1"

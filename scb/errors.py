@@ -6,6 +6,8 @@ from dataclasses import fields, is_dataclass
 from difflib import get_close_matches
 from typing import Any, get_args
 
+MOST_AGENTS = 100_000  # more would not fit into memory before the first is trained
+
 
 class UserError(Exception):
     """Bad input, told in one sentence: what it was, what is allowed, what to do.
@@ -22,6 +24,16 @@ def at_least(minimum: int, of: object = None, *names: str, **values: float | Non
     """
     allowed = f"at least {minimum}" if minimum else "0 or larger"
     _check(lambda value: minimum <= value < math.inf, allowed, of, names, values)
+
+
+def agents_at_least(minimum: int, of: object, *names: str) -> None:
+    """As `at_least` of numbers of agents; a UserError also where they are more than are made at once."""
+    at_least(minimum, of, *names)
+    for name in names:
+        if (number := getattr(of, name)) > MOST_AGENTS:
+            raise UserError(
+                f"{name} is {number}: each is an agent to train, and at most {MOST_AGENTS} are taken."
+            )
 
 
 def positive(of: object = None, *names: str, **values: float | None) -> None:

@@ -21,7 +21,7 @@ from scipy.stats import rankdata
 from scb import processes, termination
 from scb.checkpoints import continued
 from scb.console import Progress, progress_console
-from scb.errors import UserError, at_least, numbers, one_of, positive, unused
+from scb.errors import UserError, agents_at_least, at_least, numbers, one_of, positive, unused
 from scb.files import plain
 from scb.keys import key_at, root_key, split_key
 from scb.machine import machine_description
@@ -99,9 +99,8 @@ class EvolutionConfig:
                 f"{self.strategy} compares fitness with that of earlier generations, which ranks among candidates of "
                 "one do not allow: combine by mean, or choose another strategy, such as SNES."
             )
-        at_least(
-            1, self, "averaging", "mean_evaluations", "evaluate_mean_every", "checkpoint_every"
-        )
+        at_least(1, self, "averaging", "evaluate_mean_every", "checkpoint_every")
+        agents_at_least(1, self, "mean_evaluations")
         if self.averaging > 1 and self.strategy not in DISTRIBUTIONS:
             raise UserError(
                 f"averaging is {self.averaging}, and {self.strategy} keeps a population and no mean: leave it out, or "

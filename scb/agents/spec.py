@@ -141,7 +141,15 @@ class AgentSpec:
         The number of updates (iterations, epochs, minibatches) stays that of the environment's
         setting, so that an objective meets the regime in which it will be used, while a batch holds a
         fraction of the transitions: contexts are independent, consecutive steps are not.
+
+        Raises:
+          UserError: the setting's minibatches don't divide so many contexts.
         """
+        if contexts % self.config.num_minibatches:
+            raise UserError(
+                f"contexts is {contexts}, and this setting cuts a batch into {self.config.num_minibatches} equal "
+                f"minibatches: take a multiple of {self.config.num_minibatches}."
+            )
         return self.with_values(
             num_envs=contexts,
             num_steps=1,

@@ -82,15 +82,15 @@ def explain(
         "context_std": dict(zip(names, np.round(contexts.std(0), 4).tolist(), strict=True)),
         "visited_std": dict(zip(names, np.round(visited.std(0), 4).tolist(), strict=True)),
     }
-    if bandit.observation_size < 2:
-        return numbers, {}
     everything = np.concatenate([contexts, shown])
     low, high = flat_bounds(place.env.observation_space(place.params))
     box = (np.asarray(low), np.asarray(high))
     parts = {
         "name": bandit.name,
         "summary": f"its optimal policy earns {earned} in {place.name}",
-        "plane": plane_for(place.name, everything, importance.tolist(), box),
+        "plane": None
+        if bandit.observation_size < 2
+        else plane_for(place.name, everything, importance.tolist(), box),
         "best": drawn,
         "rewards": rewards,
         "num_actions": num_actions,
@@ -145,12 +145,14 @@ def explain_command(
         f"The bandit's optimal policy earns {earned['value']:.1f} in {place} "
         f"({episodes} episode{'s' * (episodes > 1)})."
     )
-    for name, share in sorted(numbers["importance"].items(), key=lambda item: -item[1]):
+    shares = sorted(numbers["importance"].items(), key=lambda item: -item[1])
+    for name, share in shares[: figures.BARS]:
         printer.print(f"  {share:6.1%} of the reward's variance, alone or with others: {name}")
-    if not parts:
-        printer.print("It has a single observation, so that there is no plane to draw.")
-    if parts:
-        plotting.save(figures.explained(parts), folder / "explain.png")
-    if parts and html:
+    if more := shares[figures.BARS :]:
+        printer.print(f"  {more[0][1]:6.1%} or less, each of {len(more)} others")
+    plotting.save(figures.explained(parts), folder / "explain.png")
+    if html and parts["plane"] is None:
+        printer.print("It has a single observation: there is no surface to turn, and no page.")
+    elif html:
         page.save_bandit_page(folder / "explain.html", parts)
     printer.print(f"written to {folder}", soft_wrap=True)

@@ -14,6 +14,7 @@ from scb import plotting
 from scb.analysis.planes import Plane
 
 POINTS = 80  # of a plane's grid in either direction
+BARS = 12  # of what the reward depends on, beyond which the others are left out
 # Discrete actions, in order; they stay apart for colour-blind readers and in grey.
 DISCRETE = ("#D9F0D3", "#FFFFFF", "#C2A5CF", "#F1A340")
 
@@ -85,7 +86,7 @@ def importance_bars(
     axes.set_yticks(positions, list(names))
     axes.invert_yaxis()
     axes.set_xlim(left=0.0)
-    axes.set_xlabel("share of the reward's variance, alone or with others", fontsize=9)
+    axes.set_xlabel("share of the reward's variance,\nalone or with others", fontsize=9)
 
 
 def trajectory_line(plane: Plane, states: NDArray[np.floating]) -> NDArray[np.floating]:
@@ -108,34 +109,65 @@ def draw_trajectory(axes: Axes, plane: Plane, states: NDArray[np.floating]) -> N
 def explained(parts: Mapping[str, Any]) -> Figure:
     """Optimal actions with an episode, states of bandit and environment, and importance, side by side.
 
+    Of many observations the most important have their bars; of a single one the actions are a line over it.
+
     Args:
-      parts: "name", "plane", "best", "num_actions", "bounds", "episode" [T, O], "contexts" [N, O],
-        "visited" [N, O], "names", "importance", "action" (its name), "summary", as
+      parts: "name", "plane" (None of a single observation), "best", "num_actions", "bounds", "episode" [T, O],
+        "contexts" [N, O], "visited" [N, O], "names", "importance", "action" (its name), "summary", as
         `scb.analysis.explain.explain` gives them.
     """
-    plane: Plane = parts["plane"]
     with plotting.figure_style():
         figure = Figure(figsize=(12.0, 4.0))
         actions, states, bars = figure.subplots(1, 3)
-        drawn = action_map(actions, plane, parts["best"], parts["num_actions"], parts["bounds"])
-        bar = figure.colorbar(drawn, ax=actions, label=parts["action"])
-        if parts["num_actions"]:
-            bar.set_ticks(range(parts["num_actions"]))
-        draw_trajectory(actions, plane, parts["episode"])
-        actions.legend(loc="upper right", fontsize=7, frameon=True)
+        draw = _over_a_line if parts["plane"] is None else _over_a_plane
+        draw(actions, states, parts)
         actions.set_title("the bandit's best action", fontsize=10)
-        for name, color, label in (
-            ("contexts", plotting.SKY_BLUE, "contexts of the bandit"),
-            ("visited", plotting.VERMILLION, "visited by its optimal policy"),
-        ):
-            points = plane.project(parts[name])
-            states.plot(*points.T, ".", markersize=2, alpha=0.4, color=color, label=label)
-        _label_axes(states, plane)
         states.set_title("states", fontsize=10)
         legend = states.legend(loc="upper right", fontsize=7, frameon=True)
         for handle in legend.legend_handles:
             handle.set_alpha(1.0)
-        importance_bars(bars, parts["names"], parts["importance"])
-        bars.set_title("what the reward depends on", fontsize=10)
+        names, importance = parts["names"], parts["importance"]
+        most = list(range(len(names)))
+        if len(names) > BARS:
+            most = sorted(most, key=lambda i: -importance[i])[:BARS]
+        importance_bars(bars, [names[i] for i in most], [importance[i] for i in most])
+        of_all = "" if len(most) == len(names) else f" ({BARS} of {len(names)})"
+        bars.set_title(f"the reward depends on{of_all}", fontsize=10)
         plotting.figure_title(figure, f"{parts['name']}: {parts['summary']}")
     return figure
+
+
+_CLOUDS = (
+    ("contexts", plotting.SKY_BLUE, "contexts of the bandit"),
+    ("visited", plotting.VERMILLION, "visited by its optimal policy"),
+)
+
+
+def _over_a_plane(actions: Axes, states: Axes, parts: Mapping[str, Any]) -> None:
+    plane: Plane = parts["plane"]
+    drawn = action_map(actions, plane, parts["best"], parts["num_actions"], parts["bounds"])
+    bar = actions.figure.colorbar(drawn, ax=actions, label=parts["action"])
+    if parts["num_actions"]:
+        bar.set_ticks(range(parts["num_actions"]))
+    draw_trajectory(actions, plane, parts["episode"])
+    actions.legend(loc="upper right", fontsize=7, frameon=True)
+    for name, color, label in _CLOUDS:
+        points = plane.project(parts[name])
+        states.plot(*points.T, ".", markersize=2, alpha=0.4, color=color, label=label)
+    _label_axes(states, plane)
+
+
+def _over_a_line(actions: Axes, states: Axes, parts: Mapping[str, Any]) -> None:
+    """The same over a single observation."""
+    everything = np.concatenate([parts["contexts"], parts["visited"]])
+    low, high = np.quantile(everything, (0.005, 0.995))
+    points = np.linspace(low, high, 4 * POINTS)[:, None]
+    actions.plot(points, parts["best"](points), color=plotting.BLUE)
+    (name,) = parts["names"]
+    actions.set(xlabel=name, ylabel=parts["action"], xlim=(low, high))
+    if parts["num_actions"]:
+        actions.set_yticks(range(parts["num_actions"]))
+    for cloud, color, label in _CLOUDS:
+        values, span = parts[cloud].ravel(), (low, high)
+        states.hist(values, 40, range=span, density=True, alpha=0.5, color=color, label=label)
+    states.set(xlabel=name, ylabel="density", xlim=(low, high))

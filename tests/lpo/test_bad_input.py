@@ -27,6 +27,7 @@ pytestmark = pytest.mark.usefixtures("working_folder", "no_training")
         ("meta-train --environment Synthetic-Pendulm-v1", "did you mean Synthetic-Pendulum-v1"),
         ("train --objective dop", "unknown objective 'dop': did you mean dpo?"),
         ("evaluate --objectives ppo dop", "unknown objective 'dop': did you mean dpo?"),
+        ("meta-train --contexts 7", "contexts is 7, and this setting cuts a batch into 10 equal"),
         ("meta-train --drift netwrok", "unknown learned drift 'netwrok': did you mean network?"),
         ("meta-train --drift dpo", "unknown learned drift 'dpo': "),
         ("certify dop", "unknown objective 'dop': did you mean dpo?"),

@@ -209,6 +209,45 @@ def test_explain_writes_what_it_found(tmp_path, capsys):
     assert "of the reward's variance, alone or with others: velocity" in capsys.readouterr().out
 
 
+def parts_of(size, plane):
+    """What `explain` finds of a bandit with so many observations, the last the most important."""
+    states = np.random.default_rng(0).normal(size=(50, size))
+    return {
+        "name": "Synthetic-Point",
+        "summary": "its optimal policy earns 1",
+        "plane": plane,
+        "best": lambda observations: np.clip(observations[:, 0], -0.5, 0.5),
+        "num_actions": None,
+        "bounds": (-0.5, 0.5),
+        "episode": states[:5],
+        "contexts": states,
+        "visited": 2 * states,
+        "names": [f"observation {i}" for i in range(size)],
+        "importance": (np.arange(size) / size).tolist(),
+        "action": "force",
+    }
+
+
+def test_of_a_single_observation_the_best_action_is_a_line_over_it():
+    actions, states, bars = figures.explained(parts_of(1, None)).axes
+    (line,) = actions.lines
+    np.testing.assert_allclose(line.get_ydata(), np.clip(line.get_xdata(), -0.5, 0.5))
+    assert (actions.get_xlabel(), actions.get_ylabel()) == ("observation 0", "force")
+    contexts, visited = states.containers
+    # As densities: the wider spread is the lower.
+    assert max(x.get_height() for x in contexts) > max(x.get_height() for x in visited)
+    assert len(bars.patches) == 1
+
+
+def test_of_many_observations_the_most_important_are_drawn():
+    states = parts_of(40, None)["contexts"]
+    plane = plane_for("hopper", states, [0.0] * 38 + [1.0, 0.5], None)
+    *_, bars, _ = figures.explained(parts_of(40, plane)).axes
+    names = [text.get_text() for text in bars.get_yticklabels()]
+    assert names == [f"observation {i}" for i in range(39, 27, -1)]
+    assert bars.get_title("left") == "the reward depends on (12 of 40)"
+
+
 PENDULUM = "Synthetic-Pendulum-v1"
 
 

@@ -28,6 +28,10 @@ pytestmark = pytest.mark.usefixtures("small_agents")
         ("train --bandit Synthetic-Pendulum-v2", "unknown bandit 'Synthetic-Pendulum-v2'"),
         ("train --bandit nowhere.npz", "nowhere.npz does not exist"),
         ("train --agents 0", "agents is 0: it must be at least 1"),
+        (
+            "train --agents 100001",
+            "agents is 100001: each is an agent to train, and at most 100000",
+        ),
         ("train --episodes -1", "episodes is -1: it must be at least 1"),
         ("train --seed -1", "seed is -1: it must be 0 or larger"),
         (
@@ -124,6 +128,11 @@ pytestmark = pytest.mark.usefixtures("small_agents")
         ("discover --min-spread -1", "min_spread is -1.0: it must be 0 or larger, and finite"),
         ("discover --min-spread nan", "min_spread is nan: it must be 0 or larger, and finite"),
         ("discover --judge-agents -1", "judge_agents is -1: it must be 0 or larger"),
+        ("discover --judge-agents 200000", "judge_agents is 200000: each is an agent to train"),
+        (
+            "discover --mean-evaluations 200000",
+            "mean_evaluations is 200000: each is an agent to tr",
+        ),
         (
             "discover --form linear --latent uniform",
             "the contexts of the form linear are normally distributed, and the latent is uniform",
