@@ -230,7 +230,7 @@ class LongRun(ABC):
             stored["inputs"] = inputs
         folder, resumed = output.resume or output.out, output.resume is not None
         growing = [f"config.{name}" for name in self.growing()]
-        opened = partial(Run.open, folder, stored, resumed, wandb, growing)
+        opened = partial(Run.open, folder, stored, resumed, wandb, growing, self.config)
         return processes.by_first(opened) or Run(folder, resumed)
 
 

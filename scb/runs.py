@@ -15,7 +15,7 @@ import secrets
 import socket
 import time
 from collections.abc import Collection, Iterator, Mapping
-from dataclasses import asdict
+from dataclasses import MISSING, asdict, fields, is_dataclass
 from functools import reduce
 from pathlib import Path
 from typing import IO, Any
@@ -56,6 +56,7 @@ class Run:
         resume: bool = False,
         wandb_project: str | None = None,
         growing: Collection[str] = (),
+        settings: Any = None,
     ) -> "Run":
         """Creates a run folder, or opens one to resume.
 
@@ -68,6 +69,8 @@ class Run:
           wandb_project: also log to this Weights & Biases project (extra `wandb`).
           growing: entries, such as "config.seeds", that may be more than they were (`grown`); of a search's
             num_generations, also fewer, as long as one is left to do. The folder then stores the new config.
+          settings: the dataclass that the config's entry "config" is of. What the folder's lacks of it, as an
+            earlier version had no such setting, is at its default.
 
         Raises:
           UserError: the folder can't be written, holds something already, isn't a run, is another
@@ -79,6 +82,8 @@ class Run:
         config = json.loads(json.dumps(config))
         if resume:
             stored, asked = ({**c, "command": None} for c in (read_config(folder), config))
+            if settings is not None and "config" in stored:
+                stored["config"] = _with_defaults(stored["config"], settings)
             inputs, now = (x.pop("inputs", None) or {} for x in (stored, asked))
             for name in inputs.keys() & now.keys():
                 if inputs[name] != now[name]:
@@ -87,8 +92,7 @@ class Run:
                         "or start a new folder."
                     )
             asked_before = _ending_early(folder, stored, asked, growing)
-            difference = first_difference(asked_before, asked, growing)
-            if difference:
+            if difference := first_difference(asked_before, asked, growing):
                 raise UserError(
                     f"cannot resume {folder}: its config differs at {difference}; resume with the config it was "
                     "started with, or start a new folder."
@@ -314,6 +318,20 @@ def config_dict(config: Any) -> dict[str, Any]:
     return dict(json.loads(json.dumps(asdict(config))))
 
 
+def _with_defaults(stored: Any, config: Any) -> Any:
+    """A configuration as it was stored, and the defaults of the settings that this version has and it lacks."""
+    if not isinstance(stored, dict):
+        return stored
+    found = dict(stored)
+    for entry in fields(config):
+        value = getattr(config, entry.name)
+        if is_dataclass(value):
+            found[entry.name] = _with_defaults(stored.get(entry.name, {}), value)
+        elif entry.name not in stored and entry.default is not MISSING:
+            found[entry.name] = json.loads(json.dumps(entry.default))
+    return found
+
+
 @contextlib.contextmanager
 def run_of(
     folder: "Run | str | Path | None",
@@ -342,7 +360,9 @@ def run_of(
         "config": config_dict(config),
         "inputs": dict(inputs),
     }
-    run = Run.open(path, stored, begun, growing=[f"config.{name}" for name in growing])
+    run = Run.open(
+        path, stored, begun, growing=[f"config.{name}" for name in growing], settings=config
+    )
     try:
         yield run
     finally:
@@ -365,7 +385,7 @@ def first_difference(stored: Any, given: Any, growing: Collection[str] = (), pat
     """Where two trees of JSON differ first, such as "a.b (1 there, 2 now)"; empty where they don't.
 
     Entries of `growing`, by such a path, may be more than they were (`grown`). What one of them lacks is as good as
-    empty: a later version has settings that an earlier one had not.
+    empty.
     """
     if isinstance(stored, dict) and isinstance(given, dict):
         for key in sorted(stored.keys() | given.keys()):

@@ -1,5 +1,7 @@
 import json
 import sys
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
 
 import jax.numpy as jnp
@@ -10,7 +12,16 @@ from scb.checkpoints import Checkpoints
 from scb.errors import UserError
 from scb.files import write_json, write_text
 from scb.machine import machine_description
-from scb.runs import Run, Stopwatch, first_difference, held, read_config, released
+from scb.runs import (
+    Run,
+    Stopwatch,
+    config_dict,
+    first_difference,
+    held,
+    read_config,
+    released,
+    run_of,
+)
 from tests.locking import is_locked
 
 CONFIG = {"seed": 0, "evolution": {"sigma": 0.05, "strategy": "SNES"}, "hidden_sizes": (8, 8)}
@@ -158,6 +169,45 @@ def test_a_bandit_that_was_replaced_cannot_go_on_with_a_run(tmp_path, growing):
     ):
         Run.open(tmp_path, replaced, resume=True, growing=growing)
     assert read_config(tmp_path)["inputs"] == began["inputs"]
+
+
+@dataclass(frozen=True)
+class Inner:
+    sigma: float = 0.05
+    averaging: int = 1
+
+
+@dataclass(frozen=True)
+class Outer:
+    seed: int
+    inner: Inner = field(default_factory=Inner)
+    episodes: int = 16
+    names: tuple[str, ...] = ("ppo",)
+    # A table is one setting, and has no defaults inside.
+    drawn: Mapping[str, float] = field(default_factory=lambda: {"scale": 1.0})
+
+
+def test_what_a_run_of_an_earlier_version_lacks_is_at_its_default(tmp_path):
+    settings = {"seed": 3, "inner": {"sigma": 0.1}, "names": ["sac"], "drawn": {"rate": 0.1}}
+    began = {"command": "x", "config": settings}
+    Run.open(tmp_path, began).close()
+    write_text(tmp_path / "metrics.jsonl", "")  # else nothing was found there yet
+    same = Outer(3, Inner(0.1), names=("sac",), drawn={"rate": 0.1})
+    others = {
+        r"inner.averaging \(1 there, 2 now": replace(same, inner=Inner(0.1, averaging=2)),
+        r"episodes \(16 there, 3 now": replace(same, episodes=3),
+        r"names \(\['sac'\] there": replace(same, names=("ppo",)),
+        r"drawn.scale \(None there, 1.0 now": replace(same, drawn={"rate": 0.1, "scale": 1.0}),
+    }
+    for difference, other in others.items():
+        with (
+            pytest.raises(UserError, match=rf"differs at config\.{difference}"),
+            run_of(tmp_path, other, {}, ()),
+        ):
+            pass
+    with run_of(tmp_path, same, {}, ()) as run:
+        assert run.resumed
+    assert read_config(tmp_path) == began
 
 
 def test_a_run_that_does_not_say_what_it_began_with_goes_on(run):
