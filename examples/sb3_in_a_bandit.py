@@ -6,6 +6,8 @@ It needs stable-baselines3 beside this library. Hyperparameters are the defaults
 earned −180 on Pendulum; docs/sb3.md has ten of every algorithm.
 """
 
+from typing import Literal
+
 import gymnasium
 import stable_baselines3
 import tyro
@@ -13,14 +15,22 @@ from stable_baselines3.common.evaluation import evaluate_policy
 
 import scb  # noqa: F401, which registers the bandits with Gymnasium
 
+# Those of Brax are not Gymnasium's environments of similar names.
+CLASSIC = Literal[
+    "Pendulum-v1", "CartPole-v1", "Acrobot-v1", "MountainCar-v0", "MountainCarContinuous-v0"
+]
+
 
 def main(
-    algorithm: str = "sac", environment: str = "Pendulum-v1", steps: int = 10_000, seed: int = 1
+    algorithm: Literal["ppo", "sac", "td3", "ddpg", "dqn"] = "sac",
+    environment: CLASSIC = "Pendulum-v1",
+    steps: int = 10_000,
+    seed: int = 1,
 ) -> float:
     """Train an agent in a bandit, then evaluate it.
 
     Args:
-      algorithm: ppo, sac, td3, ddpg or dqn.
+      algorithm: of SB3; dqn takes discrete actions, and sac, td3 and ddpg continuous ones.
       environment: of Gymnasium, for which the zoo has a bandit.
       steps: of the bandit.
       seed: of the agent.

@@ -41,8 +41,8 @@ from scb.agents.spec import bandit_agent
 from scb.artefacts import flatten
 from scb.environments.zoo import space_description
 from scb.errors import UserError, one_of
-from scb.evolution import map_population
 from scb.keys import named_key, root_key, split_key
+from scb.population import map_population
 from scb.statistics import Estimate, estimate
 
 EPISODES = 20

@@ -23,8 +23,8 @@ from scb.agents.spec import AgentSpec, algorithms_for, bandit_agent
 from scb.curriculum import paper_curriculum
 from scb.discovery import BanditDiscovery, DiscoveryConfig, discover
 from scb.environments.registry import environment_spec
-from scb.evolution import map_population
 from scb.measurement import Agents, Judge, train_and_judge
+from scb.population import map_population
 from scb.seeds import REPORTING
 from scb.statistics import Estimate, estimate, normalized_score, paired_difference
 

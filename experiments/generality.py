@@ -29,10 +29,10 @@ from scb.curriculum import paper_curriculum
 from scb.discovery import DiscoveryConfig, discover
 from scb.environments.registry import environment_spec
 from scb.evaluation import evaluate
-from scb.evolution import map_population
 from scb.keys import root_key, split_key
 from scb.measurement import Agents, Place
 from scb.neuroevolution import NeuroevolutionConfig, evolve_policy
+from scb.population import map_population
 from scb.rows import Rows, pivot
 from scb.seeds import reporting
 from scb.statistics import (

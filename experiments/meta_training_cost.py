@@ -16,8 +16,8 @@ import numpy as np
 from experiments.harness import Experiment, Save
 from lpo.inner_loop import MetaTrainingConfig
 from lpo.meta_training import MetaTraining, environment_problem
-from scb.evolution import map_population
 from scb.keys import root_key
+from scb.population import map_population
 from scb.runs import Stopwatch
 
 

@@ -25,11 +25,11 @@ from scb.agents.spec import AgentSpec
 from scb.environments.registry import environment_spec
 from scb.environments.zoo import bandit_metadata
 from scb.errors import UserError, at_least, unused
-from scb.evolution import map_population, rank_failed_last
 from scb.keys import root_key, split_key
 from scb.machine import machine_description, package_versions
 from scb.measurement import Judge, check_seeds, train_and_judge
 from scb.objectives import families
+from scb.population import map_population, rank_failed_last
 from scb.rows import Rows
 from scb.runs import Stopwatch
 from scb.statistics import iqm, rank_correlations, spearman

@@ -16,10 +16,10 @@ from scb.agents.spec import AgentSpec
 from scb.console import progress_console
 from scb.environments.synthetic import SyntheticBandit, Weights
 from scb.errors import UserError
-from scb.evolution import map_population
 from scb.experts import EPISODES
 from scb.keys import named_key, split_key
 from scb.measurement import Judge, Place, as_random, train_and_judge
+from scb.population import map_population
 
 TRAJECTORIES = 256
 LENGTH = 200

@@ -28,9 +28,9 @@ from scb.checkpoints import continued
 from scb.console import Progress, progress_console
 from scb.errors import UserError, at_least, positive
 from scb.evaluation import Episodes, Policy, evaluate
-from scb.evolution import map_population
 from scb.experts import EPISODES, Expert, judged
 from scb.keys import key_at, named_key, split_key
+from scb.population import map_population
 from scb.runs import Stopwatch
 from scb.spaces import action_size, clip_to_space, flat_size, scale_to_space
 

@@ -23,12 +23,12 @@ from scb.agents.spec import AgentSpec
 from scb.environments.registry import environment_spec
 from scb.errors import UserError, at_least, one_of
 from scb.evaluation import Episodes
-from scb.evolution import map_population
 from scb.files import plain
 from scb.keys import root_key, split_key
 from scb.machine import package_versions
 from scb.objectives import Objective, programs_for
 from scb.own import code_of, code_of_names
+from scb.population import map_population
 from scb.rows import Row, Rows
 
 MODE, SAMPLED = "mode", "sampled"

@@ -25,9 +25,9 @@ from scb.environments.linear import PolicyDistanceParts, units, with_states
 from scb.environments.synthetic import SyntheticBandit, Weights
 from scb.errors import at_least, unused
 from scb.evaluation import evaluate
-from scb.evolution import map_population
 from scb.keys import key_at, split_key
 from scb.measurement import Place
+from scb.population import map_population
 from scb.runs import Stopwatch
 
 DIRECTIONS = 32  # perturbations of a generation, each tried both ways for one episode

@@ -28,8 +28,8 @@ from scb.environments.synthetic import BanditConfig
 from scb.environments.synthetic_mdp import synthetic_for
 from scb.environments.zoo import save_bandit
 from scb.errors import UserError
-from scb.evolution import map_population
 from scb.keys import root_key
+from scb.population import map_population
 
 TINY = Regime(reward_noise=0.0, contexts=10, iterations=4, epochs=1, minibatches=1)
 

@@ -27,12 +27,13 @@ from scb.environments.zoo import (
 )
 from scb.errors import UserError
 from scb.evaluation import Episodes, evaluate
-from scb.evolution import EvolutionConfig, evaluated, map_population
+from scb.evolution import EvolutionConfig, evaluated
 from scb.fitting import standardize_reward
 from scb.judgement import check_fits, judge
 from scb.keys import named_key, split_key
 from scb.linear_expert import erring, noisy
 from scb.measurement import Place
+from scb.population import map_population
 from scb.runs import Run, config_dict
 from scb.statistics import iqm
 from scb.warm_start import WarmStartConfig

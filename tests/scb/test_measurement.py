@@ -16,8 +16,8 @@ from scb.agents.agent import evaluated_after
 from scb.agents.ppo import DIAGNOSIS, PPOConfig, PPOHyperparameters, clipped_surrogate_drift
 from scb.agents.spec import AgentSpec, environment_agent
 from scb.errors import UserError
-from scb.evolution import map_population
 from scb.measurement import Agents, Judge, Place, measure, spaced, train_and_judge
+from scb.population import map_population
 from scb.rows import Rows, _description, pivot
 
 # Seven batches of eight contexts, which have no divisor near three points: nine are trained.

@@ -25,7 +25,7 @@ from scb.agents.td3 import TD3, TD3Config, TD3Hyperparameters, ddpg_config
 from scb.environments.registry import environment_names
 from scb.environments.synthetic import BanditConfig, SyntheticBandit
 from scb.errors import UserError
-from scb.evolution import map_population
+from scb.population import map_population
 from scb.statistics import iqm
 from tests.scb.probes import ContinuousCorridor, Corridor, CorridorParams
 

@@ -15,7 +15,6 @@ from scb.machine import machine_description
 from scb.runs import (
     Run,
     Stopwatch,
-    config_dict,
     first_difference,
     held,
     read_config,
