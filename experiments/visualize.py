@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from experiments.claims import Claim
+from experiments.claims import UNDECIDED, Claim, judge
 from experiments.harness import (
     CLASSIC_CONTROL,
     Experiment,
@@ -125,7 +125,15 @@ def claims(report: Report) -> list[Claim]:
 
 def facts(report: Report) -> dict[str, Any]:
     """What is shown where."""
-    return {"hopper": HOPPER, "viewer": VIEWER, "standing": STANDING}
+    undecided = any(
+        HOPPER in x.claim.text and x.outcome == UNDECIDED for x in judge(claims(report))
+    )
+    return {
+        "hopper": HOPPER,
+        "viewer": VIEWER,
+        "standing": STANDING,
+        "hopper_undecided": undecided,
+    }
 
 
 def draw(report: Mapping[str, Any]) -> Figure:

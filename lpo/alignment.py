@@ -78,12 +78,11 @@ class Regime:
 
     def spec(self) -> AgentSpec:
         """Of its agents: the setting's own but for what is given here."""
-        own = task_agent(self.bandit, self.contexts)
+        own = task_agent(self.bandit, self.contexts, self.minibatches)
         iterations = self.iterations
         return own.with_values(
             total_steps=None if iterations is None else own.config.steps_after(iterations),
             num_epochs=self.epochs,
-            num_minibatches=self.minibatches,
             learning_rate=self.learning_rate,
             policy_output_scale=self.policy_output_scale,
         )

@@ -186,11 +186,13 @@ class MetaTrainingConfig:
         return replace(self, tasks=self.homes, fitness="return", agent=None, **of_bandits)
 
 
-def task_agent(task: str, contexts: int) -> AgentSpec:
+def task_agent(task: str, contexts: int, minibatches: int | None = None) -> AgentSpec:
     """PPO as the evaluation environment has it, or on a bandit its image (`AgentSpec.on_bandit`)."""
     place = environment_spec(task)
     spec = environment_agent("ppo", place.evaluation_environment)
-    return spec.on_bandit(contexts) if place.is_bandit else spec
+    if place.is_bandit:
+        return spec.on_bandit(contexts, minibatches)
+    return spec.with_values(num_minibatches=minibatches)
 
 
 class TaskTraining:

@@ -27,7 +27,7 @@ from scb.environments.zoo import digests
 from scb.errors import UserError
 from scb.evolution import EnvironmentSteps, EvolutionConfig, Outcome, evolve
 from scb.keys import root_key, split_key
-from scb.runs import Run, config_dict, run_of
+from scb.runs import Run, config_dict, run_of, with_defaults
 from scb.seeds import VALIDATING
 from scb.statistics import estimate
 
@@ -163,7 +163,7 @@ def _learned(path: Path, config: MetaTrainingConfig) -> bool:
     if not path.with_suffix(".json").exists():  # it is written last
         return False
     stored = load_objective(path).metadata["config"]["meta_training"]
-    return bool(stored == config_dict(config))
+    return bool(with_defaults(stored, config) == config_dict(config))
 
 
 def environment_problem(config: MetaTrainingConfig) -> MetaTraining:

@@ -30,9 +30,9 @@ def agents_at_least(minimum: int, of: object, *names: str) -> None:
     """As `at_least` of numbers of agents; a UserError also where they are more than are made at once."""
     at_least(minimum, of, *names)
     for name in names:
-        if (number := getattr(of, name)) > MOST_AGENTS:
+        if (getattr(of, name) or 0) > MOST_AGENTS:
             raise UserError(
-                f"{name} is {number}: each is an agent to train, and at most {MOST_AGENTS} are taken."
+                f"{name} is {getattr(of, name)}: each is an agent to train, and at most {MOST_AGENTS} are taken."
             )
 
 

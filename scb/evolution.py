@@ -89,6 +89,7 @@ class EvolutionConfig:
             raise UserError(
                 f"population_size is {self.population_size}: evolution compares candidates, so it needs at least 2."
             )
+        agents_at_least(2, self, "population_size")
         if self.strategy == "Open_ES" and self.population_size % 2:
             raise UserError(
                 f"population_size is {self.population_size}: Open_ES samples antithetic pairs, so it must be even."

@@ -23,7 +23,7 @@ from scb.aggregation import Fit, Learned, Learners, best_round
 from scb.console import progress_console
 from scb.environments.linear import PolicyDistanceParts, units, with_states
 from scb.environments.synthetic import SyntheticBandit, Weights
-from scb.errors import at_least, unused
+from scb.errors import agents_at_least, at_least, unused
 from scb.evaluation import evaluate
 from scb.keys import key_at, split_key
 from scb.measurement import Place
@@ -57,7 +57,8 @@ class RefinementConfig:
 
     def __post_init__(self) -> None:
         at_least(0, self, "rounds")
-        at_least(1, self, "generations", "agents")
+        at_least(1, self, "generations")
+        agents_at_least(1, self, "agents")
         if not self.rounds:
             unused(
                 self,

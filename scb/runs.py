@@ -18,7 +18,7 @@ from collections.abc import Collection, Iterator, Mapping
 from dataclasses import MISSING, asdict, fields, is_dataclass
 from functools import reduce
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, get_type_hints
 
 try:
     import fcntl
@@ -65,7 +65,7 @@ class Run:
           config: JSON-serialisable; decides the run together with the code's version. An entry
             "command", by which people and resumptions start it, is stored and not compared. An entry
             "inputs", {name: digest} of files, is compared where the folder has one.
-          resume: continue the run that is there. Its config must equal `config`.
+          resume: continue the run that is there. Its config must equal `config`, but for `growing`.
           wandb_project: also log to this Weights & Biases project (extra `wandb`).
           growing: entries, such as "config.seeds", that may be more than they were (`grown`); of a search's
             num_generations, also fewer, as long as one is left to do. The folder then stores the new config.
@@ -83,7 +83,7 @@ class Run:
         if resume:
             stored, asked = ({**c, "command": None} for c in (read_config(folder), config))
             if settings is not None and "config" in stored:
-                stored["config"] = _with_defaults(stored["config"], settings)
+                stored["config"] = with_defaults(stored["config"], settings)
             inputs, now = (x.pop("inputs", None) or {} for x in (stored, asked))
             for name in inputs.keys() & now.keys():
                 if inputs[name] != now[name]:
@@ -91,8 +91,8 @@ class Run:
                         f"cannot resume {folder}: {name} is not what it was when the run was started; put that back, "
                         "or start a new folder."
                     )
-            asked_before = _ending_early(folder, stored, asked, growing)
-            if difference := first_difference(asked_before, asked, growing):
+            stored_as_if = _as_if_shorter(folder, stored, asked, growing)
+            if difference := first_difference(stored_as_if, asked, growing):
                 raise UserError(
                     f"cannot resume {folder}: its config differs at {difference}; resume with the config it was "
                     "started with, or start a new folder."
@@ -318,17 +318,30 @@ def config_dict(config: Any) -> dict[str, Any]:
     return dict(json.loads(json.dumps(asdict(config))))
 
 
-def _with_defaults(stored: Any, config: Any) -> Any:
-    """A configuration as it was stored, and the defaults of the settings that this version has and it lacks."""
+def with_defaults(stored: Any, config: Any) -> Any:
+    """A configuration as it was stored, and the defaults of the settings that this version has and it lacks.
+
+    Of a dataclass inside of another one they are its own; where it may be one of several, nothing is added, as what is
+    lacking may be another one's.
+
+    Args:
+      stored: JSON.
+      config: a dataclass, as it is asked for now.
+    """
     if not isinstance(stored, dict):
         return stored
-    found = dict(stored)
+    found, kinds = dict(stored), get_type_hints(type(config))
     for entry in fields(config):
         value = getattr(config, entry.name)
         if is_dataclass(value):
-            found[entry.name] = _with_defaults(stored.get(entry.name, {}), value)
-        elif entry.name not in stored and entry.default is not MISSING:
-            found[entry.name] = json.loads(json.dumps(entry.default))
+            if type(value) is kinds[entry.name]:
+                found[entry.name] = with_defaults(stored.get(entry.name, {}), value)
+        elif entry.name not in stored:
+            default = entry.default
+            if entry.default_factory is not MISSING:
+                default = entry.default_factory()
+            if default is not MISSING:
+                found[entry.name] = json.loads(json.dumps(default))
     return found
 
 
@@ -344,7 +357,7 @@ def run_of(
     Args:
       config: a dataclass, which decides the run.
       inputs: {name: digest} of files that the run begins with.
-      growing: fields, such as "evolution.num_generations", of which there may be more than there were.
+      growing: fields, such as "evolution.num_generations", that may have grown (`Run.open`).
 
     Raises:
       UserError: as `Run.open`, also where the folder holds another run.
@@ -402,7 +415,7 @@ def first_difference(stored: Any, given: Any, growing: Collection[str] = (), pat
     return f"{path} ({stored!r} there, {given!r} now)"
 
 
-def _ending_early(
+def _as_if_shorter(
     folder: Path, stored: dict[str, Any], asked: dict[str, Any], growing: Collection[str]
 ) -> dict[str, Any]:
     """A stored config as if so few generations had been asked for at first as now are; itself, where these are more.
@@ -413,23 +426,28 @@ def _ending_early(
     stored = json.loads(json.dumps(stored))
     for path in growing:
         *parents, name = path.split(".")
-        before, now = (reduce(lambda x, k: x.get(k, {}), parents, x) for x in (stored, asked))
-        if name != "num_generations" or not now.get(name, 0) < before.get(name, 0):
+        there, given = (reduce(_entry, parents, config) for config in (stored, asked))
+        before, now = _entry(there, name), _entry(given, name)
+        if name != "num_generations" or not (type(before) is type(now) is int and now < before):
             continue
         done = _generations_done(folder)
-        if now[name] <= done:
+        if now <= done:
             raise UserError(
-                f"cannot end {folder} after {now[name]} generations: of {before[name]} it has done {done}"
-                + (f"; take at least {done + 1}." if done < before[name] else ", and has ended.")
+                f"cannot end {folder} after {now} generations: of {before} it has done {done}"
+                + (f"; take at least {done + 1}." if done < before else ", and has ended.")
             )
-        before[name] = now[name]
+        there[name] = now
     return stored
+
+
+def _entry(of: Any, name: str) -> Any:
+    return of.get(name) if isinstance(of, dict) else None
 
 
 def _generations_done(folder: Path) -> int:
     """How many are in a run's newest checkpoint."""
-    saved = (folder / "checkpoints").glob("*")
-    return max((int(path.name) for path in saved if path.name.isdigit()), default=0)
+    saved = (folder / "checkpoints").glob("*/*")  # what is in one, so that an empty folder is none
+    return max((int(x.parent.name) for x in saved if x.parent.name.isdecimal()), default=0)
 
 
 def grown(before: Any, now: Any) -> bool:

@@ -28,7 +28,7 @@ from scb.console import progress_console
 from scb.curriculum import paper_curriculum
 from scb.environments.registry import environment_spec
 from scb.environments.synthetic import SyntheticBandit, Weights
-from scb.errors import UserError, at_least, one_of, positive, unused
+from scb.errors import UserError, agents_at_least, at_least, one_of, positive, unused
 from scb.expert_data import DatasetConfig, expert_dataset, labelled
 from scb.experts import Expert, PolicySearchConfig, evolve_expert, train_expert
 from scb.fitting import fit_bandit
@@ -165,9 +165,11 @@ class WarmStartConfig(DatasetConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         one_of("expert", self.expert, ("auto", *SEARCHES, *ALGORITHMS))
-        at_least(0, self, "expert_pupils", "expert_error_warmup", "aggregation_rounds")
-        at_least(1, self, "num_experts", "expert_generations", "expert_starts")
-        at_least(1, self, "expert_episode_steps", "expert_reach", "fit_steps", "aggregation_agents")
+        agents_at_least(0, self, "expert_pupils")
+        agents_at_least(1, self, "num_experts", "aggregation_agents")
+        at_least(0, self, "expert_error_warmup", "aggregation_rounds")
+        at_least(1, self, "expert_generations", "expert_starts")
+        at_least(1, self, "expert_episode_steps", "expert_reach", "fit_steps")
         positive(self, "expert_sigma", "expert_learning_rate", "expert_decay")
         if not self.aggregation_rounds:
             unused(

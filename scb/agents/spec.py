@@ -135,25 +135,30 @@ class AgentSpec:
         at_least(1, steps=steps)
         return self.with_values(total_steps=steps)
 
-    def on_bandit(self, contexts: int) -> "AgentSpec":
+    def on_bandit(self, contexts: int, minibatches: int | None = None) -> "AgentSpec":
         """PPO's setting for an environment as it is on a bandit, `contexts` of them a batch.
 
         The number of updates (iterations, epochs, minibatches) stays that of the environment's
         setting, so that an objective meets the regime in which it will be used, while a batch holds a
         fraction of the transitions: contexts are independent, consecutive steps are not.
 
+        Args:
+          minibatches: of a batch; None for as many as in the environment.
+
         Raises:
-          UserError: the setting's minibatches don't divide so many contexts.
+          UserError: they don't divide so many contexts.
         """
-        if contexts % self.config.num_minibatches:
+        minibatches = self.config.num_minibatches if minibatches is None else minibatches
+        if minibatches > 0 and contexts % minibatches:
             raise UserError(
-                f"contexts is {contexts}, and this setting cuts a batch into {self.config.num_minibatches} equal "
-                f"minibatches: take a multiple of {self.config.num_minibatches}."
+                f"contexts is {contexts}, and a batch is cut into {minibatches} equal minibatches here: take a "
+                f"multiple of {minibatches}."
             )
         return self.with_values(
             num_envs=contexts,
             num_steps=1,
             total_steps=contexts * self.config.num_iterations,
+            num_minibatches=minibatches,
             normalize_observations=False,
         )
 

@@ -149,7 +149,7 @@ def explain_command(
     for name, share in shares[: figures.BARS]:
         printer.print(f"  {share:6.1%} of the reward's variance, alone or with others: {name}")
     if more := shares[figures.BARS :]:
-        printer.print(f"  {more[0][1]:6.1%} or less, each of {len(more)} others")
+        printer.print(f"  {more[0][1]:6.1%} or less: {len(more)} more, in explain.json")
     plotting.save(figures.explained(parts), folder / "explain.png")
     if html and parts["plane"] is None:
         printer.print("It has a single observation: there is no surface to turn, and no page.")

@@ -158,16 +158,21 @@ def _over_a_plane(actions: Axes, states: Axes, parts: Mapping[str, Any]) -> None
 
 
 def _over_a_line(actions: Axes, states: Axes, parts: Mapping[str, Any]) -> None:
-    """The same over a single observation."""
-    everything = np.concatenate([parts["contexts"], parts["visited"]])
-    low, high = np.quantile(everything, (0.005, 0.995))
+    """The same over a single observation, without an episode, of which a line shows no course."""
+    (name,) = parts["names"]
+    known = {cloud: parts[cloud][np.isfinite(parts[cloud])] for cloud, _, _ in _CLOUDS}
+    ends = [np.quantile(values, (0.005, 0.995)) for values in known.values() if values.size]
+    low, high = (min(x[0] for x in ends), max(x[1] for x in ends)) if ends else (0.0, 1.0)
     points = np.linspace(low, high, 4 * POINTS)[:, None]
     actions.plot(points, parts["best"](points), color=plotting.BLUE)
-    (name,) = parts["names"]
     actions.set(xlabel=name, ylabel=parts["action"], xlim=(low, high))
     if parts["num_actions"]:
         actions.set_yticks(range(parts["num_actions"]))
+    else:
+        least, most = parts["bounds"]
+        actions.set_ylim(least - 0.05 * (most - least), most + 0.05 * (most - least))
     for cloud, color, label in _CLOUDS:
-        values, span = parts[cloud].ravel(), (low, high)
-        states.hist(values, 40, range=span, density=True, alpha=0.5, color=color, label=label)
-    states.set(xlabel=name, ylabel="density", xlim=(low, high))
+        density, edges = np.histogram(known[cloud], 40, (low, high))
+        share = density / max(1, known[cloud].size)
+        states.stairs(share, edges, fill=True, alpha=0.5, color=color, label=label)
+    states.set(xlabel=name, ylabel="share", xlim=(low, high))

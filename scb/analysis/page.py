@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from scb import plotting
-from scb.analysis.figures import action_colors, trajectory_line
+from scb.analysis.figures import BARS, action_colors, trajectory_line
 from scb.analysis.planes import Plane
 from scb.analysis.states import thinned
 from scb.interactive import plotly, save_page, slider
@@ -31,8 +31,10 @@ def save_bandit_page(path: Path, parts: Mapping[str, Any]) -> Path:
         if parts["num_actions"]
         else np.linspace(parts["bounds"][0], parts["bounds"][1], ACTIONS)
     )
-    shares = zip(parts["names"], parts["importance"], strict=True)
-    reasons = ", ".join(f"{name} {share:.0%}" for name, share in shares)
+    shares = sorted(zip(parts["names"], parts["importance"], strict=True), key=lambda of: -of[1])
+    reasons = ", ".join(f"{name} {share:.0%}" for name, share in shares[:BARS])
+    if len(shares) > BARS:
+        reasons += ", the others less"
     reward = (
         "The surface is the reward for the action that the slider chooses, or for the best one, in each state of the "
         "plane; what is not on its axes is held at what is usual. Points have their own rewards: they lie off the "

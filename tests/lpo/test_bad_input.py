@@ -27,7 +27,7 @@ pytestmark = pytest.mark.usefixtures("working_folder", "no_training")
         ("meta-train --environment Synthetic-Pendulm-v1", "did you mean Synthetic-Pendulum-v1"),
         ("train --objective dop", "unknown objective 'dop': did you mean dpo?"),
         ("evaluate --objectives ppo dop", "unknown objective 'dop': did you mean dpo?"),
-        ("meta-train --contexts 7", "contexts is 7, and this setting cuts a batch into 10 equal"),
+        ("meta-train --contexts 7", "contexts is 7, and a batch is cut into 10 equal minibatches"),
         ("meta-train --drift netwrok", "unknown learned drift 'netwrok': did you mean network?"),
         ("meta-train --drift dpo", "unknown learned drift 'dpo': "),
         ("certify dop", "unknown objective 'dop': did you mean dpo?"),
@@ -101,7 +101,7 @@ def test_a_number_out_of_range_is_told_its_range(refused, arguments, message):
         ("align --objectives ppo", "'ppo' is in the family already, as 'ppo-0.2': leave it out"),
         ("align --agents -4", "agents is -4: it must be at least 1."),
         # Before the agents of the environment are trained.
-        ("align --minibatches 7", "num_minibatches is 7, which does not divide a batch of 200"),
+        ("align --minibatches 7", "contexts is 200, and a batch is cut into 7 equal minibatches"),
         ("align --steps 0 --out new", "steps is 0: it must be at least 1"),
         ("evaluate --suite classic --steps 0 --out new", "steps is 0: it must be at least 1"),
         (

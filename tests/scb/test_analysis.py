@@ -233,10 +233,21 @@ def test_of_a_single_observation_the_best_action_is_a_line_over_it():
     (line,) = actions.lines
     np.testing.assert_allclose(line.get_ydata(), np.clip(line.get_xdata(), -0.5, 0.5))
     assert (actions.get_xlabel(), actions.get_ylabel()) == ("observation 0", "force")
-    contexts, visited = states.containers
-    # As densities: the wider spread is the lower.
-    assert max(x.get_height() for x in contexts) > max(x.get_height() for x in visited)
+    # The whole range of actions, and of both clouds.
+    assert actions.get_ylim() == pytest.approx((-0.55, 0.55))
+    contexts, visited = (patch.get_data().values for patch in states.patches)
+    assert contexts.max() > visited.max()  # the wider spread is the lower
     assert len(bars.patches) == 1
+
+
+def test_few_states_far_away_and_what_is_no_number_are_drawn():
+    parts = parts_of(1, None)
+    visited = np.array([[100.0], [101.0], [np.nan], [np.inf]])
+    actions, states, _ = figures.explained({**parts, "visited": visited}).axes
+    assert actions.get_xlim()[1] > 100
+    contexts, few = (patch.get_data().values for patch in states.patches)
+    # A share of each: what lies beyond its outer half per cents is not drawn.
+    assert contexts.sum() > 0.9 and few.sum() == 0.5
 
 
 def test_of_many_observations_the_most_important_are_drawn():

@@ -128,6 +128,8 @@ pytestmark = pytest.mark.usefixtures("small_agents")
         ("discover --min-spread -1", "min_spread is -1.0: it must be 0 or larger, and finite"),
         ("discover --min-spread nan", "min_spread is nan: it must be 0 or larger, and finite"),
         ("discover --judge-agents -1", "judge_agents is -1: it must be 0 or larger"),
+        ("discover --population-size 200000", "population_size is 200000: each is an agent to tr"),
+        ("discover --num-experts 200000", "num_experts is 200000: each is an agent to train"),
         ("discover --judge-agents 200000", "judge_agents is 200000: each is an agent to train"),
         (
             "discover --mean-evaluations 200000",
@@ -307,7 +309,7 @@ OLD = {
         ),
         (
             {"command": "scb discover --seed=7", "config": {"environment": "CartPole-v1"}},
-            "its config differs at config.agents_per_candidate (None there, 4 now)",
+            "its config differs at config.environment ('CartPole-v1' there, 'Pendulum-v1' now)",
         ),
     ],
 )

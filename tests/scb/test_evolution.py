@@ -550,7 +550,7 @@ def test_a_population_that_the_devices_do_not_divide_evolves_as_on_one_device(mo
     config = replace(CONFIG, population_size=5, mean_evaluations=3)
     on_two = evolve(Parabola(noise=0.5), config, quiet=True)
     first = jax.devices()[:1]
-    monkeypatch.setattr("scb.population.jax.devices", lambda: first)
+    monkeypatch.setattr("scb.processes.jax.local_devices", lambda: first)
     on_one = evolve(Parabola(noise=0.5), config, quiet=True)
     np.testing.assert_allclose(on_two.mean["x"], on_one.mean["x"], rtol=1e-5)
     for name in ("fitness/mean", "fitness/min", "fitness/max", "candidates/x0"):

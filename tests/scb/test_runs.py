@@ -1,4 +1,5 @@
 import json
+import math
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -15,6 +16,7 @@ from scb.machine import machine_description
 from scb.runs import (
     Run,
     Stopwatch,
+    config_dict,
     first_difference,
     held,
     read_config,
@@ -187,16 +189,16 @@ class Outer:
 
 
 def test_what_a_run_of_an_earlier_version_lacks_is_at_its_default(tmp_path):
-    settings = {"seed": 3, "inner": {"sigma": 0.1}, "names": ["sac"], "drawn": {"rate": 0.1}}
+    settings = {"seed": 3, "inner": {"sigma": 0.1}, "names": ["sac"]}
     began = {"command": "x", "config": settings}
     Run.open(tmp_path, began).close()
     write_text(tmp_path / "metrics.jsonl", "")  # else nothing was found there yet
-    same = Outer(3, Inner(0.1), names=("sac",), drawn={"rate": 0.1})
+    same = Outer(3, Inner(0.1), names=("sac",))
     others = {
         r"inner.averaging \(1 there, 2 now": replace(same, inner=Inner(0.1, averaging=2)),
         r"episodes \(16 there, 3 now": replace(same, episodes=3),
         r"names \(\['sac'\] there": replace(same, names=("ppo",)),
-        r"drawn.scale \(None there, 1.0 now": replace(same, drawn={"rate": 0.1, "scale": 1.0}),
+        r"drawn.rate \(None there, 0.1 now": replace(same, drawn={"rate": 0.1, "scale": 1.0}),
     }
     for difference, other in others.items():
         with (
@@ -207,6 +209,55 @@ def test_what_a_run_of_an_earlier_version_lacks_is_at_its_default(tmp_path):
     with run_of(tmp_path, same, {}, ()) as run:
         assert run.resumed
     assert read_config(tmp_path) == began
+
+
+@dataclass(frozen=True)
+class Other(Inner):
+    power: float = 4.0
+
+
+@dataclass(frozen=True)
+class Either:
+    inner: Inner | Other = field(default_factory=Inner)
+
+
+def test_of_one_of_several_classes_nothing_is_filled_in(tmp_path):
+    # Else a run of one would go on as a run of the other.
+    Run.open(tmp_path, {"command": "x", "config": config_dict(Either())}).close()
+    write_text(tmp_path / "metrics.jsonl", "")
+    with (
+        pytest.raises(UserError, match=r"inner.power \(None there, 4.0 now"),
+        run_of(tmp_path, Either(Other()), {}, ()),
+    ):
+        pass
+
+
+@pytest.mark.parametrize(
+    "config",
+    [
+        *(None, [], "x", {"evolution": None}, {"evolution": []}),
+        *({"evolution": {"num_generations": x}} for x in (None, "9", [], 9.5, math.inf)),
+    ],
+)
+def test_a_damaged_number_of_generations_is_refused(tmp_path, config):
+    Run.open(tmp_path, {"config": config}).close()
+    asked = {"config": {"evolution": {"num_generations": 1}}}
+    with pytest.raises(UserError, match=r"differs at config"):
+        Run.open(tmp_path, asked, resume=True, growing=["config.evolution.num_generations"])
+
+
+def test_only_a_folder_with_a_checkpoint_in_it_counts_as_one(tmp_path):
+    began, asked = ({"num_generations": n} for n in (9, 4))
+    Run.open(tmp_path, began).close()
+    for name in ("999", "²", "5.tmp"):
+        (tmp_path / "checkpoints" / name).mkdir(parents=True)
+    write_text(tmp_path / "checkpoints" / "²" / "state", "")
+    Run.open(tmp_path, asked, resume=True, growing=["num_generations"]).close()
+    (tmp_path / "checkpoints" / "3" / "state").mkdir(parents=True)
+    with pytest.raises(
+        UserError, match=r"after 3 generations: of 4 it has done 3; take at least 4"
+    ):
+        Run.open(tmp_path, {"num_generations": 3}, resume=True, growing=["num_generations"])
 
 
 def test_a_run_that_does_not_say_what_it_began_with_goes_on(run):
