@@ -29,6 +29,9 @@ from scb.machine import package_versions
 # numpy.ndarray leaves under any depth of dictionaries: {"reward": {"Dense_0": {"kernel": ...}}}.
 ArrayTree: TypeAlias = "dict[str, np.ndarray | ArrayTree]"
 
+# In a run's folder: what its search starts from, and not what it finds.
+_BEGINNINGS = {"warm_start", "refinement"}
+
 
 @dataclasses.dataclass(frozen=True)
 class Artefact:
@@ -119,6 +122,11 @@ def named(name: str | Path, folder: Path, what: str, others: Sequence[str] = ())
         return Path(text if text.endswith(".npz") else f"{text}.npz")
     if os.path.isdir(text):  # which no name is too long for
         there = names_in(Path(text))
+        if {*there} <= _BEGINNINGS and os.path.isdir(os.path.join(text, "checkpoints")):
+            raise UserError(
+                f"{text} is a run whose search has not ended: go on with it by --resume {text}, for one generation "
+                "more at least."
+            )
         raise UserError(
             f"{text} is a folder: give the {what}'s file"
             + (f" in it, such as {Path(text) / there[0]}.npz." if there else ", a path.npz.")

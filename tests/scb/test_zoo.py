@@ -158,6 +158,20 @@ def test_a_bandit_opens_by_file_or_by_name(tmp_path):
         load_bandit(tmp_path)
 
 
+@pytest.mark.parametrize("begun", [[], ["warm_start"], ["warm_start", "refinement"]])
+def test_a_run_whose_search_has_not_ended_is_told(tmp_path, begun):
+    (tmp_path / "checkpoints").mkdir()
+    for name in begun:
+        (tmp_path / f"{name}.npz").touch()
+    with pytest.raises(
+        UserError, match=rf"search has not ended: go on with it by --resume {tmp_path}"
+    ):
+        load_bandit(tmp_path)
+    (tmp_path / "Synthetic-Test.npz").touch()
+    with pytest.raises(UserError, match=r"give the bandit's file in it, such as .*Synthetic-Test"):
+        load_bandit(tmp_path)
+
+
 def test_a_bandit_is_saved_with_what_there_is_to_tell(tmp_path):
     bandit = BANDITS["box"]
     path = save_bandit(
