@@ -11,6 +11,8 @@ from rich.console import Console
 from scb import processes
 
 PIPE_WIDTH = 200
+# Also because what a search starts from is judged, by agents that may train for minutes.
+_FIRST = "compiling, the first takes longest"
 
 
 def console() -> Console:
@@ -48,12 +50,10 @@ class Progress:
 
     def __enter__(self) -> Callable[[dict[str, Any], float], None]:
         self._bar.start()
-        self._task = self._bar.add_task(
-            "", total=self._total, completed=self._done, fitness="compiling"
-        )
+        self._task = self._bar.add_task("", total=self._total, completed=self._done, fitness=_FIRST)
         # A minute without a line looks like one that hangs.
         if not self._console.is_terminal and self._done < self._total:
-            self._console.print(f"generation {self._done + 1}/{self._total}: compiling")
+            self._console.print(f"generation {self._done + 1}/{self._total}: {_FIRST}")
         return self._advance
 
     def _advance(self, metrics: dict[str, Any], seconds: float) -> None:

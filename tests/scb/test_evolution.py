@@ -760,7 +760,7 @@ time.sleep(60)
 def test_progress_says_fitness_failures_and_time_left(capsys):
     evolve(Fragile(np.nan), replace(CONFIG, num_generations=3))
     before, first, *_, last = capsys.readouterr().err.splitlines()
-    assert before == "generation 1/3: compiling"
+    assert before == "generation 1/3: compiling, the first takes longest"
     assert first.startswith("generation 1/3: fitness -") and "left" not in first  # it was compiled
     assert first.endswith(" failed")
     assert last.startswith("generation 3/3: ") and last.endswith(", 0.0 min left")

@@ -65,7 +65,7 @@ def test_it_says_how_far_it_is(capsys):
     env, config = ContinuousCorridor(cells=2), replace(SEARCH, generations=3, judge_every=2)
     search_linear_expert(env, TWO_TARGETS, jax.random.key(0), config, quiet=False)
     before, *lines = capsys.readouterr().err.splitlines()
-    assert before == "generation 1/3: compiling"
+    assert before == "generation 1/3: compiling, the first takes longest"
     assert [line.split(":")[0] for line in lines] == [f"generation {n}/3" for n in (1, 2, 3)]
     assert ["mean" in line for line in lines] == [False, True, True]
 
