@@ -29,13 +29,14 @@ from experiments.parts import InParts, Jobs, elsewhere
 from scb import plotting
 from scb.cli import exit_code
 from scb.command_line import flags
+from scb.configurations import grown
 from scb.environments.registry import environment_spec, families
 from scb.environments.synthetic import SyntheticBandit
 from scb.environments.zoo import bandit_metadata, load_bandit, zoo_names
 from scb.errors import UserError
 from scb.files import make_folder, write_json
 from scb.machine import machine_description, package_versions
-from scb.runs import grown, held
+from scb.runs import held
 
 CLASSIC_CONTROL = tuple(sorted(families()["classic"].suite))
 DATA = Path("docs/data")

@@ -33,12 +33,12 @@ from experiments.harness import Experiment, Report, Save, settled
 from lpo import objectives
 from lpo.commands import MetaTrain
 from scb.commands import Discover
+from scb.configurations import config_dict
 from scb.environments import zoo
 from scb.environments.registry import environment_spec
 from scb.errors import UserError, at_least, one_of
 from scb.gymnasium import SyntheticEnv
 from scb.rows import Rows
-from scb.runs import config_dict
 
 SMALL = [
     "--population-size=4",

@@ -37,6 +37,7 @@ from experiments.zoo_table_page import (
 )
 from scb.agents.spec import AgentSpec, algorithms_for, bandit_agent
 from scb.artefacts import arrays_digest
+from scb.configurations import config_dict
 from scb.environments.registry import environment_spec
 from scb.environments.synthetic import BanditConfig, SyntheticBandit
 from scb.environments.zoo import bandit_metadata, load_bandit, zoo_names
@@ -44,7 +45,6 @@ from scb.errors import UserError, at_least
 from scb.importer import PUBLISHED_BANDITS, published_bandit
 from scb.judgement import BRAX_EPISODES, EPISODES, check_fits, judge
 from scb.measurement import Place, as_random
-from scb.runs import config_dict
 from scb.seeds import REPORTING
 from scb.statistics import estimate, paired_difference
 

@@ -22,12 +22,13 @@ from lpo.inner_loop import MetaTrainingConfig, TaskTraining
 from lpo.objectives import Objective, load_objective, save_objective
 from scb import processes
 from scb.command_line import GENERATIONS
+from scb.configurations import config_dict, with_defaults
 from scb.environments.registry import environment_spec
 from scb.environments.zoo import digests
 from scb.errors import UserError
 from scb.evolution import EnvironmentSteps, EvolutionConfig, Outcome, evolve
 from scb.keys import root_key, split_key
-from scb.runs import Run, config_dict, run_of, with_defaults
+from scb.runs import Run, run_of
 from scb.seeds import VALIDATING
 from scb.statistics import estimate
 

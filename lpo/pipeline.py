@@ -26,6 +26,7 @@ from lpo.meta_training import (
 from lpo.objectives import Objective, load_objective
 from scb import plotting
 from scb.command_line import LongRun, Output
+from scb.configurations import config_dict
 from scb.console import console
 from scb.environments.registry import make
 from scb.errors import UserError
@@ -33,7 +34,7 @@ from scb.evolution import EnvironmentSteps
 from scb.files import write_json
 from scb.machine import machine_description, package_versions
 from scb.rows import Rows
-from scb.runs import Run, Stopwatch, config_dict
+from scb.runs import Run, Stopwatch
 from scb.seeds import reporting
 
 REFERENCES = ("ppo", "dpo")  # that every run is compared with

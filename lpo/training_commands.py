@@ -22,6 +22,7 @@ from lpo.suite import SuiteScores, run_suite, suite_specs
 from lpo.suite import suite as suite_environments
 from scb import plotting
 from scb.command_line import Measuring, text
+from scb.configurations import config_dict
 from scb.console import console
 from scb.environments.registry import check_backend, environment_spec
 from scb.environments.zoo import digests
@@ -30,7 +31,6 @@ from scb.files import write_json
 from scb.lists import read_settings, write_settings
 from scb.machine import package_versions
 from scb.measurement import Place, check_seeds
-from scb.runs import config_dict
 from scb.statistics import estimate
 
 

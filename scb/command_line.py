@@ -17,10 +17,11 @@ import tyro
 from tyro.constructors import PrimitiveConstructorSpec
 
 from scb import processes
+from scb.configurations import config_dict
 from scb.errors import UserError, one_of
 from scb.machine import package_versions
 from scb.rows import Rows
-from scb.runs import Run, config_dict, read_config, released
+from scb.runs import Run, read_config, released
 
 T = TypeVar("T")
 GENERATIONS = ("evolution.num_generations",)

@@ -12,6 +12,7 @@ import tyro
 from scb import experts, processes
 from scb.agents.spec import bandit_agent
 from scb.command_line import LongRun, Measuring, SharedOutput, flags
+from scb.configurations import config_dict
 from scb.console import console
 from scb.discovery import BanditDiscovery, DiscoveryConfig
 from scb.environments.registry import environment_spec
@@ -29,7 +30,6 @@ from scb.judgement import (
 )
 from scb.listing import found
 from scb.measurement import check_seeds
-from scb.runs import config_dict
 from scb.seeds import VALIDATING
 from scb.statistics import estimate
 

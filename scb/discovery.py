@@ -27,6 +27,7 @@ from scb.agents.spec import (
     configured,
 )
 from scb.analysis.optimal_actions import optimal_actions, optimal_policy
+from scb.configurations import config_dict
 from scb.curriculum import EpisodeLengths, check_curriculum, paper_curriculum
 from scb.discovery_config import DiscoveryConfig as DiscoveryConfig
 from scb.environments.registry import environment_spec
@@ -42,7 +43,7 @@ from scb.keys import named_key, root_key, split_key
 from scb.linear_expert import erring, noisy
 from scb.measurement import Judge, Place, train_and_judge
 from scb.refinement import refined
-from scb.runs import Run, config_dict, run_of
+from scb.runs import Run, run_of
 from scb.spaces import check_bounded, kind_of_actions
 from scb.strategies import strategy_for
 from scb.warm_start import expert_agent, warm_start

@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
+from scb.configurations import first_difference
 from scb.errors import UserError
 from scb.files import write_json, write_text
-from scb.runs import first_difference
 
 Row = dict[str, Any]
 _AGENT = ("environment", "backend", "trained_in", "algorithm", "objective", "seed", "agent")

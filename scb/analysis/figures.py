@@ -126,12 +126,11 @@ def explained(parts: Mapping[str, Any]) -> Figure:
         legend = states.legend(loc="upper right", fontsize=7, frameon=True)
         for handle in legend.legend_handles:
             handle.set_alpha(1.0)
-        names, importance = parts["names"], parts["importance"]
-        most = list(range(len(names)))
-        if len(names) > BARS:
-            most = sorted(most, key=lambda i: -importance[i])[:BARS]
-        importance_bars(bars, [names[i] for i in most], [importance[i] for i in most])
-        of_all = "" if len(most) == len(names) else f" ({BARS} of {len(names)})"
+        shares, of_all = list(zip(parts["names"], parts["importance"], strict=True)), ""
+        if len(shares) > BARS:
+            of_all = f" ({BARS} of {len(shares)})"
+            shares = sorted(shares, key=lambda of: -of[1])[:BARS]
+        importance_bars(bars, *zip(*shares, strict=True))
         bars.set_title(f"the reward depends on{of_all}", fontsize=10)
         plotting.figure_title(figure, f"{parts['name']}: {parts['summary']}")
     return figure

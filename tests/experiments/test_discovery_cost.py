@@ -7,10 +7,10 @@ from dataclasses import replace
 import pytest
 
 from experiments import discovery_cost
+from scb.configurations import config_dict
 from scb.discovery import DiscoveryConfig
 from scb.errors import UserError
 from scb.evolution import EvolutionConfig
-from scb.runs import config_dict
 
 # Seconds and returns by generation: judged before the generations 0 and 2, and after 3.
 SECONDS = [60.0, 30.0, 30.0, 120.0]

@@ -11,10 +11,11 @@ from lpo.inner_loop import MetaTrainingConfig
 from lpo.meta_training import MetaTraining, learn_objective
 from lpo.pipeline import RunAll
 from scb.commands import Discover
+from scb.configurations import config_dict
 from scb.environments.zoo import bandit_metadata, load_bandit, save_bandit
 from scb.errors import UserError
 from scb.evolution import EnvironmentSteps, EvolutionConfig, Outcome
-from scb.runs import Run, config_dict
+from scb.runs import Run
 
 DRIFT = LearnedDrift(hidden_size=4)
 FINAL, BEST = (DRIFT.init(jax.random.key(i)) for i in (1, 2))

@@ -15,9 +15,9 @@ from lpo.drifts import DRIFTS
 from lpo.inner_loop import MetaTrainingConfig
 from lpo.meta_training import TEMPORAL_HORIZONS
 from lpo.objectives import load_objective, zoo_names
+from scb.configurations import config_dict
 from scb.errors import UserError
 from scb.evolution import evolve
-from scb.runs import config_dict
 from tests.locking import is_locked
 from tests.recording import recorded_seeds
 

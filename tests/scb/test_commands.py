@@ -22,6 +22,7 @@ from scb import artefacts, judgement, listing
 from scb.cli import main
 from scb.command_line import SharedOutput
 from scb.commands import Discover, Judgement, TrainConfig
+from scb.configurations import config_dict
 from scb.console import console
 from scb.curriculum import CurriculumConfig, paper_curriculum
 from scb.discovery import BanditDiscovery, DiscoveryConfig
@@ -30,7 +31,6 @@ from scb.environments.synthetic import BanditConfig, SyntheticBandit
 from scb.environments.zoo import bandit_metadata, load_bandit, save_bandit, zoo_names
 from scb.evolution import EvolutionConfig
 from scb.measurement import Place
-from scb.runs import config_dict
 from scb.warm_start import WarmStartConfig
 from tests.recording import recorded_seeds
 from tests.scb.calling import call

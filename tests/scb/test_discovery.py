@@ -10,6 +10,7 @@ from scb.agents.dqn import DQNConfig
 from scb.agents.ppo import PPOConfig, PPOHyperparameters
 from scb.agents.spec import AgentSpec, algorithms_for, bandit_agent
 from scb.analysis.optimal_actions import optimal_actions, optimal_policy
+from scb.configurations import config_dict
 from scb.curriculum import CurriculumConfig, paper_curriculum
 from scb.discovery import (
     BanditDiscovery,
@@ -34,7 +35,7 @@ from scb.keys import named_key, split_key
 from scb.linear_expert import erring, noisy
 from scb.measurement import Place
 from scb.population import map_population
-from scb.runs import Run, config_dict
+from scb.runs import Run
 from scb.statistics import iqm
 from scb.warm_start import WarmStartConfig
 from tests.scb.probes import Corridor, CorridorParams

@@ -17,11 +17,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import scb
+from scb.configurations import config_dict
 from scb.errors import UserError
 from scb.evolution import COMBINATIONS, EnvironmentSteps, EvolutionConfig, evolve
 from scb.keys import key_at, root_key, split_key
 from scb.population import combine_tasks, map_population, rank_failed_last
-from scb.runs import Run, config_dict, read_config
+from scb.runs import Run, read_config
 from scb.statistics import iqm
 from scb.strategies import GRADIENT_ESTIMATING, REMEMBERING, STRATEGIES, Strategy
 from tests.scb.probes import Parabola, Slope
@@ -729,7 +730,8 @@ def test_a_process_that_was_killed_mid_way_is_resumed_to_the_same_bytes(tmp_path
     code = f"""
 import os, pathlib, signal, sys, threading, time
 from scb.evolution import EvolutionConfig, evolve
-from scb.runs import Run, config_dict
+from scb.configurations import config_dict
+from scb.runs import Run
 from tests.scb.probes import Parabola
 
 def kill():

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from gymnax.environments import spaces
 
+from scb.configurations import config_dict
 from scb.discovery import DiscoveryConfig, discover
 from scb.environments.linear import fitted
 from scb.environments.registry import make
@@ -15,7 +16,7 @@ from scb.environments.zoo import load_bandit, save_bandit
 from scb.errors import UserError
 from scb.evolution import EvolutionConfig
 from scb.fitting import ExpertDataset, fit_bandit, standardize_reward
-from scb.runs import Run, config_dict
+from scb.runs import Run
 from scb.warm_start import WarmStartConfig
 
 LINEAR = BanditConfig(form="linear")

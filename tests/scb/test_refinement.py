@@ -9,6 +9,7 @@ import pytest
 
 from scb import refinement
 from scb.aggregation import Learned, Visited
+from scb.configurations import config_dict
 from scb.discovery import DiscoveryConfig, discover
 from scb.environments.linear import PolicyDistanceParts, fitted, with_states
 from scb.environments.synthetic import BanditConfig, bandit_for
@@ -18,7 +19,7 @@ from scb.evolution import EvolutionConfig
 from scb.keys import split_key
 from scb.measurement import Place
 from scb.refinement import Refinement, RefinementConfig, paired_ranks, refined
-from scb.runs import Run, config_dict
+from scb.runs import Run
 from tests.scb.probes import TWO_TARGETS, ContinuousCorridor
 
 CORRIDOR = Place("corridor", ContinuousCorridor(cells=2), TWO_TARGETS)

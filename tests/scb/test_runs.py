@@ -10,19 +10,11 @@ import numpy as np
 import pytest
 
 from scb.checkpoints import Checkpoints
+from scb.configurations import config_dict, first_difference
 from scb.errors import UserError
 from scb.files import write_json, write_text
 from scb.machine import machine_description
-from scb.runs import (
-    Run,
-    Stopwatch,
-    config_dict,
-    first_difference,
-    held,
-    read_config,
-    released,
-    run_of,
-)
+from scb.runs import Run, Stopwatch, held, read_config, released, run_of
 from tests.locking import is_locked
 
 CONFIG = {"seed": 0, "evolution": {"sigma": 0.05, "strategy": "SNES"}, "hidden_sizes": (8, 8)}

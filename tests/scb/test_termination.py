@@ -12,9 +12,10 @@ import numpy as np
 import pytest
 
 import scb
+from scb.configurations import config_dict
 from scb.errors import UserError
 from scb.evolution import EvolutionConfig, evolve
-from scb.runs import Run, config_dict
+from scb.runs import Run
 from tests.scb.probes import Parabola
 
 ROOT = Path(scb.__file__).parents[1]
@@ -24,7 +25,8 @@ CONFIG = EvolutionConfig(
 SEARCH = f"""
 import pathlib, sys
 from scb.evolution import EvolutionConfig, evolve
-from scb.runs import Run, config_dict
+from scb.configurations import config_dict
+from scb.runs import Run
 from tests.scb.probes import Parabola
 
 config = EvolutionConfig(**{asdict(CONFIG)!r})
