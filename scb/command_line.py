@@ -18,7 +18,7 @@ from tyro.constructors import PrimitiveConstructorSpec
 
 from scb import processes
 from scb.configurations import config_dict
-from scb.errors import UserError, one_of
+from scb.errors import UserError, flag_name, one_of
 from scb.machine import package_versions
 from scb.rows import Rows
 from scb.runs import Run, read_config, released
@@ -82,8 +82,7 @@ def flags(config: Any, default: Any) -> Iterator[str]:
         if is_dataclass(value) and not written:
             yield from flags(value, other)
             continue
-        named = [x.name for x in annotations if getattr(x, "name", None)]
-        name = (named[0] if named else entry.name).replace("_", "-")
+        name = flag_name(type(config), entry.name).replace("_", "-")
         if isinstance(value, bool):
             yield f"--{name}" if value else f"--no-{name}"
         elif isinstance(value, tuple) and not written:

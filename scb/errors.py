@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import fields, is_dataclass
 from difflib import get_close_matches
-from typing import Any, get_args
+from typing import Any, get_args, get_type_hints
 
 MOST_AGENTS = 100_000  # more would not fit into memory before the first is trained
 
@@ -32,7 +32,8 @@ def agents_at_least(minimum: int, of: object, *names: str) -> None:
     for name in names:
         if (getattr(of, name) or 0) > MOST_AGENTS:
             raise UserError(
-                f"{name} is {getattr(of, name)}: each is an agent to train, and at most {MOST_AGENTS} are taken."
+                f"{called(of, name)} is {getattr(of, name)}: each is an agent to train, and at most {MOST_AGENTS} are "
+                "taken."
             )
 
 
@@ -51,9 +52,9 @@ def _check(
     for name, value in numbers(of, *names, **values).items():
         if value is not None and not holds(value):
             finite = ", and finite" if isinstance(value, float) else ""
-            raise UserError(f"{name} is {value}: it must be {allowed}{finite}.")
+            raise UserError(f"{called(of, name)} is {value}: it must be {allowed}{finite}.")
         if isinstance(value, int) and value >= 2**31 and name != "seed":
-            raise UserError(f"{name} is {value}: it must be {allowed}, and below 2^31.")
+            raise UserError(f"{called(of, name)} is {value}: it must be {allowed}, and below 2^31.")
 
 
 def numbers(of: object = None, *names: str, **values: Any) -> dict[str, Any]:
@@ -63,8 +64,25 @@ def numbers(of: object = None, *names: str, **values: Any) -> dict[str, Any]:
     for name, value in found.items():
         if isinstance(value, str) or (name in whole and isinstance(value, float)):
             kind = "whole number" if name in whole else "number"
-            raise UserError(f"{name} is {value!r}: it must be a {kind}.")
+            raise UserError(f"{called(of, name)} is {value!r}: it must be a {kind}.")
     return found
+
+
+def called(of: object, name: str) -> str:
+    """A field's name, and the flag that sets it where that is called something else."""
+    flag = flag_name(type(of), name) if is_dataclass(of) else name
+    return name if flag == name else f"{name} (--{flag})"
+
+
+def flag_name(kind: type[Any], name: str) -> str:
+    """What the command line calls a dataclass' field, without the dashes before it: its name, unless it is annotated.
+
+    Of something that is no field it is the name.
+    """
+    hint = get_type_hints(kind, include_extras=True).get(name)
+    return next(
+        (x.name for x in getattr(hint, "__metadata__", ()) if getattr(x, "name", None)), name
+    )
 
 
 def _counted(of: Any) -> set[str]:
@@ -98,7 +116,9 @@ def unused(config: Any, because: str, names: Iterable[str], otherwise: str) -> N
     defaults = {field.name: field.default for field in fields(config)}
     for name in names:
         if (value := getattr(config, name)) != defaults[name]:
-            raise UserError(f"{name} is {value}, and {because}: leave it out, or {otherwise}.")
+            raise UserError(
+                f"{called(config, name)} is {value}, and {because}: leave it out, or {otherwise}."
+            )
 
 
 def one_of(kind: str, name: str, known: Iterable[str]) -> None:

@@ -33,9 +33,8 @@ DriftFunction: TypeAlias = Callable[[Any, jax.Array, jax.Array, jax.Array], jax.
 # PPO's never does.
 MAX_LOG_RATIO = 20.0
 USUAL_CLIP = 0.2
-DIAGNOSED = (
-    4  # iterations: enough that single batches don't show, few beside a training's thousands
-)
+# Iterations: enough that single batches don't show, few beside a training's thousands.
+DIAGNOSED = 4
 DIAGNOSIS = ("kl", "outside", "gain", "value_error", "entropy")
 
 

@@ -44,7 +44,11 @@ pytestmark = pytest.mark.usefixtures("small_agents")
         ("discover --strategy SNESS", "unknown evolution strategy 'SNESS': did you mean SNES"),
         ("discover --strategy Open_ES --population-size 5", "it must be even"),
         ("discover --population-size 1", "population_size is 1"),
-        ("discover --generations -1", "num_generations is -1"),
+        ("discover --generations -1", "num_generations (--generations) is -1"),
+        (
+            "discover --refinement-rounds 1 --refinement-agents 0",
+            "agents (--refinement-agents) is 0: it",
+        ),
         ("discover --generations 0 --init random", "0 generations, and nothing is found before"),
         ("discover --agents-per-candidate 0", "agents_per_candidate is 0"),
         ("discover --evaluation-episodes 0", "evaluation_episodes is 0"),
