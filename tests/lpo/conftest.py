@@ -9,8 +9,10 @@ import pytest
 import scb.cli
 from lpo import cli
 from lpo.drifts import LearnedDrift
+from lpo.inner_loop import MetaTrainingConfig
 from lpo.objectives import save_objective
 from scb.agents.ppo import PPOConfig
+from scb.evolution import EvolutionConfig
 
 # What an artefact must say beside its weights.
 METADATA = {"config": {}, "seeds": {}, "results": {}, "cost": {}, "command": "a test"}
@@ -32,6 +34,23 @@ def tiny_agent() -> PPOConfig:
 @pytest.fixture(scope="session")
 def tiny_drift() -> LearnedDrift:
     return LearnedDrift(hidden_size=4)
+
+
+@pytest.fixture(scope="session")
+def config(tiny_agent: PPOConfig, tiny_drift: LearnedDrift) -> MetaTrainingConfig:
+    """Two generations of two candidates on Pendulum's bandit."""
+    evolution = EvolutionConfig(
+        strategy="Open_ES", population_size=2, num_generations=2, mean_evaluations=2, seed=1
+    )
+    return MetaTrainingConfig(
+        tasks=("Synthetic-Pendulum-v1",),
+        drift=tiny_drift,
+        fitness="return",
+        agent=tiny_agent,
+        agents_per_candidate=1,
+        evaluation_episodes=2,
+        evolution=evolution,
+    )
 
 
 @pytest.fixture(scope="session")

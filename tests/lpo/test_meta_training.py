@@ -1,4 +1,4 @@
-"""Learning an objective: what a candidate is worth, what it costs, and where the noise goes."""
+"""Learning an objective: what a candidate is worth, and what it costs."""
 
 import shutil
 from dataclasses import replace
@@ -8,51 +8,21 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from gymnax.environments import spaces
 
 from lpo import inner_loop
-from lpo.commands import MetaTrain
-from lpo.drifts import ClipDrift, LearnedDrift
 from lpo.fitness import FITNESSES, Fitness
 from lpo.inner_loop import MetaTrainingConfig, TaskTraining, task_agent
 from lpo.meta_training import MetaTraining, meta_train
 from scb.agents.ppo import PPOConfig
 from scb.agents.spec import environment_agent
 from scb.environments.registry import make
-from scb.environments.spec import EnvironmentSpec
-from scb.environments.synthetic import BanditConfig, SyntheticBandit
+from scb.environments.synthetic import BanditConfig
 from scb.environments.synthetic_mdp import synthetic_for
 from scb.environments.zoo import save_bandit
-from scb.errors import UserError
 from scb.evaluation import Episodes
-from scb.evolution import EvolutionConfig, Outcome
+from scb.evolution import Outcome
 
 PENDULUM = "Synthetic-Pendulum-v1"
-EVOLUTION = EvolutionConfig(
-    strategy="Open_ES", population_size=2, num_generations=2, mean_evaluations=2, seed=1
-)
-
-
-@pytest.fixture(scope="module")
-def config(tiny_agent, tiny_drift) -> MetaTrainingConfig:
-    return MetaTrainingConfig(
-        tasks=("Synthetic-Pendulum-v1",),
-        drift=tiny_drift,
-        fitness="return",
-        agent=tiny_agent,
-        agents_per_candidate=1,
-        evaluation_episodes=2,
-        evolution=EVOLUTION,
-    )
-
-
-def bandit(reward_factor: float = 1.0) -> SyntheticBandit:
-    """A bandit of Pendulum's shapes, its rewards `reward_factor` times those of the plain one."""
-    shape = SyntheticBandit(3, spaces.Box(-2.0, 2.0, (1,), jnp.float32), BanditConfig(4))
-    weights = shape.init_weights(jax.random.key(0))
-    last = weights["reward"]["Dense_1"]
-    weights["reward"]["Dense_1"] = jax.tree.map(lambda x: reward_factor * x, last)
-    return SyntheticBandit(3, shape.action_space(), shape.config, weights)
 
 
 # -- it learns ----------------------------------------------------------------------------------
@@ -327,7 +297,7 @@ def test_tasks_of_other_shapes_learn_one_objective(config):
     # Three observations and a torque, four observations and two actions; ranks, since a pendulum
     # earns thousands below zero and a pole one a step.
     tasks = (PENDULUM, "Synthetic-CartPole-v1")
-    evolution = replace(EVOLUTION, combine="ranks")
+    evolution = replace(config.evolution, combine="ranks")
     several = replace(config, tasks=tasks, agent=None, contexts=20, evolution=evolution)
     outcome = meta_train(several, quiet=True)
     line = outcome.metrics[-1]
@@ -380,234 +350,3 @@ def test_several_environments_validate_by_their_normalised_scores(config):
     # One agent at the expert's return, one at that of random actions: (1 + 0) / 2.
     judged = problem.evaluate_mean({"output": jnp.ones((1, 1))}, jax.random.key(0))
     assert float(judged["fitness"]) == pytest.approx(0.5, abs=1e-6)
-
-
-# -- horizons ------------------------------------------------------------------------------------
-
-
-def test_inner_agents_train_for_the_horizon_and_know_how_far_they_are(config):
-    seen = []
-
-    def watch(parameters, log_ratio, advantage, progress):
-        jax.debug.callback(lambda p: seen.append(float(p)), progress[0])
-        return jnp.zeros_like(log_ratio)
-
-    task = TaskTraining(replace(config, horizons=(0.5, 1.0, 2.0), reward_noise=0.0), PENDULUM)
-    task.agent = replace(task.agent, drift=watch)
-    hyperparameters = task.spec.hyperparameters
-    fitness = jax.jit(task.fitness, static_argnums=2)
-    for horizon, fractions in (
-        (1 / 3, {0.0}),  # one batch of three
-        (1.0, {0.0, 1 / 3, 2 / 3}),
-        (2.0, {0.0, 1 / 6, 2 / 6, 3 / 6, 4 / 6, 5 / 6}),
-    ):
-        seen.clear()
-        jax.block_until_ready(fitness(0.0, jax.random.key(0), 1, horizon))
-        jax.effects_barrier()
-        assert set(np.round(seen, 5)) == set(np.round(list(fractions), 5))
-    assert hyperparameters.horizon is None
-
-
-def test_a_generation_has_one_horizon_and_generations_differ(config):
-    problem = MetaTraining(replace(config, horizons=(0.5, 1.0, 2.0), agents_per_candidate=3))
-
-    class Echo:
-        def fitness(self, candidate, key, number, horizon=1.0):
-            return jnp.full(number, horizon)
-
-    problem.tasks = {"a": Echo()}
-    drawn = [
-        problem.evaluate({}, jax.random.key(i), jnp.int32(i))["fitness"].tolist() for i in range(20)
-    ]
-    assert all(len(set(generation)) == 1 for generation in drawn)
-    assert {generation[0] for generation in drawn} == {0.5, 1.0, 2.0}
-
-
-def test_steps_with_horizons_are_their_mean(config):
-    # Three batches of eight, half (1.5, which is rounded to 2), all or twice of them: 8 x 11 / 3.
-    steps = MetaTraining(replace(config, horizons=(0.5, 1.0, 2.0), reward_noise=0.0)).steps()
-    assert (steps.training, steps.evaluation) == (29, 2)
-    # However short, a training has a batch.
-    shortest = MetaTraining(replace(config, horizons=(0.01,), reward_noise=0.0)).steps()
-    assert shortest.training == 8
-    # What is judged trains in full.
-    for horizons in ((0.5, 1.0, 2.0), (2.0,), ()):
-        steps = MetaTraining(replace(config, horizons=horizons, reward_noise=0.0)).judgement_steps()
-        assert steps.training == 3 * 8
-
-
-# -- reward noise -------------------------------------------------------------------------------
-
-
-def test_reward_noise_is_given_in_the_bandits_own_standard_deviations(config, monkeypatch):
-    plain = bandit()
-    rng = np.random.default_rng(0)
-    contexts = jax.vmap(plain.reset_env, (0, None))(
-        jax.random.split(jax.random.key(9), 4000), plain.default_params
-    )[0]
-    actions = jnp.asarray(rng.uniform(-2.0, 2.0, (4000, 1)), jnp.float32)
-    rewards = jax.vmap(plain.mean_reward, (0, 0, None))(contexts, actions, plain.default_params)
-
-    noise = {}
-    for factor in (1.0, 3.0):
-        scaled = bandit(factor)
-        monkeypatch.setattr(EnvironmentSpec, "make", lambda *_, b=scaled: (b, b.default_params))
-        problem = TaskTraining(replace(config, reward_noise=5.0), PENDULUM)
-        noise[factor] = float(problem.training_params.reward_noise)
-        assert problem.evaluation_params.reward_noise == 0.0
-    # 4000 samples know a standard deviation to about 1 / sqrt(2 * 4000) = 1 %.
-    assert noise[1.0] == pytest.approx(5.0 * float(jnp.std(rewards)), rel=0.06)
-    assert noise[3.0] == pytest.approx(3.0 * noise[1.0], rel=1e-5)
-
-
-def test_reward_noise_enters_training_and_not_evaluation(config):
-    # Half of the agents draw the learning rate 0 and stay as they were initialised: were noise in
-    # the evaluation, none of them would be worth the same as without. The other half learns, and
-    # learns something else under noise.
-    start = config.drift.init(jax.random.key(1))
-    drawn = replace(config, hyperparameters={"learning_rate": (0.0, 0.1)})
-    with_noise, without = (
-        jax.jit(TaskTraining(c, PENDULUM).fitness, static_argnums=2)(start, jax.random.key(0), 16)
-        for c in (replace(drawn, reward_noise=noise) for noise in (5.0, 0.0))
-    )
-    assert int(jnp.sum(with_noise == without)) == 8
-
-
-def test_environments_take_no_reward_noise(config):
-    problem = TaskTraining(replace(config, reward_noise=5.0), "Pendulum-v1")
-    assert problem.training_params is problem.env_params
-
-
-# -- where it trains ----------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("environment", "fitness", "made"),
-    [
-        # A bandit has no physics: the backend is for the environment that it stands for.
-        ("Synthetic-hopper", "transfer", [("hopper", "spring"), ("Synthetic-hopper", None)]),
-        ("hopper", "return", [("hopper", "spring")]),
-    ],
-)
-def test_physics_go_to_the_environment_and_not_to_its_bandit(
-    config, monkeypatch, environment, fitness, made
-):
-    calls = []
-
-    def record(spec, backend=None):
-        calls.append((spec.name, backend))
-        return bandit(), bandit().default_params
-
-    monkeypatch.setattr(EnvironmentSpec, "make", record)
-    MetaTraining(replace(config, tasks=(environment,), fitness=fitness, backend="spring"))
-    assert calls == made
-
-
-# -- bad input ----------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"fitness": "retrun"}, "unknown fitness 'retrun': did you mean return"),
-        (
-            {"tasks": ("Pendulum-v1",), "fitness": "transfer"},
-            "fitness 'transfer' asks for a bandit, and 'Pendulum-v1' is none: use 'return' or "
-            "'area', or train on 'Synthetic-Pendulum-v1'.",
-        ),
-        ({"tasks": ()}, "the list of tasks is empty: give at least one bandit or environment."),
-        ({"tasks": ("a", "b", "a")}, "the task a is there twice: give each once."),
-        (
-            {"tasks": ("CartPole-v1", "Pendulum-v1"), "agent": PPOConfig()},
-            "one agent configuration does not fit several tasks",
-        ),
-        (
-            {
-                "tasks": ("Synthetic-hopper", "Pendulum-v1"),
-                "validation": True,
-                "backend": "spring",
-            },
-            "needs a reference return of each, and hopper has none: leave out its task",
-        ),
-        ({"horizons": (0.5, 0.0)}, "horizon is 0.0: it must be positive, and finite."),
-        ({"horizons": ("a",)}, "a horizon is 'a': it must be a number."),
-        ({"horizons": (None,)}, "a horizon is None: it must be a number."),
-        ({"drift": "dpo"}, "drift is of the class str: it must be of Drift."),
-        ({"evolution": {}}, "evolution is of the class dict: it must be of EvolutionConfig."),
-        ({"agent": 3}, "agent is of the class int: it must be of PPOConfig or None."),
-        (
-            {"horizons": (0.5,), "fitness": "area"},
-            "fitness 'area' needs trainings of one length: take no horizons",
-        ),
-        ({"agents_per_candidate": 0}, "agents_per_candidate is 0: it must be at least 1."),
-        ({"evaluation_episodes": -1}, "evaluation_episodes is -1: it must be at least 1."),
-        ({"contexts": 0}, "contexts is 0: it must be at least 1."),
-        (
-            {"tasks": ("Pendulum-v1",), "reward_noise": 2.0},
-            "reward_noise is 2.0, and none of the tasks is a bandit: leave it out, or take a bandit.",
-        ),
-        ({"tasks": ("Pendulum-v1",), "contexts": 7}, "contexts is 7, and none of the tasks is a"),
-        ({"reward_noise": -0.1}, "reward_noise is -0.1: it must be 0 or larger, and finite."),
-        (
-            {"initial_scale": float("nan")},
-            "initial_scale is nan: it must be 0 or larger, and finite.",
-        ),
-        ({"reward_noise": float("nan")}, "reward_noise is nan"),
-        ({"reward_noise": float("inf")}, "reward_noise is inf"),
-    ],
-)
-def test_a_configuration_that_cannot_be_is_refused(arguments, message, one_sentence):
-    with pytest.raises(UserError) as error:
-        MetaTrainingConfig(**arguments)
-    assert message in one_sentence(str(error.value))
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"tasks": ("Synthetic-Pendulm-v1",)}, "did you mean Synthetic-Pendulum-v1"),
-        (
-            {"tasks": ("Pendulum-v1",), "backend": "spring"},
-            "of Pendulum-v1 none has a choice: leave it out",
-        ),
-    ],
-)
-def test_an_environment_that_cannot_be_is_refused(config, changes, message, one_sentence):
-    with pytest.raises(UserError) as error:
-        MetaTraining(replace(config, **changes))
-    assert message in one_sentence(str(error.value))
-
-
-def test_defaults_take_a_bandit_with_noise():
-    # What the library recommends: documentation and the shipped objective rest on it.
-    default = MetaTrainingConfig()
-    assert (default.tasks, default.reward_noise) == (("Synthetic-Pendulum-v1",), 5.0)
-    assert (default.drift, default.evolution.strategy) == (LearnedDrift(base="ppo"), "Open_ES")
-
-
-def test_a_folder_keeps_a_meta_training_from_python(config, tmp_path):
-    folder = tmp_path / "run"
-    longer = replace(config, evolution=replace(config.evolution, num_generations=4))
-    shorter = replace(config, evolution=replace(config.evolution, num_generations=2))
-    meta_train(shorter, folder, quiet=True)
-    logged = (folder / "metrics.jsonl").read_text()
-    # The same call with more generations goes on, and ends as one that had them from the start.
-    grown = meta_train(longer, str(folder), quiet=True)
-    assert (folder / "metrics.jsonl").read_text().startswith(logged)
-    whole = meta_train(longer, quiet=True)
-    jax.tree.map(np.testing.assert_array_equal, grown.mean, whole.mean)
-    with pytest.raises(UserError, match=r"its config differs at config\.agents_per_candidate"):
-        meta_train(replace(longer, agents_per_candidate=2), folder, quiet=True)
-
-
-def test_a_mistake_leaves_no_folder_of_a_meta_training(config, tmp_path):
-    folder = tmp_path / "run"
-    with pytest.raises(UserError, match="family clip, which has nothing to learn"):
-        meta_train(replace(config, drift=ClipDrift()), folder)
-    assert not folder.exists()
-
-
-def test_a_run_from_python_is_none_of_the_command_line(config, tmp_path):
-    meta_train(config, tmp_path / "run", quiet=True)
-    with pytest.raises(UserError, match="it was started with python"):
-        MetaTrain.parse([f"--resume={tmp_path / 'run'}"])
