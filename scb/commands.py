@@ -4,7 +4,7 @@ from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 import tyro
@@ -12,11 +12,10 @@ import tyro
 from scb import experts, processes
 from scb.agents.spec import bandit_agent
 from scb.command_line import LongRun, Measuring, SharedOutput, flags
-from scb.configurations import config_dict
 from scb.console import console
 from scb.discovery import BanditDiscovery, DiscoveryConfig
 from scb.environments.registry import environment_spec
-from scb.environments.zoo import bandit_metadata, load_synthetic, save_bandit
+from scb.environments.zoo import load_synthetic, save_bandit
 from scb.errors import agents_at_least, at_least
 from scb.evolution import EvolutionConfig
 from scb.judgement import (
@@ -28,9 +27,7 @@ from scb.judgement import (
     judge_all,
     told,
 )
-from scb.listing import found
 from scb.measurement import check_seeds
-from scb.seeds import VALIDATING
 from scb.statistics import estimate
 
 
@@ -143,29 +140,11 @@ class Discover(LongRun):
     def run(self) -> None:
         # The problem first: where a name is wrong, no folder is left behind to be in the next try's way.
         problem = BanditDiscovery(self.config)
-        config, best = problem.config, self.config.select == "best"
-        spec = environment_spec(config.environment)
-        folder = self.open()
+        config, folder = problem.config, self.open()
         outcome = problem.search(folder)
         folder.end_log()
-        outcome.check(best)
-        weights = outcome.best_mean if best else outcome.mean
-        metadata = {
-            "config": {
-                "evaluation_environment": config.environment,
-                "backend": spec.physics(config.backend),
-                "discovery": config_dict(config),
-                "started_from": None if config.start is None else _origin(config.start),
-            },
-            "seeds": {"discovery": config.evolution.seed, "validation": VALIDATING.start},
-            "results": {},
-            "cost": {
-                **outcome.cost(problem, config.evolution, best),
-                **problem.start_reports,
-            },
-            "command": self.command,
-        }
-        path = folder.folder / f"{spec.bandit}.npz"
+        weights, metadata = problem.selected(outcome), problem.described(outcome, self.command)
+        path = folder.folder / f"{environment_spec(config.environment).bandit}.npz"
         # Before it is judged, which may take longer than the search.
         if processes.first():
             save_bandit(path, problem.bandit, weights, metadata)
@@ -208,17 +187,6 @@ def scale(environment: str, backend: str | None, start: Mapping[str, Mapping[str
         known["standing still"] = standing
     values = "; ".join(f"{who}: {value:.4g}" for who, value in known.items())
     return f"to compare with, on {environment}: {values}"
-
-
-def _origin(bandit: str) -> dict[str, Any]:
-    metadata = bandit_metadata(bandit)
-    return {
-        "command": metadata["command"],
-        "sha256": metadata["sha256"],
-        "cost": metadata["cost"],
-        "found": found(metadata),
-        "started_from": metadata["config"].get("started_from"),
-    }
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ hyperparameters drawn from the paper's lists so that the bandit suits any of the
 their return in the evaluation environment. The same search finds the paper's fully synthetic MDPs.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -41,9 +41,11 @@ from scb.fitting import standardize_reward
 from scb.judgement import check_fits
 from scb.keys import named_key, root_key, split_key
 from scb.linear_expert import erring, noisy
+from scb.listing import found
 from scb.measurement import Judge, Place, train_and_judge
 from scb.refinement import refined
 from scb.runs import Run, run_of
+from scb.seeds import VALIDATING
 from scb.spaces import check_bounded, kind_of_actions
 from scb.strategies import strategy_for
 from scb.warm_start import expert_agent, warm_start
@@ -214,6 +216,49 @@ class BanditDiscovery:
         self._starts[name], self.start_reports[name] = weights, report
         return weights
 
+    def selected(self, outcome: Outcome) -> Weights:
+        """The weights that the configuration selects: of the last mean, or of the best judged one.
+
+        Raises:
+          UserError: they are no numbers, or no mean was judged a number.
+        """
+        best = self.config.select == "best"
+        outcome.check(best)
+        return cast(Weights, outcome.best_mean if best else outcome.mean)
+
+    def described(self, outcome: Outcome, command: str) -> dict[str, Any]:
+        """What is saved with what a search found, which no agents have judged yet.
+
+        Args:
+          command: that makes it again.
+        """
+        config = self.config
+        origin = None if config.start is None else bandit_metadata(config.start)
+        return {
+            "config": {
+                "evaluation_environment": config.environment,
+                "backend": environment_spec(config.environment).physics(config.backend),
+                "discovery": config_dict(config),
+                "started_from": origin and _as_origin(origin),
+            },
+            "seeds": {"discovery": config.evolution.seed, "validation": VALIDATING.start},
+            "results": {},
+            "cost": {
+                **outcome.cost(self, config.evolution, config.select == "best"),
+                **self.start_reports,
+            },
+            "command": command,
+        }
+
+    def save(self, path: str | Path, outcome: Outcome) -> Path:
+        """Writes what a search found as `scb discover` does: NAME.npz, and NAME.json, which says how it was found.
+
+        Raises:
+          UserError: as `selected` does, or the file cannot be written.
+        """
+        metadata = self.described(outcome, "python")
+        return save_bandit(path, self.bandit, self.selected(outcome), metadata)
+
     def evaluate(
         self, candidate: Weights, key: jax.Array, generation: jax.Array
     ) -> dict[str, jax.Array]:
@@ -335,6 +380,14 @@ class BanditDiscovery:
         )
 
 
+def _as_origin(metadata: Mapping[str, Any]) -> dict[str, Any]:
+    return {
+        **{name: metadata[name] for name in ("command", "sha256", "cost")},
+        "found": found(metadata),
+        "started_from": metadata["config"].get("started_from"),
+    }
+
+
 def discover(
     config: DiscoveryConfig, run: Run | str | Path | None = None, quiet: bool = False
 ) -> tuple[BanditDiscovery, Outcome]:
@@ -350,8 +403,8 @@ def discover(
       quiet: no line a generation.
 
     Returns:
-      (the problem, whose `bandit` has the shapes, the outcome, whose `mean` and `best_mean` are weights): what
-      `save_bandit` takes.
+      (the problem, whose `bandit` has the shapes; the outcome, whose `mean` and `best_mean` are weights).
+      `problem.save("mine.npz", outcome)` writes them.
 
     Raises:
       UserError: the folder holds something else, or a run of another configuration.

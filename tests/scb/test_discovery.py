@@ -17,7 +17,7 @@ from scb.discovery import (
     DiscoveryConfig,
     discover,
 )
-from scb.environments.registry import EnvironmentSpec, make
+from scb.environments.registry import EnvironmentSpec, environment_spec, make
 from scb.environments.synthetic import BanditConfig, SyntheticBandit, bandit_for
 from scb.environments.zoo import (
     PREFIX,
@@ -170,6 +170,20 @@ def test_a_discovered_bandit_is_saved_and_loaded(discovered, tmp_path):
     bandit = load_bandit(path)
     np.testing.assert_array_equal(flat(bandit.default_params.weights), flat(outcome.mean))
     check_fits(bandit, problem.place.env, problem.place.params, "CartPole-v1")
+
+
+@pytest.mark.parametrize("select", ["final", "best"])
+def test_what_a_discovery_saves_says_how_it_was_found(discovered, tmp_path, select):
+    problem, outcome = discovered
+    problem = BanditDiscovery(replace(problem.config, select=select))
+    chosen = outcome.best_mean if select == "best" else outcome.mean
+    # Its file may have any name.
+    path = problem.save(tmp_path / "mine.npz", outcome)
+    np.testing.assert_array_equal(flat(load_bandit(path).default_params.weights), flat(chosen))
+    assert environment_spec(str(path)).evaluation_environment == "CartPole-v1"
+    metadata = bandit_metadata(path)
+    assert metadata["config"]["discovery"] == config_dict(problem.config)
+    assert metadata["cost"]["environment_steps_training"] > 0
 
 
 def test_a_candidate_is_judged_by_the_return_of_every_agent(discovered):
