@@ -112,7 +112,11 @@ class BanditDiscovery:
         self._folder: Path | None = None
         self._quiet = True
         # Read now, so that a wrong name is told before anything is computed or written.
-        self._start = None if config.start is None else self._weights_of(config.start)
+        self._start: Weights | None = None
+        self._origin: dict[str, Any] | None = None
+        if config.start is not None:
+            self._start = self._weights_of(config.start)
+            self._origin = _as_origin(bandit_metadata(config.start))
 
     def search(self, run: Run | None = None, quiet: bool = False) -> Outcome:
         """Evolves; in a run's folder the fit is kept, so that a resumed one need not look for an expert again."""
@@ -230,16 +234,15 @@ class BanditDiscovery:
         """What is saved with what a search found, which no agents have judged yet.
 
         Args:
-          command: that makes it again.
+          command: that makes it again, or "python".
         """
         config = self.config
-        origin = None if config.start is None else bandit_metadata(config.start)
         return {
             "config": {
                 "evaluation_environment": config.environment,
                 "backend": environment_spec(config.environment).physics(config.backend),
                 "discovery": config_dict(config),
-                "started_from": origin and _as_origin(origin),
+                "started_from": self._origin,
             },
             "seeds": {"discovery": config.evolution.seed, "validation": VALIDATING.start},
             "results": {},
@@ -252,6 +255,8 @@ class BanditDiscovery:
 
     def save(self, path: str | Path, outcome: Outcome) -> Path:
         """Writes what a search found as `scb discover` does: NAME.npz, and NAME.json, which says how it was found.
+
+        Of several processes one is to call it.
 
         Raises:
           UserError: as `selected` does, or the file cannot be written.

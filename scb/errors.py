@@ -70,7 +70,13 @@ def numbers(of: object = None, *names: str, **values: Any) -> dict[str, Any]:
 
 def called(of: object, name: str) -> str:
     """A field's name, and the flag that sets it where that is called something else."""
-    flag = flag_name(type(of), name) if is_dataclass(of) else name
+    try:
+        flag = flag_name(type(of), name) if is_dataclass(of) else name
+    except (
+        NameError,
+        TypeError,
+    ):  # a class of somebody's own, with annotations that nothing here resolves
+        flag = name
     return name if flag == name else f"{name} (--{flag})"
 
 

@@ -76,7 +76,9 @@ def print_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]
 
 def found(metadata: Mapping[str, Any]) -> str:
     """How a bandit was: fitted to an expert, and by what more than that, or from random weights; evolved or not."""
-    discovery = metadata["config"]["discovery"]
+    discovery = metadata["config"].get("discovery")
+    if discovery is None:  # not by a discovery of this library
+        return "elsewhere"
     earlier = metadata["config"].get("started_from")
     if earlier:
         start = str(earlier.get("found", "from a bandit"))  # earlier versions did not write it

@@ -291,7 +291,7 @@ def _lock(path: Path, of: Path) -> None:
         holder = file.read().strip() or "which has just begun"
         file.close()
         raise UserError(
-            f"{of} is in use by another command ({holder}): wait until it has ended, or name another."
+            f"{of} is in use by another command ({holder}): wait until that has ended, or name another folder or file."
         ) from error
     except OSError:
         pass  # a file system without locks

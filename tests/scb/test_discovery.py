@@ -33,6 +33,7 @@ from scb.fitting import standardize_reward
 from scb.judgement import check_fits, judge
 from scb.keys import named_key, split_key
 from scb.linear_expert import erring, noisy
+from scb.listing import found
 from scb.measurement import Place
 from scb.population import map_population
 from scb.runs import Run
@@ -175,7 +176,8 @@ def test_a_discovered_bandit_is_saved_and_loaded(discovered, tmp_path):
 @pytest.mark.parametrize("select", ["final", "best"])
 def test_what_a_discovery_saves_says_how_it_was_found(discovered, tmp_path, select):
     problem, outcome = discovered
-    problem = BanditDiscovery(replace(problem.config, select=select))
+    if select != problem.config.select:
+        problem = BanditDiscovery(replace(problem.config, select=select))
     chosen = outcome.best_mean if select == "best" else outcome.mean
     # Its file may have any name.
     path = problem.save(tmp_path / "mine.npz", outcome)
@@ -184,6 +186,10 @@ def test_what_a_discovery_saves_says_how_it_was_found(discovered, tmp_path, sele
     metadata = bandit_metadata(path)
     assert metadata["config"]["discovery"] == config_dict(problem.config)
     assert metadata["cost"]["environment_steps_training"] > 0
+    assert metadata["config"]["started_from"] is None
+    later = BanditDiscovery(replace(problem.config, start=str(path)))
+    origin = later.described(outcome, "a test")["config"]["started_from"]
+    assert origin["sha256"] == metadata["sha256"] and origin["command"] == "python"
 
 
 def test_a_candidate_is_judged_by_the_return_of_every_agent(discovered):
@@ -586,11 +592,15 @@ def saved(folder, environment, **config):
     return save_bandit(folder / f"Synthetic-{environment}", bandit, weights, METADATA), weights
 
 
-def test_a_discovery_starts_from_a_bandit_in_a_file(tmp_path):
+def test_a_discovery_starts_from_a_bandit_in_a_file(discovered, tmp_path):
     path, weights = saved(tmp_path, "CartPole-v1", hidden_size=4)
     problem = BanditDiscovery(replace(CONFIG, start=str(path)))
     start = problem.initial_solution(jax.random.key(0))
     np.testing.assert_array_equal(flat(start), flat(weights))
+    # Whose file does not say how it was found, as one of the published ones does not.
+    metadata = problem.described(discovered[1], "a test")
+    assert metadata["config"]["started_from"]["found"] == "elsewhere"
+    assert found(metadata) == "elsewhere, evolved"
 
 
 @pytest.mark.parametrize("environment", ["CartPole-v1", "Pendulum-v1"])

@@ -1,5 +1,7 @@
 """What a caller in Python gets wrong is told in a sentence, before anything is trained."""
 
+from dataclasses import dataclass
+
 import gymnasium
 import gymnax
 import jax
@@ -9,7 +11,7 @@ from gymnax.environments import environment
 
 import scb
 from scb.discovery import BanditDiscovery, DiscoveryConfig
-from scb.errors import UserError
+from scb.errors import UserError, at_least
 from scb.evolution import EvolutionConfig
 
 KEY = jax.random.key(0)
@@ -77,6 +79,15 @@ def test_what_is_true_or_false_is_neither_text_nor_number(value):
 def test_what_is_counted_is_a_whole_number(field, value):
     with pytest.raises(UserError, match=rf"^{field} .*is .*: it must be a whole number"):
         EvolutionConfig(**{field: value})
+
+
+def test_a_class_whose_annotations_do_not_resolve_is_told_of_by_the_fields_name():
+    @dataclass
+    class Mine:
+        size: "Nowhere"  # noqa: F821
+
+    with pytest.raises(UserError, match=r"^size is 0: it must be at least 1"):
+        at_least(1, Mine(0), "size")
 
 
 def test_a_curriculum_in_words_is_the_one_that_they_say():
