@@ -82,7 +82,7 @@ def flags(config: Any, default: Any) -> Iterator[str]:
         if is_dataclass(value) and not written:
             yield from flags(value, other)
             continue
-        name = flag_name(type(config), entry.name).replace("_", "-")
+        name = flag_name(hints[entry.name], entry.name).replace("_", "-")
         if isinstance(value, bool):
             yield f"--{name}" if value else f"--no-{name}"
         elif isinstance(value, tuple) and not written:

@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import fields, is_dataclass
 from difflib import get_close_matches
-from typing import Any, get_args, get_type_hints
+from typing import Any, get_args
 
 MOST_AGENTS = 100_000  # more would not fit into memory before the first is trained
 
@@ -68,27 +68,17 @@ def numbers(of: object = None, *names: str, **values: Any) -> dict[str, Any]:
     return found
 
 
-def called(of: object, name: str) -> str:
+def called(of: Any, name: str) -> str:
     """A field's name, and the flag that sets it where that is called something else."""
-    try:
-        flag = flag_name(type(of), name) if is_dataclass(of) else name
-    except (
-        NameError,
-        TypeError,
-    ):  # a class of somebody's own, with annotations that nothing here resolves
-        flag = name
+    types = {f.name: f.type for f in fields(of)} if is_dataclass(of) else {}
+    flag = flag_name(types.get(name), name)
     return name if flag == name else f"{name} (--{flag})"
 
 
-def flag_name(kind: type[Any], name: str) -> str:
-    """What the command line calls a dataclass' field, without the dashes before it: its name, unless it is annotated.
-
-    Of something that is no field it is the name.
-    """
-    hint = get_type_hints(kind, include_extras=True).get(name)
-    return next(
-        (x.name for x in getattr(hint, "__metadata__", ()) if getattr(x, "name", None)), name
-    )
+def flag_name(annotated: Any, name: str) -> str:
+    """What the command line calls a field, without dashes before it: its name, unless its type's annotations say."""
+    named = (getattr(x, "name", None) for x in getattr(annotated, "__metadata__", ()))
+    return next(filter(None, named), name)
 
 
 def _counted(of: Any) -> set[str]:

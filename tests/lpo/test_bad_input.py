@@ -53,7 +53,10 @@ def test_an_unknown_name_is_answered_by_near_ones(refused, arguments, message):
             "meta-train --generations 0",
             "num_generations (--generations) is 0: it must be at least 1",
         ),
-        ("meta-train --generations -2", "num_generations (--generations) is -2: it must be 0 or l"),
+        (
+            "meta-train --generations -2",
+            "num_generations (--generations) is -2: it must be 0 or larger",
+        ),
         ("meta-train --agents-per-candidate 0", "agents_per_candidate is 0"),
         ("meta-train --contexts 0", "contexts is 0"),
         ("meta-train --evaluation-episodes 0", "evaluation_episodes is 0"),

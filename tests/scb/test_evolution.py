@@ -779,7 +779,10 @@ def test_progress_says_fitness_failures_and_time_left(capsys):
         ({"combine": "rank"}, "unknown combination of tasks 'rank': did you mean ranks"),
         ({"population_size": 1}, "population_size is 1: .* at least 2"),
         ({"population_size": 5, "strategy": "Open_ES"}, "population_size is 5: .* must be even"),
-        ({"num_generations": -1}, r"num_generations \(--generations\) is -1: it must be 0"),
+        (
+            {"num_generations": -1},
+            r"num_generations \(--generations\) is -1: it must be 0 or larger",
+        ),
         ({"averaging": 0}, "averaging is 0: it must be at least 1"),
         (
             {"averaging": 2, "strategy": "SimpleGA"},
