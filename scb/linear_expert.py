@@ -70,6 +70,9 @@ class LinearSearchConfig:
         clipped after the errors. Above 1 they vanish far enough beyond an end, as those of an agent do
         whose mean action lies there, and what bears them switches between the ends. The expert is
         tanh(reach * outputs), which is as steep where it switches.
+      normalization: the power of their deviations that observations are divided by. With 1 all entries weigh the
+        same; with less, small ones weigh less, of which an agent that sees them as they are learns less, and
+        every agent alike.
       constant: one action instead of a linear policy, each entry at an end of its range: what agents
         overshoot there they cannot get wrong.
     """
@@ -87,12 +90,13 @@ class LinearSearchConfig:
     episode_steps: int | None = None
     judge_every: int = 10
     reach: float = 1.0
+    normalization: float = 1.0
     constant: bool = False
 
     def __post_init__(self) -> None:
         at_least(1, self, "generations", "starts", "directions", "best", "episode_steps")
         at_least(1, self, "judge_every", "reach")
-        at_least(0, self, "action_noise", "action_errors", "error_warmup")
+        at_least(0, self, "action_noise", "action_errors", "error_warmup", "normalization")
         positive(self, "sigma", "learning_rate", "decay")
         if self.starts > 1 and self.generations < 2:
             raise UserError(
@@ -251,7 +255,8 @@ class _LinearSearch:
     ) -> jax.Array:
         if self._config.constant:
             return jnp.where(policy["bias"] > 0, jnp.inf, -jnp.inf)
-        return normalize(seen, observation) @ policy["matrix"] + policy["bias"]
+        inputs = normalize(seen, observation, self._config.normalization)
+        return inputs @ policy["matrix"] + policy["bias"]
 
     def _reaching(
         self, policy: Linear, seen: RunningStatistics, observation: jax.Array

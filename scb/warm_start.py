@@ -82,6 +82,7 @@ def _linear(
         action_errors=config.expert_errors,
         error_warmup=config.expert_error_warmup,
         reach=config.expert_reach,
+        normalization=config.expert_normalization,
         constant=constant,
     )
     return search_linear_expert(place.env, place.params, key, search, bonus, quiet, worth, folder)
@@ -104,6 +105,7 @@ _OF_LINEAR_SEARCHES = (
     "expert_decay",
     "expert_error_warmup",
     "expert_reach",
+    "expert_normalization",
 )
 
 SEARCHES = {
@@ -135,6 +137,8 @@ class WarmStartConfig(DatasetConfig):
       expert_reach: how far the policy of a linear search goes where it errs, in halves of the actions' range, before
         it is clipped to that. Above 1 a policy that bears errors comes to switch between the ends, beyond
         which they vanish.
+      expert_normalization: the power of their deviations that a linear search divides observations by. With
+        less than 1 its policy asks less of entries that vary little, of which PPO's agents learn less.
       expert_pupils: agents of each algorithm of the inner loop that train in a bandit fitted to each policy
         which the linear search judges: the expert is then the one whose agents earn most on average. With 0
         it is the one that earns most itself, under its noise and errors.
@@ -156,6 +160,7 @@ class WarmStartConfig(DatasetConfig):
     expert_decay: float = 1.0
     expert_error_warmup: int = 0
     expert_reach: float = 1.0
+    expert_normalization: float = 1.0
     expert_pupils: int = 0
     expert_episode_steps: int | None = None
     fit_steps: int = 4000
@@ -167,7 +172,7 @@ class WarmStartConfig(DatasetConfig):
         one_of("expert", self.expert, ("auto", *SEARCHES, *ALGORITHMS))
         agents_at_least(0, self, "expert_pupils")
         agents_at_least(1, self, "num_experts", "aggregation_agents")
-        at_least(0, self, "expert_error_warmup", "aggregation_rounds")
+        at_least(0, self, "expert_error_warmup", "expert_normalization", "aggregation_rounds")
         at_least(1, self, "expert_generations", "expert_starts")
         at_least(1, self, "expert_episode_steps", "expert_reach", "fit_steps")
         positive(self, "expert_sigma", "expert_learning_rate", "expert_decay")

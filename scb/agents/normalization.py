@@ -46,9 +46,16 @@ def _merged(
     )
 
 
-def normalize(statistics: RunningStatistics, observation: jax.Array) -> jax.Array:
-    """[..., O] -> [..., O] with mean 0 and variance 1, clipped to ten deviations; as it is before any observation."""
+def normalize(
+    statistics: RunningStatistics, observation: jax.Array, power: float = 1.0
+) -> jax.Array:
+    """[..., O] -> [..., O] with mean 0 and variance 1, clipped to ten deviations; as it is before any observation.
+
+    With another power of the deviations to divide by than 1, an entry keeps the rest of its deviation, with 0 all.
+    """
     variance = jnp.where(
         statistics.count > 0, statistics.squares / jnp.maximum(statistics.count, 1.0), 1.0
     )
-    return jnp.clip((observation - statistics.mean) / jnp.sqrt(variance + 1e-8), -10.0, 10.0)
+    deviation = jnp.sqrt(variance + 1e-8)
+    normal = jnp.clip((observation - statistics.mean) / deviation, -10.0, 10.0)
+    return normal if power == 1 else normal * deviation ** (1 - power)

@@ -221,7 +221,7 @@ EVERY_FLAG = """--preset=paper --environment=MountainCar-v0 --backend=spring --m
 --select=best --form=linear
 --expert=sac --expert-noise=0.2 --expert-errors=0.3 --expert-pupils=2
 --expert-episode-steps=5 --expert-sigma=0.1 --expert-learning-rate=0.2 --expert-decay=0.9 --expert-reach=1.5
---expert-error-warmup=4 --expert-starts=2
+--expert-error-warmup=4 --expert-starts=2 --expert-normalization=0.5
 --num-experts=3 --expert-steps=9 --expert-generations=8 --num-states=7
 --aggregation-rounds=2 --aggregation-agents=3
 --refinement-rounds=1 --refinement-generations=2 --refinement-agents=4 --no-refinement-visits

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from scb.agents.normalization import RunningStatistics
 from scb.environments.registry import make
 from scb.errors import UserError
 from scb.linear_expert import (
@@ -295,6 +296,20 @@ def test_what_reaches_further_is_as_steep_where_it_switches():
     assert (np.asarray(found.policy(places[0])) <= space.high).all()
 
 
+def test_a_search_sees_entries_by_a_power_of_their_deviation():
+    env, key = ContinuousCorridor(cells=2), jax.random.key(0)
+    seen = replace(RunningStatistics.start(2), count=4.0, squares=jnp.array([0.04, 16.0]))
+    policy = {"matrix": jnp.full((2, 1), 0.3), "bias": jnp.zeros(1)}
+    observation, outputs = jnp.array([0.1, 2.0]), {}
+    for power in (1.0, 0.5, 0.0):
+        config = replace(SEARCH, normalization=power)
+        found = _LinearSearch(env, TWO_TARGETS, key, config, 0.0, None).expert(policy, seen)
+        outputs[power] = np.arctanh((found.policy(observation)[0] - 0.5) / 1.5)
+    # Deviations of 0.1 and 2: an entry's own is one, its root, and as it is.
+    expected = {1.0: 2.0, 0.5: 0.1**0.5 + 2**0.5, 0.0: 2.1}
+    assert outputs == pytest.approx({power: 0.3 * x for power, x in expected.items()}, rel=1e-4)
+
+
 def test_errors_grow_to_their_scale(monkeypatch):
     scales = []
     monkeypatch.setattr(
@@ -358,6 +373,7 @@ def test_a_warm_starts_settings_reach_the_search(monkeypatch):
             "expert_reach": 2.0,
             "expert_starts": 3,
             "expert_error_warmup": 9,
+            "expert_normalization": 0.5,
         },
     ):
         find_expert(
@@ -376,6 +392,7 @@ def test_a_warm_starts_settings_reach_the_search(monkeypatch):
             error_warmup=9,
             starts=3,
             reach=2.0,
+            normalization=0.5,
             constant=True,
         ),
     ]
