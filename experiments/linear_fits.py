@@ -38,6 +38,7 @@ EXPERTS: dict[str, dict[str, Any]] = {
     "no errors": {},
     "noise": {"expert_noise": 0.4},
     "errors": {"expert_errors": 0.45},
+    "errors, less normalized": {"expert_errors": 0.45, "expert_normalization": 0.25},
 }
 CONTEXTS: dict[str, dict[str, Any]] = {
     "as visited": {},
@@ -46,7 +47,8 @@ CONTEXTS: dict[str, dict[str, Any]] = {
 }
 ALGORITHMS = ("ppo", "td3")
 SETTLED = ("generations", *ALGORITHMS, "episodes")  # the same for all searches of a report
-BEFORE, NOW = ("noise", "stretched"), ("errors", "stretched and jittered")
+JITTERED = "stretched and jittered"
+BEFORE, NOW = ("noise", "stretched"), ("errors", JITTERED)
 COLORS = dict(zip(CONTEXTS, (plotting.GREY, plotting.BLUE, plotting.VERMILLION), strict=True))
 
 
@@ -132,6 +134,11 @@ def claims(report: Report) -> list[Claim]:
             (NOW, (BEFORE[0], NOW[1]), "with errors than with noise, both with jitter"),
             (NOW, (NOW[0], BEFORE[1]), "with jitter than without, both with errors"),
             (NOW, ("no errors", NOW[1]), "with errors than without, both with jitter"),
+            (
+                ("errors, less normalized", JITTERED),
+                NOW,
+                "when observations are normalized less, both with errors and jitter",
+            ),
         ):
             seeds = sorted(entry.get(expert, {}).keys() & entry.get(other, {}).keys())
             evidence = None
@@ -193,7 +200,7 @@ def draw(report: Mapping[str, Any]) -> Figure:
             if standing:
                 axes.axhline(standing, color=plotting.GREY, linestyle=":")
             names = _searched_for(entry)
-            axes.set_xticks(range(len(names)), [f"under {name}" for name in names])
+            axes.set_xticks(range(len(names)), [f"under\n{name}" for name in names])
             axes.set_title(f"{environment}: {algorithm.upper()}'s agents")
         row[0].set_ylabel("return in the environment")
     plotting.legend_of(
