@@ -34,11 +34,13 @@ from scb.statistics import pooled_estimate
 from scb.warm_start import WarmStartConfig, find_expert
 
 BACKEND = "generalized"
+LONGER = {"expert_errors": 0.45, "expert_error_warmup": 100, "expert_generations": 300}
 EXPERTS: dict[str, dict[str, Any]] = {
     "no errors": {},
     "noise": {"expert_noise": 0.4},
     "errors": {"expert_errors": 0.45},
-    "errors, less normalized": {"expert_errors": 0.45, "expert_normalization": 0.25},
+    "errors, longer": LONGER,
+    "errors, longer, less normalized": {**LONGER, "expert_normalization": 0.25},
 }
 CONTEXTS: dict[str, dict[str, Any]] = {
     "as visited": {},
@@ -135,9 +137,9 @@ def claims(report: Report) -> list[Claim]:
             (NOW, (NOW[0], BEFORE[1]), "with jitter than without, both with errors"),
             (NOW, ("no errors", NOW[1]), "with errors than without, both with jitter"),
             (
-                ("errors, less normalized", JITTERED),
-                NOW,
-                "when observations are normalized less, both with errors and jitter",
+                ("errors, longer, less normalized", JITTERED),
+                ("errors, longer", JITTERED),
+                "when observations are normalized less, both with errors and jitter after 300 generations",
             ),
         ):
             seeds = sorted(entry.get(expert, {}).keys() & entry.get(other, {}).keys())
@@ -176,7 +178,8 @@ def facts(report: Report) -> dict[str, Any]:
                 for contexts in CONTEXTS
             ],
         }
-    return {"tables": tables}
+    longer = {"longer": LONGER["expert_generations"], "warmup": LONGER["expert_error_warmup"]}
+    return {"tables": tables, **longer}
 
 
 def draw(report: Mapping[str, Any]) -> Figure:
