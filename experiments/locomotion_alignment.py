@@ -283,6 +283,10 @@ def facts(report: Report) -> dict[str, Any]:
             environment: [name for name, x in pairs if x.low > 0.0]
             for environment, pairs in in_order.items()
         },
+        "missing": {
+            environment: [name for name in REGIMES if name not in of["area"]]
+            for environment, of in found.items()
+        },
         "earned": earned,
         "agree": {
             environment: {

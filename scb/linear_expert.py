@@ -71,8 +71,7 @@ class LinearSearchConfig:
         whose mean action lies there, and what bears them switches between the ends. The expert is
         tanh(reach * outputs), which is as steep where it switches.
       normalization: the power of their deviations that observations are divided by. With 1 all entries weigh the
-        same; with less, small ones weigh less, of which an agent that sees them as they are learns less, and
-        every agent alike.
+        same; with less, those that vary little weigh less, as they do for an agent that sees them as they are.
       constant: one action instead of a linear policy, each entry at an end of its range: what agents
         overshoot there they cannot get wrong.
     """

@@ -137,8 +137,8 @@ class WarmStartConfig(DatasetConfig):
       expert_reach: how far the policy of a linear search goes where it errs, in halves of the actions' range, before
         it is clipped to that. Above 1 a policy that bears errors comes to switch between the ends, beyond
         which they vanish.
-      expert_normalization: the power of their deviations that a linear search divides observations by. With
-        less than 1 its policy asks less of entries that vary little, of which PPO's agents learn less.
+      expert_normalization: the power of their deviations that a linear search divides observations by, from 1,
+        standardised, to 0, centred only. With less than 1 its policy asks less of entries that vary little.
       expert_pupils: agents of each algorithm of the inner loop that train in a bandit fitted to each policy
         which the linear search judges: the expert is then the one whose agents earn most on average. With 0
         it is the one that earns most itself, under its noise and errors.
@@ -172,10 +172,14 @@ class WarmStartConfig(DatasetConfig):
         one_of("expert", self.expert, ("auto", *SEARCHES, *ALGORITHMS))
         agents_at_least(0, self, "expert_pupils")
         agents_at_least(1, self, "num_experts", "aggregation_agents")
-        at_least(0, self, "expert_error_warmup", "expert_normalization", "aggregation_rounds")
+        at_least(0, self, "expert_error_warmup", "aggregation_rounds")
         at_least(1, self, "expert_generations", "expert_starts")
         at_least(1, self, "expert_episode_steps", "expert_reach", "fit_steps")
         positive(self, "expert_sigma", "expert_learning_rate", "expert_decay")
+        if not 0 <= self.expert_normalization <= 1:
+            raise UserError(
+                f"expert_normalization is {self.expert_normalization}: it must be between 0 and 1."
+            )
         if not self.aggregation_rounds:
             unused(
                 self, "there are no aggregation rounds", ("aggregation_agents",), "take at least 1"
@@ -209,6 +213,9 @@ def expert_agent(
     found = f"the expert of {name} is found by {algorithm}"
     if not linear:
         unused(config, f"{found}, which has no such setting", _OF_LINEAR_SEARCHES, "choose linear")
+    if algorithm == "constant":
+        sees_nothing = f"{found}, which observes nothing"
+        unused(config, sees_nothing, ("expert_normalization",), "choose linear")
     if algorithm in SEARCHES:
         search = SEARCHES[algorithm]
         if search.linear and isinstance(space, spaces.Discrete):

@@ -51,7 +51,7 @@ def normalize(
 ) -> jax.Array:
     """[..., O] -> [..., O] with mean 0 and variance 1, clipped to ten deviations; as it is before any observation.
 
-    With another power of the deviations to divide by than 1, an entry keeps the rest of its deviation, with 0 all.
+    Divided by deviation**power: a power of 1 standardises, one of 0 only centres; clipped at ten deviations either way.
     """
     variance = jnp.where(
         statistics.count > 0, statistics.squares / jnp.maximum(statistics.count, 1.0), 1.0

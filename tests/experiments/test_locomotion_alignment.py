@@ -162,6 +162,7 @@ def test_regimes_are_compared_over_the_objectives_that_all_have(tmp_path, enviro
     facts = module.facts(report)
     assert facts["earned"]["hopper"].keys() == EARNED.keys() - {"dpo"}
     assert facts["best"]["hopper"][2] == len(module.REGIMES)
+    assert facts["missing"] == {"hopper": []}
     del report["environments"]["hopper"]["Pendulum's"]["fitness"]["ppo"]
     assert module.facts(report)["best"] == {}  # two objectives rank nothing
 
@@ -171,6 +172,12 @@ def test_what_was_measured_of_a_bandit_that_was_replaced_is_measured_again(
 ):
     report, _ = run(tmp_path)
     before = len(trained)
+    assert "not measured yet" not in module.EXPERIMENT.page(report)
+    without = json.loads(json.dumps(report))
+    del without["environments"]["hopper"]["Pendulum's"]
+    assert "not measured yet with bandits that ship: Pendulum's.\n" in module.EXPERIMENT.page(
+        without
+    )
     report["environments"]["hopper"]["Pendulum's"]["sha256"] = "of another"
     (tmp_path / "report.json").write_text(json.dumps(report))
     again, _ = run(tmp_path)

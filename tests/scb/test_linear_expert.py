@@ -373,8 +373,8 @@ def test_a_warm_starts_settings_reach_the_search(monkeypatch):
             "expert_reach": 2.0,
             "expert_starts": 3,
             "expert_error_warmup": 9,
-            "expert_normalization": 0.5,
         },
+        {"expert": "linear", "expert_normalization": 0.5},
     ):
         find_expert(
             Place.named("Pendulum-v1"), jax.random.key(0), WarmStartConfig(**settings), quiet=True
@@ -392,9 +392,9 @@ def test_a_warm_starts_settings_reach_the_search(monkeypatch):
             error_warmup=9,
             starts=3,
             reach=2.0,
-            normalization=0.5,
             constant=True,
         ),
+        replace(plain, normalization=0.5),
     ]
 
 
@@ -448,6 +448,21 @@ def test_a_warm_starts_settings_reach_the_search(monkeypatch):
             "Pendulum-v1",
             {"expert": "td3", "expert_reach": 2.0},
             "expert_reach is 2.0, and the expert of Pendulum-v1 is found by td3, which has no such setting",
+        ),
+        (
+            "Pendulum-v1",
+            {"expert_normalization": 1.5},
+            "expert_normalization is 1.5: it must be between 0 and 1",
+        ),
+        (
+            "Pendulum-v1",
+            {"expert": "td3", "expert_normalization": 0.5},
+            "expert_normalization is 0.5, and the expert of Pendulum-v1 is found by td3, which has no such setting",
+        ),
+        (
+            "Pendulum-v1",
+            {"expert": "constant", "expert_normalization": 0.5},
+            "expert_normalization is 0.5, and .* by constant, which observes nothing: leave it out, or choose linear",
         ),
         (
             "CartPole-v1",
