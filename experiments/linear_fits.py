@@ -185,7 +185,7 @@ def facts(report: Report) -> dict[str, Any]:
 def draw(report: Mapping[str, Any]) -> Figure:
     """A row an environment, a panel an algorithm: each agent a dot, the estimate with its interval."""
     number = len(report["environments"])
-    figure = Figure(figsize=(8, 3.6 * number + 0.4))
+    figure = Figure(figsize=(9, 3.8 * number + 0.4))
     panels: Any = figure.subplots(number, 2, squeeze=False, sharey="row")
     for row, (environment, entry) in zip(panels, report["environments"].items(), strict=True):
         standing = environment_spec(environment).standing_still(BACKEND)
@@ -203,7 +203,11 @@ def draw(report: Mapping[str, Any]) -> Figure:
             if standing:
                 axes.axhline(standing, color=plotting.GREY, linestyle=":")
             names = _searched_for(entry)
-            axes.set_xticks(range(len(names)), [f"under\n{name}" for name in names])
+            axes.set_xticks(
+                range(len(names)),
+                [name.replace(", ", ",\n").replace("less ", "less\n") for name in names],
+            )
+            axes.set_xlabel("what the expert was found under")
             axes.set_title(f"{environment}: {algorithm.upper()}'s agents")
         row[0].set_ylabel("return in the environment")
     plotting.legend_of(
