@@ -11,6 +11,7 @@ command adds searches.
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache, partial
+from textwrap import fill
 from typing import Any
 
 import numpy as np
@@ -203,10 +204,7 @@ def draw(report: Mapping[str, Any]) -> Figure:
             if standing:
                 axes.axhline(standing, color=plotting.GREY, linestyle=":")
             names = _searched_for(entry)
-            axes.set_xticks(
-                range(len(names)),
-                [name.replace(", ", ",\n").replace("less ", "less\n") for name in names],
-            )
+            axes.set_xticks(range(len(names)), [fill(name, 12) for name in names])
             axes.set_xlabel("what the expert was found under")
             axes.set_title(f"{environment}: {algorithm.upper()}'s agents")
         row[0].set_ylabel("return in the environment")

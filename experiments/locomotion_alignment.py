@@ -284,8 +284,8 @@ def facts(report: Report) -> dict[str, Any]:
             for environment, pairs in in_order.items()
         },
         "missing": {
-            environment: [name for name in REGIMES if name not in of["area"]]
-            for environment, of in found.items()
+            environment: [name for name in REGIMES if name not in entry]
+            for environment, entry in report["environments"].items()
         },
         "earned": earned,
         "agree": {

@@ -42,16 +42,22 @@ def positive(of: object = None, *names: str, **values: float | None) -> None:
     _check(lambda value: 0 < value < math.inf, "positive", of, names, values)
 
 
+def fraction(of: object, *names: str) -> None:
+    """As `at_least`, where a value is not between 0 and 1."""
+    _check(lambda value: 0 <= value <= 1, "between 0 and 1", of, names, {}, bounded=True)
+
+
 def _check(
     holds: Callable[[float], bool],
     allowed: str,
     of: object,
     names: Iterable[str],
     values: Mapping[str, float | None],
+    bounded: bool = False,
 ) -> None:
     for name, value in numbers(of, *names, **values).items():
         if value is not None and not holds(value):
-            finite = ", and finite" if isinstance(value, float) else ""
+            finite = ", and finite" if isinstance(value, float) and not bounded else ""
             raise UserError(f"{called(of, name)} is {value}: it must be {allowed}{finite}.")
         if isinstance(value, int) and value >= 2**31 and name != "seed":
             raise UserError(f"{called(of, name)} is {value}: it must be {allowed}, and below 2^31.")

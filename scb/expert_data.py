@@ -11,7 +11,7 @@ from gymnax.environments import spaces
 from jax.tree_util import Partial
 
 from scb.aggregation import TRAJECTORIES, Visited, trajectory
-from scb.errors import UserError, at_least, one_of, positive, unused
+from scb.errors import at_least, fraction, one_of, positive, unused
 from scb.experts import Expert
 from scb.fitting import CONSTRUCTIONS, ExpertDataset, unchanging
 from scb.keys import named_key, split_key
@@ -69,8 +69,7 @@ class DatasetConfig:
         # Of the expert's alone there would be no reward to tell from another.
         at_least(2, self, "num_actions")
         positive(self, "stretch")
-        if not 0 <= self.discount <= 1:
-            raise UserError(f"discount is {self.discount}: it must be between 0 and 1.")
+        fraction(self, "discount")
         distance = self.construction == "action_distance"
         unused(
             self,

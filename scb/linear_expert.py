@@ -26,7 +26,7 @@ from scb.agents.networks import MLP
 from scb.agents.normalization import RunningStatistics, merge_statistics, normalize
 from scb.checkpoints import continued
 from scb.console import Progress, progress_console
-from scb.errors import UserError, at_least, positive
+from scb.errors import UserError, at_least, fraction, positive
 from scb.evaluation import Episodes, Policy, evaluate
 from scb.experts import EPISODES, Expert, judged
 from scb.keys import key_at, named_key, split_key
@@ -95,7 +95,8 @@ class LinearSearchConfig:
     def __post_init__(self) -> None:
         at_least(1, self, "generations", "starts", "directions", "best", "episode_steps")
         at_least(1, self, "judge_every", "reach")
-        at_least(0, self, "action_noise", "action_errors", "error_warmup", "normalization")
+        at_least(0, self, "action_noise", "action_errors", "error_warmup")
+        fraction(self, "normalization")
         positive(self, "sigma", "learning_rate", "decay")
         if self.starts > 1 and self.generations < 2:
             raise UserError(

@@ -28,7 +28,7 @@ from scb.console import progress_console
 from scb.curriculum import paper_curriculum
 from scb.environments.registry import environment_spec
 from scb.environments.synthetic import SyntheticBandit, Weights
-from scb.errors import UserError, agents_at_least, at_least, one_of, positive, unused
+from scb.errors import UserError, agents_at_least, at_least, fraction, one_of, positive, unused
 from scb.expert_data import DatasetConfig, expert_dataset, labelled
 from scb.experts import Expert, PolicySearchConfig, evolve_expert, train_expert
 from scb.fitting import fit_bandit
@@ -176,10 +176,7 @@ class WarmStartConfig(DatasetConfig):
         at_least(1, self, "expert_generations", "expert_starts")
         at_least(1, self, "expert_episode_steps", "expert_reach", "fit_steps")
         positive(self, "expert_sigma", "expert_learning_rate", "expert_decay")
-        if not 0 <= self.expert_normalization <= 1:
-            raise UserError(
-                f"expert_normalization is {self.expert_normalization}: it must be between 0 and 1."
-            )
+        fraction(self, "expert_normalization")
         if not self.aggregation_rounds:
             unused(
                 self, "there are no aggregation rounds", ("aggregation_agents",), "take at least 1"

@@ -81,7 +81,7 @@ def test_what_is_true_or_false_is_neither_text_nor_number(value):
     ],
 )
 def test_what_is_counted_is_a_whole_number(field, value, called):
-    with pytest.raises(UserError, match=rf"{called} is .*: it must be a whole number"):
+    with pytest.raises(UserError, match=rf"^{called} is .*: it must be a whole number"):
         EvolutionConfig(**{field: value})
 
 

@@ -180,7 +180,7 @@ def test_only_a_linear_bandit_is_refined():
     with pytest.raises(UserError, match="there are 1 refinement rounds, and only a linear"):
         DiscoveryConfig(refinement=once)
     DiscoveryConfig(bandit=LINEAR, refinement=once)
-    said = r"agents \(--refinement-agents\) is 4, and there are no refinement rounds"
+    said = r"^agents \(--refinement-agents\) is 4, and there are no refinement rounds"
     with pytest.raises(UserError, match=said):
         RefinementConfig(agents=4)
 
