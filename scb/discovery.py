@@ -206,16 +206,7 @@ class BanditDiscovery:
         else:
             weights, report = made()
             if path is not None and processes.first():
-                metadata = {
-                    "config": {
-                        "evaluation_environment": self.config.environment,
-                        "discovery": config_dict(self.config),
-                    },
-                    "seeds": {"discovery": self.config.evolution.seed},
-                    "results": {},
-                    "cost": report,
-                    "command": "scb discover (what its search starts from)",
-                }
+                metadata = self._metadata(report, "scb discover (what its search starts from)")
                 save_bandit(path, self.bandit, weights, metadata)
         self._starts[name], self.start_reports[name] = weights, report
         return weights
@@ -236,6 +227,10 @@ class BanditDiscovery:
         Args:
           command: that makes it again, or "python".
         """
+        found = outcome.cost(self, self.config.evolution, self.config.select == "best")
+        return self._metadata({**found, **self.start_reports}, command)
+
+    def _metadata(self, cost: Mapping[str, Any], command: str) -> dict[str, Any]:
         config = self.config
         return {
             "config": {
@@ -246,10 +241,7 @@ class BanditDiscovery:
             },
             "seeds": {"discovery": config.evolution.seed, "validation": VALIDATING.start},
             "results": {},
-            "cost": {
-                **outcome.cost(self, config.evolution, config.select == "best"),
-                **self.start_reports,
-            },
+            "cost": cost,
             "command": command,
         }
 
