@@ -45,7 +45,8 @@ class RefinementConfig:
       rounds: in each of which agents train in the bandit, and the linear search goes on under their errors. The
         round whose agents earn most is kept.
       generations: of the search in each round.
-      agents: of each algorithm of the inner loop, in every round and after the last.
+      agents: of each algorithm of the inner loop, in every round and after the last. A generation takes 32 of them,
+        in turn.
       visits: whether half of the contexts come to be where the agents went, in every round. It undoes what
         stretching and jittering the contexts did.
     """
@@ -191,7 +192,8 @@ class Refinement:
             population, state = ask(key_ask, state, params)
             mean = search.get_mean(state)
             # Both ways with the same agent from the same start state.
-            which = np.arange(DIRECTIONS) % len(learned[algorithm].returns)
+            turn = number // len(learned)
+            which = (turn * DIRECTIONS + np.arange(DIRECTIONS)) % len(learned[algorithm].returns)
             earned, lengths = self._programs[algorithm](
                 jax.tree.map(lambda x, m: x - m, population, mean),
                 np.tile(which, 2),

@@ -95,6 +95,23 @@ def test_algorithms_take_turns_and_a_pair_has_one_agent_and_one_start():
     assert len({keys.tobytes() for _, _, keys, _ in met}) == 3
 
 
+def test_more_agents_than_pairs_have_their_turns_in_other_generations():
+    bandit, met = bandit_of(CORRIDOR), {"ppo": [], "td3": []}
+
+    def recorder(name):
+        def program(changes, which, keys, mean, states, weights):
+            met[name].extend(which[:32])
+            return np.arange(64.0), np.full(64, 2)
+
+        return program
+
+    refine = Refinement(bandit, {}, CORRIDOR, generations=8)
+    refine._programs = {name: recorder(name) for name in met}
+    learned = {name: Learned(np.zeros(128), name, None, np.zeros(128, bool)) for name in met}
+    refine(bandit.init_weights(jax.random.key(0)), learned, jax.random.key(1))
+    assert all(sorted(agents) == list(range(128)) for agents in met.values())
+
+
 def test_pairs_are_ranked_by_their_difference_whoever_they_are_of():
     # Of three pairs the second is of an agent that earns a thousand times as much.
     ranks = paired_ranks(np.array([1.0, 3000.0, 2.0, 3.0, 2999.0, 7.0]))
