@@ -1,15 +1,18 @@
-"""How agents of PPO act that learned from a bandit: within the actions' range, or beyond its ends, where errors vanish.
+"""How agents of PPO err that learned from a bandit: alike or each in its own way, and where the clip takes errors away.
 
     python -m experiments saturation --published DIRECTORY
 
-PPO's Gaussian has a mean of any size, and the environment clips the action. Agents train in a bandit; in states that
-they visit in its environment, this takes the mean that each of them would act by, and asks how far agents are from
-each other before and after the clip, and how many directions what they all do has.
+Agents train in a bandit, and act in its environment: each for itself, then all as one, by the mean of their actions,
+which has what they err alike in and next to nothing of what is one agent's own; and the bandit's best action. PPO's
+Gaussian has a mean of any size, and the environment clips the action: in states that the agents visit, this takes the
+mean that each would act by, and asks how far agents are from each other before and after the clip, and how many
+directions what they all do has.
 """
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -23,23 +26,33 @@ from experiments.parts import InParts, Part
 from experiments.zoo_table import Candidate, bandits
 from experiments.zoo_table_page import BANDITS
 from scb import plotting
+from scb.agents.agent import Agent
 from scb.agents.spec import bandit_agent
 from scb.aggregation import Learners
+from scb.analysis.optimal_actions import optimal_policy
 from scb.environments.registry import environment_spec
 from scb.errors import at_least, one_of
+from scb.evaluation import evaluate
 from scb.importer import PUBLISHED_BANDITS
 from scb.keys import named_key, root_key
 from scb.measurement import Place
-from scb.statistics import estimate
+from scb.statistics import Estimate, estimate
 
 BACKEND = "generalized"
 SEED = 1  # nothing is chosen by it
 STATES = 2048
+EPISODES = 24  # of all agents as one, and of the bandit's best action
+ACTING = {
+    "returns": (plotting.BLUE, "each agent"),
+    "together": (plotting.ORANGE, "all as one"),
+    "best": (plotting.BLACK, "the bandit's best action"),
+}
 CLIPPING = {
     "apart": (plotting.VERMILLION, "what they would do"),
-    "clipped": (plotting.BLUE, "after the clip at the ends of the range"),
+    "clipped": (plotting.GREEN, "after the clip at the ends of the range"),
 }
 OF_AGENTS = ("beyond", "apart", "clipped", "returns")  # what a report has of every agent
+OF_EPISODES = ("together", "best")  # and of every episode
 
 
 @dataclass(frozen=True)
@@ -86,6 +99,27 @@ def spread(means: np.ndarray) -> dict[str, Any]:
     }
 
 
+def earned_together(
+    agent: Agent, states: Any, candidate: Candidate, place: Place, key: jax.Array
+) -> dict[str, np.ndarray]:
+    """[24] what agents of these states earn by the mean of their actions, and a bandit's best action, by episode."""
+    params = candidate.bandit.default_params
+
+    def all_as_one(observation: jax.Array, key: jax.Array) -> jax.Array:
+        def act(state: Any) -> jax.Array:
+            return agent.act(state, observation, key, params, mode=True)
+
+        return jax.vmap(act)(states).mean(axis=0)
+
+    policies = {"together": all_as_one, "best": optimal_policy(candidate.bandit)}
+    return {
+        name: np.asarray(
+            evaluate(place.env, place.params, policy, named_key(key, name), EPISODES).returns
+        )
+        for name, policy in policies.items()
+    }
+
+
 def measured(candidate: Candidate, options: Options) -> dict[str, Any]:
     """What agents earn, and how they act in states that they visit."""
     bandit, place = candidate.bandit, Place.named(candidate.environment, BACKEND)
@@ -108,8 +142,13 @@ def measured(candidate: Candidate, options: Options) -> dict[str, Any]:
     shares = (np.asarray(means(learned["ppo"].states)) - (low + high) / 2) / ((high - low) / 2)
     random = environment_spec(candidate.environment).random_return(BACKEND)
     returns, _ = finite(learned["ppo"].returns, random)
-    found = {**spread(shares), "returns": returns}
-    found |= {name: packed([found[name]])[0] for name in OF_AGENTS}
+    acting = jax.tree.map(lambda x: x[~learned["ppo"].failed], learned["ppo"].states)
+    found = {
+        **spread(shares),
+        **earned_together(agent, acting, candidate, place, key),
+        "returns": returns,
+    }
+    found |= {name: packed([found[name]])[0] for name in (*OF_AGENTS, *OF_EPISODES)}
     said = {"bandit": candidate.kind, "sha256": candidate.sha256, "actions": shares.shape[-1]}
     return {**said, **found}
 
@@ -127,36 +166,63 @@ def parts(options: Options, report: dict[str, Any]) -> Iterator[Part]:
 measure = InParts(parts)
 
 
+def way(each: Estimate, together: Estimate, best: Estimate) -> Estimate | None:
+    """How much of the way from what each earns to what the best action earns all come as one: 1 without shared errors.
+
+    The interval is the widest that the ends of the three give. None where the best action is not above each by more
+    than their intervals.
+    """
+    three = [
+        (x.low, x.high) for x in (each, together, best) if x.low is not None and x.high is not None
+    ]
+    if len(three) < 3 or three[2][0] <= three[0][1]:
+        return None
+
+    def share(each: float, together: float, best: float) -> float:
+        return (together - each) / (best - each)
+
+    ends = [share(*at) for at in product(*three)]
+    return Estimate(share(each.value, together.value, best.value), min(ends), max(ends), each.n)
+
+
 def facts(report: Report) -> dict[str, Any]:
-    """A row a bandit: estimates over its agents, and how far every agent is from all, before and after the clip."""
+    """A row a bandit: estimates over its agents or over episodes, of what they earn and of how far they are apart."""
     rows = []
     for environment, entry in report["environments"].items():
         for kind in (kind for kind in BANDITS if kind in entry):
-            of_agents = {name: unpacked([entry[kind][name]])[0] for name in OF_AGENTS}
-            estimates = {name: estimate(values) for name, values in of_agents.items()}
-            row = {"environment": environment, "kind": kind, **entry[kind], **estimates}
-            rows.append({**row, "of_agents": of_agents})
+            measured = (*OF_AGENTS, *OF_EPISODES)
+            dots = {name: unpacked([entry[kind][name]])[0] for name in measured}
+            estimates = {name: estimate(values) for name, values in dots.items()}
+            label = {"environment": environment, "kind": kind, "label": f"{environment}, {kind}"}
+            come = way(*(estimates[name] for name in ACTING))
+            rows.append({**label, **entry[kind], **estimates, "way": come, "dots": dots})
     return {"rows": rows}
 
 
 def draw(report: Mapping[str, Any]) -> Figure:
-    """A row a bandit: how far agents are apart before the clip and after it, with a dot an agent."""
+    """A row a bandit: what its agents earn, together too, and how far apart they are; a dot an agent or an episode."""
     rows = facts(report)["rows"]
-    figure = Figure(figsize=(7, 0.55 * len(rows) + 1.5))
-    axes = figure.subplots()
-    for place, row in enumerate(rows):
-        for of, (color, _) in CLIPPING.items():
-            plotting.estimate_row(axes, place, row["of_agents"][of], row[of], color)
-    axes.set_yticks(range(len(rows)), [f"{row['environment']}, {row['kind']}" for row in rows])
-    axes.set_ylim(len(rows) - 0.5, -0.5)
-    axes.set_xlim(0, None)
-    axes.set_xlabel("distance of an agent of PPO from all, in halves of the actions' range")
-    plotting.figure_title(figure, "How far agents that learned in one bandit are apart")
+    figure = Figure(figsize=(plotting.WIDTH, 0.7 * len(rows) + 1.8))
+    earned, apart = figure.subplots(1, 2)
+    for axes, shown in ((earned, ACTING), (apart, CLIPPING)):
+        for place, row in enumerate(rows):
+            for shift, (of, (color, _)) in enumerate(shown.items()):
+                at = place + (shift - (len(shown) - 1) / 2) * 0.22
+                plotting.estimate_row(axes, at, row["dots"][of], row[of], color)
+        axes.set_ylim(len(rows) - 0.5, -0.5)
+        axes.set_xlim(0, None)
+    earned.set_yticks(range(len(rows)), [row["label"] for row in rows])
+    apart.set_yticks(range(len(rows)), [])
+    earned.set_xlabel("return in the environment")
+    apart.set_xlabel("distance of an agent from all, in half ranges")
     looks = {
         label: {"color": color, "marker": "o", "linestyle": ""}
-        for color, label in CLIPPING.values()
+        for color, label in (ACTING | CLIPPING).values()
     }
-    plotting.legend_of(figure, looks, columns=2)
+    plotting.legend_of(figure, looks, columns=len(ACTING))
+    plotting.figure_title(
+        figure, "PPO's agents that learned in one bandit: errors alike, and each one's own"
+    )
     return figure
 
 

@@ -1,11 +1,18 @@
-"""How far agents are apart is taken before and after the clip, and the page says where the clip helps most."""
+"""What agents earn as one tells errors that all share from each one's own, of which the clip takes a part away."""
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from experiments import saturation
 from experiments.saturation import Options, bandits, spread
+from experiments.zoo_table import Candidate
+from scb.environments.zoo import load_bandit
 from scb.errors import UserError
+from scb.evaluation import evaluate
+from scb.keys import named_key, root_key
+from scb.measurement import Place
+from scb.statistics import Estimate
 
 
 def test_what_lies_beyond_an_end_is_the_same_action():
@@ -40,33 +47,90 @@ def test_a_bandit_of_ours_is_taken_where_there_is_one():
         bandits("ant", None)
 
 
-def entry(beyond, apart, clipped):
-    means = {"beyond": beyond, "apart": apart, "clipped": clipped}
-    of_agents = {
-        name: " ".join(str(x + d) for d in (-0.04, -0.01, 0.01, 0.04)) for name, x in means.items()
+def around(value, step):
+    return " ".join(str(round(value + d * step, 4)) for d in (-4, -1, 1, 4))
+
+
+def entry(beyond, apart, clipped, returns=250, together=250, best=250):
+    distances = {"beyond": beyond, "apart": apart, "clipped": clipped}
+    earned = {"returns": returns, "together": together, "best": best}
+    return {
+        **{name: around(value, 0.01) for name, value in distances.items()},
+        **{name: around(value, 10) for name, value in earned.items()},
+        "directions": 2.0,
+        "actions": 6,
     }
-    return {**of_agents, "directions": 2.0, "returns": "100 200 300 400", "actions": 6}
 
 
-def test_the_page_says_where_the_clip_takes_most():
+def test_the_page_tells_errors_of_all_from_an_agents_own():
     report = {
         "size": {"agents": 4, "episodes": 1},
         "environments": {
-            "hopper": {"ours": entry(0.2, 0.5, 0.4), "published": entry(0.4, 0.6, 0.4)},
-            "halfcheetah": {"published": entry(0.95, 0.7, 0.1)},
+            "hopper": {
+                "ours": entry(0.2, 0.5, 0.4, returns=250, together=500, best=510),
+                "published": entry(0.4, 0.6, 0.4, returns=250, together=240, best=500),
+            },
+            "halfcheetah": {"published": entry(0.95, 0.7, 0.1, 250, 400, 280)},
         },
     }
     page = saturation.EXPERIMENT.page(report)
-    assert "Furthest goes the published bandit of halfcheetah: 95 %" in page
     assert (
-        "| hopper, ours | 250 [" in page
-        and "| 0.20 [0.16, 0.24] | 0.50 [0.46, 0.54] | 0.40 [0.36, 0.44] | 2.0 of 6 |" in page
+        "**Mostly each in its own way in hopper, ours. Mostly alike in hopper, published.**" in page
     )
-    (axes,) = saturation.EXPERIMENT.figures(report)["saturation"].axes
-    labels = [label.get_text() for label in axes.get_yticklabels()]
+    assert "beyond an end: 95 % in halfcheetah, published." in page
+    assert (
+        "| hopper, ours | 250 [210, 290] | 500 [460, 540] | 510 [470, 550] | 0.96 [0.65, 1.39] | 0.20 [0.16, 0.24] | "
+        "0.50 [0.46, 0.54] | 0.40 [0.36, 0.44] | 2.0 of 6 |" in page
+    )
+    assert (
+        "| halfcheetah, published | 250 [210, 290] | 400 [360, 440] | 280 [240, 320] | the best is not above |"
+        in page
+    )
+    earned, apart = saturation.EXPERIMENT.figures(report)["saturation"].axes
+    labels = [label.get_text() for label in earned.get_yticklabels()]
     assert labels == ["hopper, ours", "hopper, published", "halfcheetah, published"]
-    low, high = axes.get_xlim()
-    assert low == 0 and high > 0.74  # the outermost agent
+    for axes, outermost in ((earned, 550), (apart, 0.74)):  # an agent or an episode
+        low, high = axes.get_xlim()
+        assert low == 0 and high > outermost
+
+
+def test_where_nothing_is_apart_nothing_is_said_of_it():
+    report = {
+        "size": {"agents": 4, "episodes": 1},
+        "environments": {"hopper": {"ours": entry(0.2, 0.5, 0.4)}},
+    }
+    page = saturation.EXPERIMENT.page(report)
+    assert "**In no bandit mostly each in its own way, as far as this shows.** All agents" in page
+
+
+def test_the_way_to_the_best_action_is_as_wide_as_its_parts():
+    each, together, best = (
+        Estimate(value, value - 10, value + 10, 8) for value in (100.0, 150.0, 200.0)
+    )
+    found = saturation.way(each, together, best)
+    assert found.value == 0.5 and found.n == 8
+    # From 110 to 140 of 210; from 110 to 160 of 190.
+    assert (found.low, found.high) == (pytest.approx(0.3), pytest.approx(0.7))
+    assert saturation.way(together, each, together) is None
+    assert saturation.way(each, together, best.without_interval()) is None
+
+
+class Pointing:
+    """An agent whose state is the action that it takes."""
+
+    def act(self, state, observation, key, env_params=None, mode=False):
+        return state
+
+
+def test_all_as_one_act_by_the_mean_of_their_actions():
+    place, bandit = Place.named("Pendulum-v1"), load_bandit("Synthetic-Pendulum-v1")
+    candidate = Candidate("Pendulum-v1", "ours", bandit, "")
+    pushes = jnp.array([[-2.0], [0.0], [1.0], [1.0]])  # of mean 0
+    earned = saturation.earned_together(Pointing(), pushes, candidate, place, root_key(0))
+    key = named_key(root_key(0), "together")
+    still = evaluate(place.env, place.params, lambda o, k: jnp.zeros(1), key, saturation.EPISODES)
+    np.testing.assert_allclose(earned["together"], still.returns, rtol=1e-3)
+    assert np.mean(earned["best"]) > -300 > np.mean(earned["together"])
 
 
 @pytest.mark.parametrize(
