@@ -26,6 +26,7 @@ from scb.environments.synthetic import SyntheticBandit, Weights
 from scb.errors import agents_at_least, at_least, unused
 from scb.evaluation import evaluate
 from scb.keys import key_at, split_key
+from scb.linear_expert import noisy
 from scb.measurement import Place
 from scb.population import map_population
 from scb.runs import Stopwatch
@@ -49,22 +50,25 @@ class RefinementConfig:
         in turn.
       visits: whether half of the contexts come to be where the agents went, in every round. It undoes what
         stretching and jittering the contexts did.
+      noise: standard deviation of Gaussian noise on the actions in the search, in half their range: for agents that
+        act by sampled ones.
     """
 
     rounds: Annotated[int, tyro.conf.arg(name="refinement-rounds")] = 0
     generations: Annotated[int, tyro.conf.arg(name="refinement-generations")] = 20
     agents: Annotated[int, tyro.conf.arg(name="refinement-agents")] = 16
     visits: Annotated[bool, tyro.conf.arg(name="refinement-visits")] = True
+    noise: Annotated[float, tyro.conf.arg(name="refinement-noise")] = 0.0
 
     def __post_init__(self) -> None:
-        at_least(0, self, "rounds")
+        at_least(0, self, "rounds", "noise")
         at_least(1, self, "generations")
         agents_at_least(1, self, "agents")
         if not self.rounds:
             unused(
                 self,
                 "there are no refinement rounds",
-                ("generations", "agents", "visits"),
+                ("generations", "agents", "visits", "noise"),
                 "take at least 1",
             )
 
@@ -91,7 +95,7 @@ def refined(
     """
     watch = Stopwatch()
     learners = Learners(bandit, specs, place, config.agents, EPISODES)
-    refine = Refinement(bandit, learners.agents, place, config.generations)
+    refine = Refinement(bandit, learners.agents, place, config.generations, config.noise)
 
     def improve(latest: Weights, learned: Mapping[str, Learned], key: jax.Array) -> Any:
         better, taken = refine(latest, learned, key)
@@ -131,13 +135,20 @@ class Refinement:
       agents: by algorithm, which trained in it.
       place: the environment.
       generations: of a round, which the algorithms have in turn.
+      noise: on the actions.
     """
 
     def __init__(
-        self, bandit: SyntheticBandit, agents: Mapping[str, Agent], place: Place, generations: int
+        self,
+        bandit: SyntheticBandit,
+        agents: Mapping[str, Agent],
+        place: Place,
+        generations: int,
+        noise: float = 0.0,
     ) -> None:
         self._generations = generations
         low, high = bandit.bounds
+        space = place.env.action_space(place.params)
 
         def program(agent: Agent) -> Any:
             def one(
@@ -149,13 +160,14 @@ class Refinement:
                     for w in (weights, moved(weights, jax.tree.map(jnp.add, start, change)))
                 )
 
-                def act(observation: jax.Array, key: jax.Array) -> jax.Array:
-                    seen = jnp.ravel(observation)
-                    action = agent.act(state, observation, key, place.params, mode=True)
+                def policy(seen: jax.Array) -> jax.Array:
+                    # The most likely action, which takes no key.
+                    action = agent.act(state, seen, key, place.params, mode=True)
                     share = learned.share(jnp.ravel(action))
                     share = jnp.clip(share + candidate.best(seen) - learned.best(seen), -1, 1)
-                    return jnp.reshape(learned.action(share), jnp.shape(action))
+                    return learned.action(share)
 
+                act = noisy(policy, space, noise)
                 episodes = evaluate(place.env, place.params, act, key, 1)
                 return episodes.returns[0], episodes.lengths[0]
 

@@ -224,7 +224,7 @@ EVERY_FLAG = """--preset=paper --environment=MountainCar-v0 --backend=spring --m
 --expert-error-warmup=4 --expert-starts=2 --expert-normalization=0.5
 --num-experts=3 --expert-steps=9 --expert-generations=8 --num-states=7
 --aggregation-rounds=2 --aggregation-agents=3
---refinement-rounds=1 --refinement-generations=2 --refinement-agents=4 --no-refinement-visits
+--refinement-rounds=1 --refinement-generations=2 --refinement-agents=4 --no-refinement-visits --refinement-noise=0.1
 --strategy=Open_ES --population-size=6 --generations=9 --sigma=0.2 --sigma-decay=0.9 --sigma-limit=0.1
 --learning-rate=0.3 --learning-rate-decay=0.8 --learning-rate-limit=0.2 --combine=ranks --averaging=6
 --mean-evaluations=5

@@ -95,6 +95,21 @@ def test_algorithms_take_turns_and_a_pair_has_one_agent_and_one_start():
     assert len({keys.tobytes() for _, _, keys, _ in met}) == 3
 
 
+@pytest.mark.parametrize("noise", [0.0, 0.2])
+def test_noise_is_a_share_of_half_the_actions_range(noise):
+    bandit = bandit_of(CORRIDOR)
+    weights = jax.tree.map(jnp.zeros_like, bandit.init_weights(jax.random.key(0)))
+    refine = Refinement(bandit, {"off": Off(bandit, weights)}, CORRIDOR, 1, noise)
+    same = {k: jnp.zeros_like(weights["reward"][k]) for k in ("kernel", "bias")}
+    changes = jax.tree.map(lambda x: jnp.zeros((64, *x.shape)), same)
+    keys, which = split_key(jax.random.key(1), 64), np.zeros(64, int)
+    returns, _ = refine._programs["off"](changes, which, keys, same, jnp.zeros((1, 1)), weights)
+    # The agent does 0.5, which is 1 from either target: a deviation e costs 2 e, to one side or the other, and e^2.
+    deviation = noise * 1.5
+    assert np.std(returns) == pytest.approx(np.sqrt(2) * 2 * deviation, rel=0.25)
+    assert np.mean(returns) == pytest.approx(-2 * deviation**2, abs=0.3 if noise else 1e-5)
+
+
 def test_more_agents_than_pairs_have_their_turns_in_other_generations():
     bandit, met = bandit_of(CORRIDOR), {"ppo": [], "td3": []}
 
@@ -148,8 +163,8 @@ def test_the_round_whose_agents_earn_most_is_kept(visits, bandit, monkeypatch):
             assert visits
             return Visited(None, 0.5 * np.ones((2, 3, 3)))
 
-    def moving(bandit, agents, place, generations):
-        assert generations == 6
+    def moving(bandit, agents, place, generations, noise):
+        assert (generations, noise) == (6, 0.3)
 
         def refine(weights, learned, key):
             kernel = weights["reward"]["kernel"] + 1.0
@@ -160,7 +175,7 @@ def test_the_round_whose_agents_earn_most_is_kept(visits, bandit, monkeypatch):
     monkeypatch.setattr(refinement, "Learners", Fake)
     monkeypatch.setattr(refinement, "Refinement", moving)
     start = bandit.init_weights(jax.random.key(0))
-    config = RefinementConfig(rounds=2, generations=6, agents=3, visits=visits)
+    config = RefinementConfig(rounds=2, generations=6, agents=3, visits=visits, noise=0.3)
     weights, report = refined(bandit, start, {}, PENDULUM, jax.random.key(1), config)
     assert (report["refinement"], report["refined_return"]) == (1, -3.0)
     jax.tree.map(np.testing.assert_array_equal, weights, seen[1])
