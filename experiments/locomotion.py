@@ -29,7 +29,8 @@ from lpo import figures
 from lpo.comparison import Comparison, LearningCurves, changed, compare, ppo_spec
 from lpo.full_size import REFERENCE, as_comparison, looked_at
 from lpo.objectives import CLIPS, learned_in, load_objective, zoo_names
-from scb.agents.spec import AgentSpec, check_value
+from scb.agents.spec import AgentSpec
+from scb.agents.values import check_value
 from scb.errors import at_least, unused
 from scb.files import plain
 from scb.rows import Rows

@@ -5,7 +5,8 @@ episodes, so that differences are paired. Final scores are interquartile means w
 intervals.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from types import MappingProxyType
@@ -18,9 +19,10 @@ from scb.agents.ppo import DIAGNOSIS
 from scb.agents.spec import AgentSpec, environment_agent
 from scb.environments.registry import environment_spec
 from scb.errors import UserError, one_of
-from scb.files import plain
+from scb.files import make_folder, plain
 from scb.measurement import MODE, SAMPLED, Place, as_random, measure
 from scb.rows import Rows, pivot
+from scb.runs import held
 from scb.statistics import DECIDING, Estimate, estimate, paired_difference
 
 if TYPE_CHECKING:
@@ -268,28 +270,31 @@ def compare(
       mode_actions: evaluate the most likely actions rather than sampled ones.
       diagnose: whether curves say also what an iteration does to the policy (`scb.PPO.diagnose`).
       rows: a .jsonl file in which results are kept, and found, so that they are not measured again; None for memory.
+        It is this process's meanwhile: jobs that run side by side have files of their own.
       tell: takes a line when some agents are done.
 
     Raises:
-      UserError: there are no objectives, or two bear one name, by which their results are told apart.
+      UserError: there are no objectives, or two bear one name, by which their results are told apart; another process
+        measures into the same file.
     """
     loaded = load_apart(objectives)
     if not loaded:
         raise UserError("no objectives: give at least one, such as ppo.")
     spec = spec or ppo_spec(environment)
     place = Place.named(environment, backend)
-    found = measure(
-        spec,
-        place,
-        agents=seeds,
-        objectives=loaded,
-        points=points,
-        episodes=episodes,
-        actions=(MODE if mode_actions else SAMPLED,),
-        diagnose=diagnose,
-        rows=Rows(rows) if isinstance(rows, str | Path) else rows,
-        tell=tell,
-    )
+    with _kept(rows) as kept:
+        found = measure(
+            spec,
+            place,
+            agents=seeds,
+            objectives=loaded,
+            points=points,
+            episodes=episodes,
+            actions=(MODE if mode_actions else SAMPLED,),
+            diagnose=diagnose,
+            rows=kept,
+            tell=tell,
+        )
     steps = np.asarray(list(dict.fromkeys(row["step"] for row in found)))
     other = changed(spec, environment)
     columns = ("return", "length", "speed", *(DIAGNOSIS if diagnose else ()))
@@ -315,6 +320,18 @@ def compare(
             for i, objective in enumerate(loaded)
         ]
     )
+
+
+@contextmanager
+def _kept(rows: str | Path | Rows | None) -> Iterator[Rows | None]:
+    """Within it a file of rows is this process's: two would each drop what the other has added."""
+    if not isinstance(rows, str | Path):
+        yield rows
+        return
+    file = Path(rows)
+    make_folder(file.parent, "rows")
+    with held(file):
+        yield Rows(file)
 
 
 def learning_curves(

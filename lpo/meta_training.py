@@ -25,7 +25,7 @@ from scb.command_line import GENERATIONS
 from scb.configurations import config_dict, with_defaults
 from scb.environments.registry import environment_spec
 from scb.environments.zoo import digests
-from scb.errors import UserError
+from scb.errors import UserError, of_class
 from scb.evolution import EnvironmentSteps, EvolutionConfig, Outcome, evolve
 from scb.keys import root_key, split_key
 from scb.runs import Run, run_of
@@ -128,6 +128,7 @@ def meta_train(
     Raises:
       UserError: the folder holds something else, or a run of another configuration.
     """
+    of_class(MetaTrainingConfig, config=config)
     problem = MetaTraining(config)  # a mistake must not leave a folder behind
     with run_of(run, config, config.checksums(), GENERATIONS) as opened:
         return evolve(problem, config.evolution, opened, quiet)

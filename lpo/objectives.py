@@ -1,7 +1,7 @@
 """Objectives by name or file: PPO's clip, DPO, no drift, the learned ones of the zoo, and formulas."""
 
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
@@ -130,6 +130,7 @@ def load_objective(name: Named) -> Objective:
         return closed_form(name.name, name)
     if callable(name) and not isinstance(name, type):
         surrogate = SurrogateDrift(name)
+        surrogate.check_slope()
         return closed_form(surrogate.called, surrogate)
     if not isinstance(name, str | Path):
         raise UserError(
@@ -182,6 +183,10 @@ def load_apart(names: Iterable[Named] | Mapping[str, Named]) -> list[Objective]:
     """
     if isinstance(names, str | Path | Objective | Drift) or callable(names):
         raise UserError("the objectives are a single one: give a list of them.")
+    if isinstance(names, Set):
+        raise UserError(
+            "the objectives are a set, which has no order: give a list, with whose first the others are compared."
+        )
     if isinstance(names, Mapping):
         return [replace(load_objective(of), name=name) for name, of in names.items()]
     names = list(names)

@@ -34,7 +34,7 @@ from scb.environments.registry import environment_spec
 from scb.environments.synthetic import SyntheticBandit, Weights
 from scb.environments.synthetic_mdp import synthetic_for
 from scb.environments.zoo import bandit_metadata, load_bandit, save_bandit
-from scb.errors import UserError, one_of
+from scb.errors import UserError, of_class, one_of
 from scb.evaluation import evaluate
 from scb.evolution import EnvironmentSteps, Outcome, evolve
 from scb.fitting import standardize_reward
@@ -406,6 +406,7 @@ def discover(
     Raises:
       UserError: the folder holds something else, or a run of another configuration.
     """
+    of_class(DiscoveryConfig, config=config)
     problem = BanditDiscovery(config)  # a mistake must not leave a folder behind
     with run_of(run, config, config.checksums(), config.growing) as opened:
         return problem, problem.search(opened, quiet)

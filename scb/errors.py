@@ -26,6 +26,14 @@ def at_least(minimum: int, of: object = None, *names: str, **values: float | Non
     _check(lambda value: minimum <= value < math.inf, allowed, of, names, values)
 
 
+def count_at_least(minimum: int, **values: int | None) -> None:
+    """As `at_least`, and a UserError for what is no whole number."""
+    for name, value in values.items():
+        if value is not None and not hasattr(value, "__index__"):
+            raise UserError(f"{name} is {value!r}: it must be a whole number.")
+    at_least(minimum, **values)
+
+
 def agents_at_least(minimum: int, of: object, *names: str) -> None:
     """As `at_least` of numbers of agents; a UserError also where they are more than are made at once."""
     at_least(minimum, of, *names)
@@ -96,11 +104,22 @@ def _counted(of: Any) -> set[str]:
 def of_classes(of: Any, **wanted: Any) -> None:
     """Raises a UserError where an attribute is not of its class, or union of classes, as None is where that has it."""
     for name, classes in wanted.items():
-        if not isinstance(given := getattr(of, name), classes):
-            kinds = [x.__name__.replace("NoneType", "None") for x in get_args(classes) or [classes]]
+        of_class(classes, **{name: getattr(of, name)})
+
+
+def of_class(classes: Any, **values: Any) -> None:
+    """As `of_classes`, of values."""
+    for name, given in values.items():
+        if isinstance(given, classes):
+            continue
+        if isinstance(given, type):
             raise UserError(
-                f"{name} is of the class {type(given).__name__}: it must be of {' or '.join(kinds)}."
+                f"{name} is the class {given.__name__} itself: make one, {given.__name__}(...)."
             )
+        kinds = [x.__name__.replace("NoneType", "None") for x in get_args(classes) or [classes]]
+        raise UserError(
+            f"{name} is of the class {type(given).__name__}: it must be of {' or '.join(kinds)}."
+        )
 
 
 def first_line(error: Exception) -> str:

@@ -12,7 +12,14 @@ import numpy as np
 
 from scb.errors import UserError
 
-_REFUSED = (errno.ENOENT, errno.EACCES, errno.EPERM, errno.ENOTDIR)
+_REFUSED = (
+    errno.ENOENT,
+    errno.EACCES,
+    errno.EPERM,
+    errno.ENOTDIR,
+    errno.EEXIST,
+    errno.EROFS,
+)
 
 
 def make_folder(folder: Path, flag: str = "--out") -> None:

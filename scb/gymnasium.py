@@ -16,7 +16,7 @@ from gymnasium.vector.utils import batch_space
 
 from scb.environments.in_numpy import InNumpy
 from scb.environments.zoo import load_synthetic, space_description, zoo_names
-from scb.errors import UserError, at_least, one_of
+from scb.errors import UserError, count_at_least, one_of
 
 NAMESPACE = "scb"
 _BLOCK = 256  # first observations that are drawn together, which costs hardly more than one
@@ -161,7 +161,7 @@ class SyntheticVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         render_mode: None = None,
     ) -> None:
         _check_shown(render_mode)
-        at_least(1, num_envs=num_envs)
+        count_at_least(1, num_envs=num_envs)
         mode = autoreset_mode.value if isinstance(autoreset_mode, AutoresetMode) else autoreset_mode
         one_of("autoreset mode", mode, [x.value for x in AutoresetMode])
         self._mode, self.num_envs = AutoresetMode(mode), num_envs
@@ -180,7 +180,7 @@ class SyntheticVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         """Begins new episodes; of `options`, "reset_mask" [num_envs] says where, all being left out.
 
         Raises:
-          UserError: a seed for each, where all draw from one generator.
+          UserError: a seed for each, where all draw from one generator; a mask of another shape or type.
         """
         given: object = seed
         if isinstance(given, list | tuple | np.ndarray):
@@ -190,8 +190,13 @@ class SyntheticVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             )
         super().reset(seed=seed)
         self._begun = True
-        mask = (options or {}).get("reset_mask")
-        self._begin(np.ones(self.num_envs, bool) if mask is None else np.asarray(mask, bool))
+        mask = np.asarray((options or {}).get("reset_mask", np.ones(self.num_envs, bool)))
+        if mask.shape != (self.num_envs,) or mask.dtype != bool:
+            raise UserError(
+                f"the reset_mask has the shape {mask.shape} and the type {mask.dtype}: give a bool for each of the "
+                f"{self.num_envs} environments."
+            )
+        self._begin(mask)
         return self._observations.copy(), {}
 
     def step(

@@ -21,7 +21,7 @@ from jax.typing import ArrayLike
 from scb.agents.agent import Agent, evaluated_after
 from scb.agents.spec import AgentSpec
 from scb.environments.registry import environment_spec
-from scb.errors import UserError, at_least, one_of
+from scb.errors import UserError, count_at_least, one_of
 from scb.evaluation import Episodes
 from scb.files import plain
 from scb.keys import root_key, split_key
@@ -256,7 +256,7 @@ def measure(
             f"the spec is of the class {type(given).__name__}: give what scb.environment_agent returns, with_values of "
             "yours."
         )
-    at_least(1, points=points, episodes=episodes, side_by_side=side_by_side)
+    count_at_least(1, points=points, episodes=episodes, side_by_side=side_by_side)
     actions = (actions,) if isinstance(actions, str) else actions
     for kind in actions:
         one_of("kind of actions", kind, (MODE, SAMPLED))

@@ -77,7 +77,10 @@ class Rows:
         return self.path.with_suffix(".json")
 
     def cell(self, columns: Mapping[str, Any], configuration: Any, number: int) -> "Cell":
-        """What is there of agents with these columns, each of `number` rows; a part of an agent is dropped."""
+        """What is there of agents with these columns, each of `number` rows; a part of an agent is dropped.
+
+        Of what was measured twice, as by two processes that had one file, the first is kept.
+        """
         described = json.loads(json.dumps(configuration, default=_description, sort_keys=True))
         digest = hashlib.sha256(json.dumps(described, sort_keys=True).encode()).hexdigest()[:12]
         there = [row for row in self.rows if all(row[n] == x for n, x in columns.items())]
@@ -104,8 +107,13 @@ class Rows:
         done: dict[tuple[int, int], list[Row]] = {}
         for row in there:
             done.setdefault((row["seed"], row["agent"]), []).append(row)
-        if parts := [name for name, of_it in done.items() if len(of_it) != number]:
-            dropped = {id(row) for name in parts for row in done.pop(name)}
+        if other := {name: of_it for name, of_it in done.items() if len(of_it) != number}:
+            dropped = set()
+            for name, of_it in other.items():
+                whole = len(of_it) % number == 0
+                done[name] = of_it[:number] if whole else []
+                dropped |= {id(row) for row in of_it[len(done[name]) :]}
+            done = {name: of_it for name, of_it in done.items() if of_it}
             self.rows = [row for row in self.rows if id(row) not in dropped]
             self._write()
         return Cell(self, {**columns}, digest, done)

@@ -29,7 +29,7 @@ from tensorboardX.summary import scalar
 
 from scb import termination
 from scb.configurations import as_if_shorter, config_dict, first_difference, with_defaults
-from scb.errors import UserError
+from scb.errors import UserError, of_class
 from scb.files import cannot_write, make_folder, plain, refusing, write_json, write_text
 from scb.machine import machine_description
 
@@ -295,9 +295,12 @@ def _lock(path: Path, of: Path) -> None:
         ) from error
     except OSError:
         pass  # a file system without locks
-    file.truncate(0)
-    file.write(f"process {os.getpid()} on {socket.gethostname()}\n")
-    file.flush()
+    try:
+        file.truncate(0)
+        file.write(f"process {os.getpid()} on {socket.gethostname()}\n")
+        file.flush()
+    except OSError as error:  # the disk is full
+        raise cannot_write(path.parent, reason=error.strerror) from error
     _held[path.resolve()] = file
 
 
@@ -329,6 +332,7 @@ def run_of(
     Raises:
       UserError: as `Run.open`, also where the folder holds another run.
     """
+    of_class(Run | str | Path | None, run=folder)
     if folder is None or isinstance(folder, Run):
         yield folder
         return

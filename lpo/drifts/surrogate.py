@@ -62,12 +62,48 @@ class SurrogateDrift(Drift):
         by_name = (x for x in parameters if x.kind in (x.POSITIONAL_OR_KEYWORD, x.KEYWORD_ONLY))
         return [x.name for x in by_name if x.default is x.empty or x.name in ARGUMENTS]
 
+    def _refused(self, error: Exception, xp: Any) -> UserError:
+        where, advice = {
+            "jax.numpy": ("in JAX", "use xp.where in place of if, and xp in place of numpy"),
+            "numpy": ("with NumPy", "use xp.where in place of if"),
+            "torch": ("with PyTorch", "its minimum takes tensors alone: use xp.clip with numbers"),
+        }[xp.__name__]
+        if "xp" not in self._takes:
+            advice = "let it take xp, and call xp.minimum and the like"
+        said = first_line(error).rstrip(".")
+        return UserError(
+            f"the surrogate {self.called} does not compute {where} ({said}): {advice}."
+        )
+
     @property
     def temporal(self) -> bool:
         return "progress" in self._takes
 
     def init(self, key: jax.Array, scale: float = 1.0) -> jax.Array:
         return jnp.zeros(())
+
+    def check_slope(self) -> None:
+        """Raises a UserError where it does not rise with the ratio, at 1, for a positive advantage, as a loss does not.
+
+        It also falls for a negative one where it is what PPO maximises.
+        """
+
+        def surrogate(log_ratio: jax.Array, advantage: jax.Array, progress: jax.Array) -> jax.Array:
+            penalty = self(jnp.zeros(()), log_ratio[None], advantage[None], progress[None])
+            return (jnp.exp(log_ratio) * advantage - penalty)[0]
+
+        slope = jax.jit(jax.grad(surrogate))  # traced, as in a training
+        slopes = [float(slope(0.0, advantage, 0.0)) for advantage in (1.0, -1.0)]
+        if slopes[0] < 0 < slopes[1]:
+            raise UserError(
+                f"the surrogate {self.called} falls with the ratio where the advantage is positive, as a loss does: "
+                "return its negative, which PPO maximises."
+            )
+        if slopes == [0.0, 0.0]:
+            raise UserError(
+                f"the surrogate {self.called} does not change with the ratio where that is 1, and agents would learn "
+                "nothing: let it take ratio, or log_ratio, and compute with it."
+            )
 
     def __call__(
         self, parameters: Any, log_ratio: Array, advantage: Array, progress: Array, xp: Any = jnp
@@ -77,13 +113,8 @@ class SurrogateDrift(Drift):
         given = dict(zip(ARGUMENTS, values, strict=True))
         try:
             surrogate = self.function(**{name: given[name] for name in self._takes})
-        except TypeError as error:
-            if xp.__name__ != "torch" or "xp" in self._takes:
-                raise
-            raise UserError(
-                f"the surrogate {self.called} does not compute with PyTorch ({first_line(error)}): let it take "
-                "xp, and call xp.minimum and the like."
-            ) from error
+        except (TypeError, ValueError, RuntimeError) as error:
+            raise self._refused(error, xp) from error
         if getattr(surrogate, "shape", None) != log_ratio.shape:
             raise UserError(
                 f"the surrogate {self.called} returns the shape {getattr(surrogate, 'shape', surrogate)} for "

@@ -19,7 +19,8 @@ from jax.typing import ArrayLike
 
 from scb.agents import networks
 from scb.agents.normalization import normalize
-from scb.errors import UserError, at_least, one_of
+from scb.agents.values import check_values
+from scb.errors import UserError, at_least, count_at_least, one_of
 from scb.evaluation import Episodes, evaluate
 from scb.keys import split_key
 from scb.spaces import clip_to_space, flat_size, shapes
@@ -114,9 +115,14 @@ def _check_params(env: environment.Environment[Any, Any], params: Any) -> None:
         return
     # One of somebody's own may come with parameters of a class that it does not name.
     if wanted is not environment.EnvParams and not isinstance(params, wanted):
+        given = type(params)
+        # gymnax calls those of every environment EnvParams.
+        where = [
+            f"{x.__module__}." if given.__name__ == wanted.__name__ else "" for x in (given, wanted)
+        ]
         raise UserError(
-            f"the environment's parameters are of the class {type(params).__name__}, and those of {env.name} of "
-            f"{wanted.__name__}: give the second of scb.make(NAME), of the same environment."
+            f"the environment's parameters are of the class {where[0]}{given.__name__}, and those of {env.name} of "
+            f"{where[1]}{wanted.__name__}: give the second of scb.make(NAME), of the same environment."
         )
 
 
@@ -143,12 +149,16 @@ class Agent(ABC):
             )
 
     def check_inputs(self, hyperparameters: Any, env_params: Any) -> None:
-        """Raises a UserError for hyperparameters of another algorithm, or parameters of another environment."""
+        """Raises a UserError for hyperparameters of another algorithm, or with values that an agent cannot take.
+
+        So do parameters of another environment.
+        """
         if not isinstance(hyperparameters, self.takes):
             raise UserError(
                 f"the hyperparameters are of the class {type(hyperparameters).__name__}: give (key, "
                 f"{self.takes.__name__}, the environment's parameters), in this order."
             )
+        check_values(hyperparameters)
         _check_params(self.env, env_params)
 
     @property
@@ -277,7 +287,7 @@ class Agent(ABC):
         """
         env = self.env if env is None else env
         _check_environment(env)
-        at_least(1, num_episodes=num_episodes)
+        count_at_least(1, num_episodes=num_episodes)
         env_params = env.default_params if env_params is None else env_params
         _check_params(env, env_params)
         own_params = env_params

@@ -220,11 +220,13 @@ class PPO(Agent):
         one = jnp.zeros(1)
         try:
             penalty = jax.eval_shape(self.drift, parameters, one, one, one)
+        except UserError:  # a drift's own sentence
+            raise
         except Exception as error:  # what a drift raises for parameters of another kind is its own
             raise UserError(
                 "the agent's drift cannot take the hyperparameters' drift: of an objective give objective.drift to the "
                 "agent, and objective.parameters as the hyperparameters' drift; one of your own takes (parameters, "
-                f"log_ratio [B], advantage [B], progress [B]), and says here: {first_line(error)}."
+                f"log_ratio [B], advantage [B], progress [B]), and says here: {first_line(error).rstrip('.')}."
             ) from error
         if getattr(penalty, "shape", None) != one.shape:
             raise UserError(

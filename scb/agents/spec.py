@@ -15,24 +15,13 @@ from gymnax.environments import spaces
 
 from scb.agents.agent import Agent
 from scb.agents.tables import ACTIVATIONS, TABLES, Lists, Setting, Tables, Values
+from scb.agents.values import check_value, check_values
 from scb.curriculum import with_limit
 from scb.environments.registry import environment_spec
 from scb.errors import UserError, at_least, one_of
 from scb.keys import split_key
 from scb.spaces import kind_of_actions
 
-# Of 32 bits, which is what an agent calculates with.
-_LARGEST = float(jnp.finfo(jnp.float32).max)
-# What is a factor or a share, of which more than 1 makes no sense.
-_SHARES = (
-    "discount",
-    "gae_lambda",
-    "polyak",
-    "epsilon_start",
-    "epsilon_end",
-    "epsilon_decay",
-    "target_entropy_ratio",
-)
 # {name: its tables, with the algorithm itself}. In the order that lists and pages name them in.
 ALGORITHMS: dict[str, Tables] = {tables.algorithm.name: tables for tables in TABLES}
 
@@ -122,13 +111,11 @@ class AgentSpec:
                 )
             if name in traced and isinstance(value, int | float | str):
                 check_value(name, value)
-        return replace(
-            self,
-            config=configured(self.config, {k: v for k, v in values.items() if k in static}),
-            hyperparameters=replace(
-                self.hyperparameters, **{k: v for k, v in values.items() if k in traced}
-            ),
-        )
+        config = configured(self.config, {k: v for k, v in values.items() if k in static})
+        changed = {k: v for k, v in values.items() if k in traced}
+        hyperparameters = replace(self.hyperparameters, **changed)
+        check_values(hyperparameters)
+        return replace(self, config=config, hyperparameters=hyperparameters)
 
     def with_steps(self, steps: int | None) -> "AgentSpec":
         """Trained for another number of environment steps; as it is where that is None."""
@@ -268,18 +255,6 @@ def check_lists(lists: Lists, hyperparameters: Any) -> None:
             )
         for value in values:
             check_value(name, value)
-
-
-def check_value(name: str, value: Any) -> None:
-    """Raises a UserError for a value that the hyperparameter cannot have."""
-    number = isinstance(value, int | float) and not isinstance(value, bool)
-    if not number or not abs(value) <= _LARGEST:
-        raise UserError(
-            f"{name} has the value {value!r}, which is no number that an agent can take: give finite numbers only."
-        )
-    if value < 0 or (name in _SHARES and value > 1):
-        allowed = "between 0 and 1" if name in _SHARES else "0 or larger"
-        raise UserError(f"{name} has the value {value!r}: it must be {allowed}.")
 
 
 @cache

@@ -6,6 +6,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from gymnax.environments import environment, spaces
 
 from scb import own
@@ -110,20 +111,50 @@ def _check(name: str, env: environment.Environment[Any, Any], params: Any) -> No
             raise wrong(
                 f"returns a terminated of the type {jnp.result_type(inner[3])} from step_env: return a bool"
             )
+        check_same("state", state, inner[1])
+        # Of arrays of other shapes its space says more.
+        if len({getattr(x, "shape", None) for x in (observation, inner[0])} - {None}) < 2:
+            check_same("observation", observation, inner[0])
+        times = (0, 1)
+        # But for an environment that says itself when time is up.
+        if type(env).is_truncated is environment.Environment.is_truncated:
+            if not hasattr(state, "time"):
+                raise wrong(
+                    "has a state without time, the steps of its episode: give it that field, 0 after reset_env and one "
+                    "more after each step_env"
+                )
+            times = (state.time, inner[1].time)
         step = env.step(key, state, action, params)
         check_values("step", step, "observation, state, reward, terminated, truncated, info")
-        return observation, step
+        return observation, step, times
+
+    def check_same(what: str, begun: Any, stepped: Any) -> None:
+        one, other = (
+            {
+                jax.tree_util.keystr(path): f"{jnp.result_type(x)}{list(jnp.shape(x))}"
+                for path, x in jax.tree.leaves_with_path(tree)
+            }
+            for tree in (begun, stepped)
+        )
+        for name in {**one, **other}:
+            begins, goes_on = (of.get(name, "something else") for of in (one, other))
+            if begins != goes_on:
+                called = f"whose {name.lstrip('.')} is" if name else "that is"
+                raise wrong(
+                    f"returns an {what} {called} {begins} from reset_env and {goes_on} from step_env: let them agree"
+                )
 
     try:
-        first, step = jax.eval_shape(first_step, root_key(0))
+        first, step, _ = jax.eval_shape(first_step, root_key(0))
+        observed, _, times = jax.jit(first_step)(root_key(0))
     except NotImplementedError as error:
         raise wrong(
             "lacks reset_env or step_env, which gymnax's own reset and step call: define these two"
         ) from error
-    except jax.errors.ConcretizationTypeError as error:
+    except (jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError) as error:
         raise wrong(
             f"asks for a value where JAX only has a shape ({first_line(error)}): write reset_env and step_env with "
-            "jnp.where or jax.lax.cond in place of if"
+            "jnp.where or jax.lax.cond in place of if, and with jnp in place of numpy"
         ) from error
     for when, observation in {"reset": first, "step": step[0]}.items():
         shape = getattr(observation, "shape", type(observation).__name__)
@@ -135,4 +166,13 @@ def _check(name: str, env: environment.Environment[Any, Any], params: Any) -> No
     if step[2].shape != ():
         raise wrong(
             f"returns rewards of shape {step[2].shape}, where one number is expected: sum or average them"
+        )
+    if int(times[1]) != int(times[0]) + 1:
+        raise wrong(
+            f"has a state whose time is {int(times[0])} after reset_env and {int(times[1])} after step_env, by which "
+            "episodes are cut at max_steps_in_episode: count a step for each"
+        )
+    if not np.isfinite(observed).all():
+        raise wrong(
+            "returns an observation from reset that is no number: its agents would learn nothing"
         )

@@ -1,6 +1,8 @@
 """Comparing objectives: the same seeds for all, and numbers that can be redone by hand."""
 
 import json
+import subprocess
+import sys
 from dataclasses import replace
 
 import jax
@@ -259,3 +261,29 @@ def test_a_comparison_keeps_its_rows_in_a_file(tmp_path, tiny_agent):
     assert file.read_bytes() == kept
     with pytest.raises(UserError, match=r"are kept in a \.jsonl file"):
         compare("Synthetic-Pendulum-v1", ["ppo"], [0], spec, rows=tmp_path / "rows.json")
+
+
+def test_a_file_of_rows_is_one_process_es(tmp_path, tiny_agent):
+    spec = AgentSpec("ppo", tiny_agent, PPOHyperparameters())
+    file = tmp_path / "new" / "rows.jsonl"
+    compare("Synthetic-Pendulum-v1", ["ppo"], [0, 1], spec, points=1, rows=file)
+    once = file.read_text()
+    assert [path.name for path in sorted(file.parent.iterdir())] == ["rows.json", "rows.jsonl"]
+    program = (
+        "import sys, time; from pathlib import Path; from scb.runs import held\n"
+        "with held(Path(sys.argv[1])): print('held', flush=True); time.sleep(60)"
+    )
+    other = subprocess.Popen(
+        [sys.executable, "-c", program, str(file)], stdout=subprocess.PIPE, text=True
+    )
+    try:
+        assert other.stdout.readline() == "held\n"
+        with pytest.raises(UserError, match=r"rows\.jsonl is in use by another command \(process"):
+            compare("Synthetic-Pendulum-v1", ["ppo"], [2], spec, points=1, rows=file)
+    finally:
+        other.kill()
+        other.wait()
+    # What two processes measured that had one file is kept once.
+    file.write_text(once + once)
+    compare("Synthetic-Pendulum-v1", ["ppo"], [0, 1], spec, points=1, rows=file)
+    assert file.read_text() == once

@@ -134,6 +134,54 @@ def test_functions_that_are_none(function, message):
         lpo.drift_function(function)(LOG_RATIO, ADVANTAGE)
 
 
+@pytest.mark.parametrize(
+    ("function", "message"),
+    [
+        (
+            lambda ratio, advantage: -ratio * advantage,
+            "falls with the ratio where .*, as a loss do",
+        ),
+        (lambda ratio, advantage, xp: xp.maximum(-ratio * advantage, -advantage), "as a loss does"),
+        (lambda advantage: advantage, "does not change with the ratio where that is 1"),
+    ],
+)
+def test_what_would_teach_nothing_or_the_opposite_is_refused(function, message):
+    with pytest.raises(UserError, match=message):
+        load_objective(function)
+
+
+def branching(ratio, advantage, progress, xp):
+    return ratio * advantage if progress > 0.5 else 0.5 * ratio * advantage
+
+
+@pytest.mark.parametrize(
+    ("function", "message"),
+    [
+        (
+            branching,
+            r"surrogate branching does not compute in JAX \(.*\): use xp.where in place of",
+        ),
+        (
+            lambda ratio, advantage: np.minimum(ratio, 1.2) * advantage,
+            r"does not compute in JAX \(.*[^.]\): let it take xp, and call xp.minimum and the like",
+        ),
+    ],
+)
+def test_what_jax_cannot_trace_is_told_of_the_function(function, message):
+    with pytest.raises(UserError, match=message):
+        load_objective(function)
+
+
+def test_what_one_library_cannot_compute_is_told_of_the_function():
+    drift = SurrogateDrift(branching)
+    with pytest.raises(UserError, match=r"branching does not compute with NumPy .*: use xp.where"):
+        drift(None, LOG_RATIO, ADVANTAGE, np.zeros(len(LOG_RATIO)), np)
+    torch = pytest.importorskip("torch")
+    tight = load_objective(lambda ratio, advantage, xp: advantage * xp.minimum(ratio, 1.2))
+    with pytest.raises(UserError, match=r"with PyTorch .*: its minimum takes tensors alone: use"):
+        lpo.torch_drift(tight)(torch.as_tensor(LOG_RATIO), torch.as_tensor(ADVANTAGE))
+
+
 def test_it_may_depend_on_the_fraction_of_training_done():
     def fading(ratio, advantage, progress):
         return ratio * advantage - progress * (ratio - 1) ** 2

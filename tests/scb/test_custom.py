@@ -18,7 +18,7 @@ from scb.measurement import Place, as_random
 from scb.own import code_of, code_of_names
 
 MODULE = """
-import gymnax, jax.numpy as jnp
+import gymnax, jax.numpy as jnp, numpy as np
 from flax import struct
 from gymnax.environments import environment, spaces
 from gymnax.environments.classic_control.pendulum import Pendulum
@@ -103,6 +103,50 @@ class AsksForValues(Pendulum):
         if state.theta > 0:
             action = -action
         return super().step_env(key, state, action, params)
+
+class AsNumpy(Pendulum):
+    def step_env(self, key, state, action, params):
+        return super().step_env(key, state, np.abs(action), params)
+
+class Untimed(Pendulum):
+    def step_env(self, *arguments):
+        observation, state, *others = super().step_env(*arguments)
+        return observation, state.replace(time=state.time - 1), *others
+
+class Timed(Untimed):
+    def is_truncated(self, state, params):
+        return state.theta > 3.0
+
+class OtherType(Pendulum):
+    def step_env(self, *arguments):
+        observation, state, *others = super().step_env(*arguments)
+        return observation, state.replace(time=state.time * 1.0), *others
+
+class WholeNumbers(Pendulum):
+    def step_env(self, *arguments):
+        observation, *others = super().step_env(*arguments)
+        return jnp.int32(observation), *others
+
+class ByName(Pendulum):
+    def step_env(self, *arguments):
+        observation, *others = super().step_env(*arguments)
+        return {"angle": observation}, *others
+
+class Nowhere(Pendulum):
+    def reset_env(self, *arguments):
+        observation, state = super().reset_env(*arguments)
+        return observation * jnp.nan, state
+
+@struct.dataclass
+class Timeless:
+    theta: float = 0.0
+
+class NoTime(Pendulum):
+    def reset_env(self, *arguments):
+        return super().reset_env(*arguments)[0], Timeless()
+
+    def step_env(self, key, state, action, params):
+        return jnp.zeros(3), state, 0.0, jnp.bool_(False), {}
 
 def no_steps():
     return Pendulum(), Pendulum().default_params.replace(max_steps_in_episode=0)
@@ -286,6 +330,13 @@ def test_the_physics_that_a_factory_takes_is_part_of_the_place(module):
         ("{}:NoParts", "lacks reset_env or step_env, which gymnax's own reset and step call"),
         ("{}:FloatTerminated", "returns a terminated of the type float32 from step_env: return a"),
         ("{}:AsksForValues", "asks for a value where JAX only has a shape .*jax.lax.cond"),
+        ("{}:AsNumpy", "asks for a value where JAX only has a shape .*jnp in place of numpy"),
+        ("{}:Untimed", "time is 0 after reset_env and 0 after step_env, by which episodes are"),
+        ("{}:OtherType", r"state whose time is int32\[\] from reset_env and float32\[\] from"),
+        ("{}:WholeNumbers", r"observation that is float32\[3\] from reset_env and int32\[3\] from"),
+        ("{}:ByName", r"an observation that is float32\[3\] from reset_env and something else fr"),
+        ("{}:Nowhere", "returns an observation from reset that is no number"),
+        ("{}:NoTime", "has a state without time, the steps of its episode: give it that field"),
         ("{}:no_steps", "has a max_steps_in_episode of 0, after which an episode ends"),
         ("{}:endless", "without max_steps_in_episode"),
         ("{}:wrong", "returned a str: it must return a gymnax"),
@@ -295,6 +346,10 @@ def test_the_physics_that_a_factory_takes_is_part_of_the_place(module):
 def test_what_is_no_factory_is_refused(module, name, message):
     with pytest.raises(UserError, match=message):
         make(name.format(module))
+
+
+def test_an_environment_may_end_its_episodes_by_something_else_than_time(module):
+    assert make(f"{module}:Timed")[1].max_steps_in_episode == 200
 
 
 def test_where_nobody_earns_a_number_the_environment_is_told(module):

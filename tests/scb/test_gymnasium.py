@@ -363,6 +363,17 @@ def test_a_vector_steps_and_resets_as_gymnasiums_own(file, mode):
         waiting = over & (mode is AutoresetMode.NEXT_STEP)
 
 
+def test_a_mask_has_a_place_for_each_and_their_number_is_whole():
+    envs = gymnasium.make_vec(BANDIT, num_envs=4)
+    envs.reset(seed=0)
+    for mask in (np.ones(2, bool), np.ones(4)):
+        with pytest.raises(UserError, match="give a bool for each of the 4 environments"):
+            envs.reset(options={"reset_mask": mask})
+    envs.reset(options={"reset_mask": [True, False, True, False]})
+    with pytest.raises(UserError, match=r"num_envs is 2\.5: it must be a whole number"):
+        gymnasium.make_vec(BANDIT, num_envs=2.5)
+
+
 def test_many_bandits_step_together():
     envs = gymnasium.make_vec(BANDIT, num_envs=64)
     assert isinstance(envs.unwrapped, SyntheticVectorEnv)

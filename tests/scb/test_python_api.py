@@ -5,12 +5,17 @@ from dataclasses import dataclass
 import gymnasium
 import gymnax
 import jax
+import jax.numpy as jnp
+import numpy as np
 import pytest
 from flax import struct
 from gymnax.environments import environment
 
+import lpo
 import scb
-from scb.discovery import BanditDiscovery, DiscoveryConfig
+from lpo.inner_loop import MetaTrainingConfig
+from lpo.meta_training import meta_train
+from scb.discovery import BanditDiscovery, DiscoveryConfig, discover
 from scb.errors import UserError, at_least
 from scb.evolution import EvolutionConfig
 
@@ -37,6 +42,65 @@ def test_parameters_of_another_environment_are_refused(bandit):
     with pytest.raises(UserError, match=r"of the class BanditParams, and those of Pendulum-v1 of"):
         agent.evaluate(state, KEY, 1, pendulum, params)
     assert agent.evaluate(state, KEY, 2, pendulum, pendulum_params).returns.shape == (2,)
+
+
+def test_classes_of_one_name_are_told_by_their_modules():
+    env, _ = gymnax.make("Pendulum-v1")
+    agent = scb.PPO(env, scb.PPOConfig())
+    said = r"class gymnax\..*cartpole\.EnvParams, and those of .* of gymnax\..*pendulum\.EnvParams"
+    with pytest.raises(UserError, match=said):
+        agent.train(KEY, scb.PPOHyperparameters(), gymnax.make("CartPole-v1")[1])
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"learning_rate": -1e-3}, "learning_rate has the value -0.001: it must be 0 or larger"),
+        ({"discount": 1.5}, "discount has the value 1.5: it must be between 0 and 1"),
+        ({"gae_lambda": np.float32(5.0)}, "gae_lambda has the value 5.0: it must be between"),
+        ({"learning_rate": float("nan")}, "learning_rate has the value nan, which is no number"),
+        ({"learning_rate": "a"}, "learning_rate has the value 'a', which is no number"),
+        ({"learning_rate": np.ones(2)}, r"learning_rate has the shape \(2,\): give one number"),
+        ({"discount": jnp.ones((1, 1))}, r"discount has the shape \(1, 1\): give one number"),
+    ],
+)
+def test_what_no_agent_can_be_trained_with_is_refused(values, message, bandit):
+    env, params = bandit
+    agent = scb.PPO(env, scb.PPOConfig())
+    with pytest.raises(UserError, match=message):
+        agent.init(KEY, scb.PPOHyperparameters(**values), params)
+    spec = scb.environment_agent("ppo", "Pendulum-v1")
+    with pytest.raises(UserError, match=message):
+        spec.with_values(**values)
+
+
+def test_numbers_of_any_library_are_hyperparameters(bandit):
+    env, params = bandit
+    agent = scb.PPO(env, scb.PPOConfig())
+    values = {"learning_rate": np.float64(1e-3), "discount": jnp.float32(0.9), "gae_lambda": 1}
+    agent.check_inputs(scb.PPOHyperparameters(**values), params)
+    jax.eval_shape(lambda x: agent.init(KEY, scb.PPOHyperparameters(discount=x), params), 0.9)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: discover(None), "config is of the class NoneType: it must be of DiscoveryConfig"),
+        (lambda: discover(DiscoveryConfig), r"config is the class DiscoveryConfig itself: make on"),
+        (
+            lambda: discover(DiscoveryConfig(), 3),
+            "run is of the class int: it must be of Run or st",
+        ),
+        (lambda: meta_train(EvolutionConfig()), "config is of the class EvolutionConfig: it must"),
+        (lambda: MetaTrainingConfig(drift=lpo.LearnedDrift), "drift is the class LearnedDrift its"),
+        (lambda: lpo.compare("CartPole-v1", ["ppo"], [0], episodes=1.5), "episodes is 1.5: it mus"),
+        (lambda: lpo.compare("CartPole-v1", ["ppo"], [0], points=1.5), "points is 1.5: it must be"),
+        (lambda: lpo.compare("CartPole-v1", {"ppo", "dpo"}, [0]), "are a set, which has no order"),
+    ],
+)
+def test_arguments_of_another_class_are_told(call, message):
+    with pytest.raises(UserError, match=message):
+        call()
 
 
 @pytest.mark.parametrize("agent", ["SAC", "TD3"])
