@@ -17,6 +17,8 @@ from scb import processes
 from scb.artefacts import arrays_digest
 from scb.errors import UserError, first_line
 
+MARGIN = 2**16  # bytes that a checkpoint takes beside its arrays, and more
+
 
 class Checkpoints:
     """Orbax checkpoints of a pytree of arrays, each with a digest, restored newest first.
@@ -48,6 +50,7 @@ class Checkpoints:
             digest=ocp.args.JsonSave({"sha256": arrays_digest(leaves)}),
         )
         try:
+            self._find_room(sum(leaf.nbytes for leaf in leaves.values()))
             self._manager.save(step, args=items)
             self._manager.wait_until_finished()
         # Orbax and tensorstore raise many kinds where a disk is full or a folder is gone.
@@ -56,6 +59,14 @@ class Checkpoints:
                 f"checkpoint {step} could not be written to {self.folder} ({_said(error)}): the one before it is "
                 "there; make room, and go on with --resume."
             ) from error
+
+    def _find_room(self, size: int) -> None:
+        """An OSError where there is none: from Orbax's threads a full disk brings hundreds of lines."""
+        trial = self.folder / ".room"
+        try:
+            trial.write_bytes(bytes(2 * size + MARGIN))
+        finally:
+            trial.unlink(missing_ok=True)
 
     def restore(self, template: Any) -> tuple[int, Any, list[int]]:
         """(step, state, steps of unreadable newer checkpoints); step 0 and the template where there is none.

@@ -1,10 +1,13 @@
+import errno
 import json
 import math
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from types import SimpleNamespace
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -455,6 +458,28 @@ def test_where_no_checkpoint_can_be_read_it_is_told_and_they_stay(tmp_path):
     with pytest.raises(UserError, match="or remove that folder to start again"):
         again.restore(state(0))
     again.close()
+
+
+def test_a_full_disk_is_found_before_a_checkpoint_is_begun(tmp_path, monkeypatch):
+    checkpoints = Checkpoints(tmp_path)
+    checkpoints.save(1, state(1))
+
+    def full(path, content):
+        assert len(content) > 2 * sum(np.asarray(x).nbytes for x in jax.tree.leaves(state(1)))
+        path.touch()
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Path, "write_bytes", full)
+        said = (
+            r"checkpoint 2 could not be written to .* \(.*No space left on device\): the one before"
+        )
+        with pytest.raises(UserError, match=said):
+            checkpoints.save(2, state(2))
+    assert {p.name for p in (tmp_path / "checkpoints").iterdir()} == {"1"}
+    checkpoints.save(2, state(2))
+    assert_is(checkpoints.restore(state(0)), 2)
+    checkpoints.close()
 
 
 # -- small things
