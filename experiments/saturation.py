@@ -167,7 +167,7 @@ measure = InParts(parts)
 
 
 def way(each: Estimate, together: Estimate, best: Estimate) -> Estimate | None:
-    """How much of the way from what each earns to what the best action earns all come as one: 1 without shared errors.
+    """How much of the way from what each earns to what the best action earns all come as one; past it above 1.
 
     The interval is the widest that the ends of the three give. None where the best action is not above each by more
     than their intervals.

@@ -5,6 +5,7 @@ episodes, so that differences are paired. Final scores are interquartile means w
 intervals.
 """
 
+import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields
@@ -328,8 +329,11 @@ def _kept(rows: str | Path | Rows | None) -> Iterator[Rows | None]:
     if not isinstance(rows, str | Path):
         yield rows
         return
-    file = Path(rows)
-    make_folder(file.parent, "rows")
+    file, there = Path(rows), Rows(rows)
+    if there.rows and not os.access(file.parent, os.W_OK):
+        yield there  # to read what is complete
+        return
+    make_folder(file.parent, "place")
     with held(file):
         yield Rows(file)
 

@@ -127,6 +127,8 @@ def load_objective(name: Named) -> Objective:
                 "settings."
             ) from error
     if isinstance(name, Drift):
+        if isinstance(name, SurrogateDrift):
+            name.check_slope()
         return closed_form(name.name, name)
     if callable(name) and not isinstance(name, type):
         surrogate = SurrogateDrift(name)

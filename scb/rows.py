@@ -110,9 +110,10 @@ class Rows:
         if other := {name: of_it for name, of_it in done.items() if len(of_it) != number}:
             dropped = set()
             for name, of_it in other.items():
-                whole = len(of_it) % number == 0
-                done[name] = of_it[:number] if whole else []
-                dropped |= {id(row) for row in of_it[len(done[name]) :]}
+                first = {(row.get("step"), row.get("actions")): row for row in reversed(of_it)}
+                kept = [row for row in of_it if row is first[row.get("step"), row.get("actions")]]
+                done[name] = kept if len(kept) == number else []
+                dropped |= {id(row) for row in of_it} - {id(row) for row in done[name]}
             done = {name: of_it for name, of_it in done.items() if of_it}
             self.rows = [row for row in self.rows if id(row) not in dropped]
             self._write()

@@ -255,6 +255,9 @@ def released() -> Iterator[None]:
 def held(path: Path) -> Iterator[None]:
     """Within it a file is this process's; a UserError where it is another's. A lock stands beside it meanwhile."""
     lock = path.with_name(f".{path.name}{_LOCK}")
+    if lock.resolve() in _held:  # by who called this
+        yield
+        return
     _lock(lock, path)
 
     def remove() -> str:

@@ -8,10 +8,13 @@ from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from lpo.drifts.contract import Array, Drift
 from scb.errors import UserError, first_line
 
+# What a function raises that is to be traced, and asks for a value.
+_TRACED = (jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError)
 ARGUMENTS = ("ratio", "log_ratio", "advantage", "progress", "xp")
 
 
@@ -63,17 +66,16 @@ class SurrogateDrift(Drift):
         return [x.name for x in by_name if x.default is x.empty or x.name in ARGUMENTS]
 
     def _refused(self, error: Exception, xp: Any) -> UserError:
-        where, advice = {
-            "jax.numpy": ("in JAX", "use xp.where in place of if, and xp in place of numpy"),
-            "numpy": ("with NumPy", "use xp.where in place of if"),
-            "torch": ("with PyTorch", "its minimum takes tensors alone: use xp.clip with numbers"),
-        }[xp.__name__]
-        if "xp" not in self._takes:
-            advice = "let it take xp, and call xp.minimum and the like"
+        where = {"jax.numpy": "in JAX", "numpy": "with NumPy", "torch": "with PyTorch"}[xp.__name__]
         said = first_line(error).rstrip(".")
-        return UserError(
-            f"the surrogate {self.called} does not compute {where} ({said}): {advice}."
-        )
+        advice = ""
+        if isinstance(error, _TRACED) or "truth value" in said:
+            advice = ": use xp.where in place of if, and xp in place of numpy"
+        elif xp.__name__ == "torch" and "xp" in self._takes:
+            advice = "; its minimum and maximum take tensors alone, and xp.clip takes numbers"
+        elif xp.__name__ == "torch":
+            advice = ": let it take xp, and call xp.minimum and the like"
+        return UserError(f"the surrogate {self.called} does not compute {where} ({said}){advice}.")
 
     @property
     def temporal(self) -> bool:
@@ -83,26 +85,34 @@ class SurrogateDrift(Drift):
         return jnp.zeros(())
 
     def check_slope(self) -> None:
-        """Raises a UserError where it does not rise with the ratio, at 1, for a positive advantage, as a loss does not.
+        """Raises a UserError where agents would learn nothing by it, or the opposite: by its slope in the ratio, at 1.
 
-        It also falls for a negative one where it is what PPO maximises.
+        That is 0, or no number, or, as a loss's, against the sign of the advantage wherever it is not 0.
         """
+        advantage = jnp.asarray([-2.0, -0.5, 0.5, 2.0])
 
-        def surrogate(log_ratio: jax.Array, advantage: jax.Array, progress: jax.Array) -> jax.Array:
-            penalty = self(jnp.zeros(()), log_ratio[None], advantage[None], progress[None])
-            return (jnp.exp(log_ratio) * advantage - penalty)[0]
+        def total(log_ratio: jax.Array, progress: jax.Array) -> jax.Array:
+            progress = jnp.full_like(advantage, progress)
+            penalty = self(jnp.zeros(()), log_ratio, advantage, progress)
+            return (jnp.exp(log_ratio) * advantage - penalty).sum()
 
-        slope = jax.jit(jax.grad(surrogate))  # traced, as in a training
-        slopes = [float(slope(0.0, advantage, 0.0)) for advantage in (1.0, -1.0)]
-        if slopes[0] < 0 < slopes[1]:
+        slope = jax.jit(jax.grad(total))  # traced, as in a training
+        slopes = np.stack([slope(jnp.zeros_like(advantage), x) for x in (0.0, 0.5, 1.0)])
+        if not np.isfinite(slopes).all():
             raise UserError(
-                f"the surrogate {self.called} falls with the ratio where the advantage is positive, as a loss does: "
-                "return its negative, which PPO maximises."
+                f"the surrogate {self.called} has a slope in the ratio that is no number where that is 1, as every "
+                "update begins: let it be differentiable there."
             )
-        if slopes == [0.0, 0.0]:
+        along = slopes * np.asarray(advantage)
+        if not along.any():
             raise UserError(
                 f"the surrogate {self.called} does not change with the ratio where that is 1, and agents would learn "
                 "nothing: let it take ratio, or log_ratio, and compute with it."
+            )
+        if (along <= 0).all():
+            raise UserError(
+                f"the surrogate {self.called} falls with the ratio where the advantage is positive, as a loss does: "
+                "return its negative, which PPO maximises."
             )
 
     def __call__(

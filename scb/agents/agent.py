@@ -149,9 +149,9 @@ class Agent(ABC):
             )
 
     def check_inputs(self, hyperparameters: Any, env_params: Any) -> None:
-        """Raises a UserError for hyperparameters of another algorithm, or with values that an agent cannot take.
+        """Raises a UserError for hyperparameters of another algorithm, or parameters of another environment.
 
-        So do parameters of another environment.
+        And for values that an agent cannot take, unless they are traced, as what is given to a jitted `train` is.
         """
         if not isinstance(hyperparameters, self.takes):
             raise UserError(

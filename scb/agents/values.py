@@ -5,7 +5,6 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from scb.errors import UserError
 
@@ -43,6 +42,5 @@ def check_values(hyperparameters: Any) -> None:
             raise UserError(
                 f"{name} has the shape {shape}: give one number; each agent's is drawn from a spec's lists."
             )
-        if value is None or isinstance(value, bool | np.bool_ | jax.Array):
-            continue
-        check_value(name, value.item() if isinstance(value, np.ndarray | np.generic) else value)
+        if value is not None and not isinstance(value, jax.core.Tracer):
+            check_value(name, value.item() if hasattr(value, "item") else value)

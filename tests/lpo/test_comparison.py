@@ -283,7 +283,12 @@ def test_a_file_of_rows_is_one_process_es(tmp_path, tiny_agent):
     finally:
         other.kill()
         other.wait()
-    # What two processes measured that had one file is kept once.
-    file.write_text(once + once)
-    compare("Synthetic-Pendulum-v1", ["ppo"], [0, 1], spec, points=1, rows=file)
-    assert file.read_text() == once
+    # What two processes measured that had one file is kept once, in whatever order they wrote it.
+    rows = once.splitlines(keepends=True)
+    for twice in (rows + rows, [line for row in rows for line in (row, row)]):
+        file.write_text("".join(twice))
+        compare("Synthetic-Pendulum-v1", ["ppo"], [0, 1], spec, points=1, rows=file)
+        assert file.read_text() == once
+    with pytest.raises(UserError, match=r"are kept in a \.jsonl file"):
+        compare("Synthetic-Pendulum-v1", ["ppo"], [0], spec, rows=tmp_path / "none" / "rows.json")
+    assert not (tmp_path / "none").exists()

@@ -142,12 +142,31 @@ def test_functions_that_are_none(function, message):
             "falls with the ratio where .*, as a loss do",
         ),
         (lambda ratio, advantage, xp: xp.maximum(-ratio * advantage, -advantage), "as a loss does"),
+        (lambda ratio, advantage: -ratio * jnp.maximum(advantage, 0), "as a loss does"),
+        (SurrogateDrift(lambda ratio, advantage: -ratio * advantage), "as a loss does"),
         (lambda advantage: advantage, "does not change with the ratio where that is 1"),
+        (
+            lambda ratio, advantage: ratio * advantage + jnp.sqrt((ratio - 1) ** 2),
+            "slope in the ratio that is no number",
+        ),
     ],
 )
 def test_what_would_teach_nothing_or_the_opposite_is_refused(function, message):
     with pytest.raises(UserError, match=message):
         load_objective(function)
+
+
+@pytest.mark.parametrize(
+    "function",
+    [
+        lambda ratio, advantage, progress: progress * ratio * advantage,
+        lambda ratio, advantage: ratio * (advantage - advantage.mean()),
+        lambda ratio, advantage: jnp.where(jnp.abs(advantage) > 1, ratio * advantage, 0),
+        lambda log_ratio, advantage: log_ratio * advantage,
+    ],
+)
+def test_what_is_unusual_and_teaches_is_taken(function):
+    load_objective(function)
 
 
 def branching(ratio, advantage, progress, xp):
@@ -163,7 +182,7 @@ def branching(ratio, advantage, progress, xp):
         ),
         (
             lambda ratio, advantage: np.minimum(ratio, 1.2) * advantage,
-            r"does not compute in JAX \(.*[^.]\): let it take xp, and call xp.minimum and the like",
+            r"does not compute in JAX \(.*[^.]\): use xp.where in place of if, and xp in place of",
         ),
     ],
 )
@@ -174,11 +193,13 @@ def test_what_jax_cannot_trace_is_told_of_the_function(function, message):
 
 def test_what_one_library_cannot_compute_is_told_of_the_function():
     drift = SurrogateDrift(branching)
-    with pytest.raises(UserError, match=r"branching does not compute with NumPy .*: use xp.where"):
+    with pytest.raises(
+        UserError, match=r"compute with NumPy \(The truth value .*\): use xp.where in place"
+    ):
         drift(None, LOG_RATIO, ADVANTAGE, np.zeros(len(LOG_RATIO)), np)
     torch = pytest.importorskip("torch")
     tight = load_objective(lambda ratio, advantage, xp: advantage * xp.minimum(ratio, 1.2))
-    with pytest.raises(UserError, match=r"with PyTorch .*: its minimum takes tensors alone: use"):
+    with pytest.raises(UserError, match=r"with PyTorch .*; its minimum and maximum take tensors a"):
         lpo.torch_drift(tight)(torch.as_tensor(LOG_RATIO), torch.as_tensor(ADVANTAGE))
 
 

@@ -111,7 +111,7 @@ class AsNumpy(Pendulum):
 class Untimed(Pendulum):
     def step_env(self, *arguments):
         observation, state, *others = super().step_env(*arguments)
-        return observation, state.replace(time=state.time - 1), *others
+        return observation, state.replace(time=arguments[1].time), *others
 
 class Timed(Untimed):
     def is_truncated(self, state, params):
@@ -132,10 +132,15 @@ class ByName(Pendulum):
         observation, *others = super().step_env(*arguments)
         return {"angle": observation}, *others
 
-class Nowhere(Pendulum):
-    def reset_env(self, *arguments):
-        observation, state = super().reset_env(*arguments)
-        return observation * jnp.nan, state
+class OwnStep(Untimed):
+    def step(self, key, state, action, params):
+        observation, state, reward, terminated, info = self.step_env(key, state, action, params)
+        return observation, state, reward, terminated, state.theta > 3.0, info
+
+class InFrames(Pendulum):
+    def step_env(self, *arguments):
+        observation, state, *others = super().step_env(*arguments)
+        return observation, state.replace(time=state.time + 3), *others
 
 @struct.dataclass
 class Timeless:
@@ -331,11 +336,13 @@ def test_the_physics_that_a_factory_takes_is_part_of_the_place(module):
         ("{}:FloatTerminated", "returns a terminated of the type float32 from step_env: return a"),
         ("{}:AsksForValues", "asks for a value where JAX only has a shape .*jax.lax.cond"),
         ("{}:AsNumpy", "asks for a value where JAX only has a shape .*jnp in place of numpy"),
-        ("{}:Untimed", "time is 0 after reset_env and 0 after step_env, by which episodes are"),
+        (
+            "{}:Untimed",
+            "returns a state whose time is what it was, from step_env, and episodes end",
+        ),
         ("{}:OtherType", r"state whose time is int32\[\] from reset_env and float32\[\] from"),
         ("{}:WholeNumbers", r"observation that is float32\[3\] from reset_env and int32\[3\] from"),
         ("{}:ByName", r"an observation that is float32\[3\] from reset_env and something else fr"),
-        ("{}:Nowhere", "returns an observation from reset that is no number"),
         ("{}:NoTime", "has a state without time, the steps of its episode: give it that field"),
         ("{}:no_steps", "has a max_steps_in_episode of 0, after which an episode ends"),
         ("{}:endless", "without max_steps_in_episode"),
@@ -348,8 +355,9 @@ def test_what_is_no_factory_is_refused(module, name, message):
         make(name.format(module))
 
 
-def test_an_environment_may_end_its_episodes_by_something_else_than_time(module):
-    assert make(f"{module}:Timed")[1].max_steps_in_episode == 200
+@pytest.mark.parametrize("name", ["Timed", "OwnStep", "InFrames"])
+def test_an_environment_may_end_its_episodes_by_something_else_than_steps(module, name):
+    assert make(f"{module}:{name}")[1].max_steps_in_episode == 200
 
 
 def test_where_nobody_earns_a_number_the_environment_is_told(module):

@@ -62,6 +62,14 @@ def test_classes_of_one_name_are_told_by_their_modules():
         ({"learning_rate": "a"}, "learning_rate has the value 'a', which is no number"),
         ({"learning_rate": np.ones(2)}, r"learning_rate has the shape \(2,\): give one number"),
         ({"discount": jnp.ones((1, 1))}, r"discount has the shape \(1, 1\): give one number"),
+        (
+            {"learning_rate": jnp.float32(jnp.nan)},
+            "learning_rate has the value nan, which is no num",
+        ),
+        (
+            {"gae_lambda": True},
+            "gae_lambda has the value True, which is no number that an agent can",
+        ),
     ],
 )
 def test_what_no_agent_can_be_trained_with_is_refused(values, message, bandit):
