@@ -111,10 +111,10 @@ def _check(name: str, env: environment.Environment[Any, Any], params: Any) -> No
                 f"returns a terminated of the type {jnp.result_type(inner[3])} from step_env: return a bool"
             )
         if whole_step:
-            check_same("state", state, inner[1])
+            check_same("a state", state, inner[1])
             # Of arrays of other shapes its space says more.
             if len({getattr(x, "shape", None) for x in (observation, inner[0])} - {None}) < 2:
-                check_same("observation", observation, inner[0])
+                check_same("an observation", observation, inner[0])
             if timed and not hasattr(state, "time"):
                 raise wrong(
                     "has a state without time, the steps of its episode: give it that field, 0 after reset_env and one "
@@ -146,7 +146,7 @@ def _check(name: str, env: environment.Environment[Any, Any], params: Any) -> No
             if begins != goes_on:
                 called = f"whose {name.lstrip('.')} is" if name else "that is"
                 raise wrong(
-                    f"returns an {what} {called} {begins} from reset_env and {goes_on} from step_env: let them agree"
+                    f"returns {what} {called} {begins} from reset_env and {goes_on} from step_env: let them agree"
                 )
 
     try:
