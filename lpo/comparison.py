@@ -329,9 +329,11 @@ def _kept(rows: str | Path | Rows | None) -> Iterator[Rows | None]:
     if not isinstance(rows, str | Path):
         yield rows
         return
-    file, there = Path(rows), Rows(rows)
-    if there.rows and not os.access(file.parent, os.W_OK):
-        yield there  # to read what is complete
+    file = Path(rows)
+    if not file.exists():
+        Rows(file)  # refuses a name before a folder is made
+    elif not os.access(file.parent, os.W_OK):
+        yield Rows(file)  # to read what is complete
         return
     make_folder(file.parent, "place")
     with held(file):

@@ -127,12 +127,9 @@ def load_objective(name: Named) -> Objective:
                 "settings."
             ) from error
     if isinstance(name, Drift):
-        if isinstance(name, SurrogateDrift):
-            name.check_slope()
         return closed_form(name.name, name)
     if callable(name) and not isinstance(name, type):
         surrogate = SurrogateDrift(name)
-        surrogate.check_slope()
         return closed_form(surrogate.called, surrogate)
     if not isinstance(name, str | Path):
         raise UserError(
@@ -216,6 +213,8 @@ def run_name(file: Path) -> str:
 
 def closed_form(name: str, drift: Drift) -> Objective:
     """The objective of a drift whose parameters its settings say: none of them is random."""
+    if isinstance(drift, SurrogateDrift):
+        drift.check_slope()
     return Objective(name, _family(drift), drift.init(root_key(0)))
 
 

@@ -6,6 +6,8 @@ from dataclasses import fields, is_dataclass
 from difflib import get_close_matches
 from typing import Any, get_args
 
+import numpy as np
+
 MOST_AGENTS = 100_000  # more would not fit into memory before the first is trained
 
 
@@ -26,12 +28,18 @@ def at_least(minimum: int, of: object = None, *names: str, **values: float | Non
     _check(lambda value: minimum <= value < math.inf, allowed, of, names, values)
 
 
+def counted(name: str, value: Any) -> int:
+    """The whole number that a value is; a UserError where it is none."""
+    if not isinstance(value, int | np.integer) or isinstance(value, bool):
+        raise UserError(f"{name} is {value!r}: it must be a whole number.")
+    return int(value)
+
+
 def count_at_least(minimum: int, **values: int | None) -> None:
-    """As `at_least`, and a UserError for what is no whole number."""
+    """As `at_least`, and a UserError for what is no whole number; None is nothing of this."""
     for name, value in values.items():
-        if value is not None and not hasattr(value, "__index__"):
-            raise UserError(f"{name} is {value!r}: it must be a whole number.")
-    at_least(minimum, **values)
+        if value is not None:
+            at_least(minimum, **{name: counted(name, value)})
 
 
 def agents_at_least(minimum: int, of: object, *names: str) -> None:

@@ -255,10 +255,9 @@ def released() -> Iterator[None]:
 def held(path: Path) -> Iterator[None]:
     """Within it a file is this process's; a UserError where it is another's. A lock stands beside it meanwhile."""
     lock = path.with_name(f".{path.name}{_LOCK}")
-    if lock.resolve() in _held:  # by who called this
+    if not _lock(lock, path):  # whoever called this holds it
         yield
         return
-    _lock(lock, path)
 
     def remove() -> str:
         lock.unlink(missing_ok=True)
@@ -277,14 +276,17 @@ def _release(path: Path) -> None:
         file.close()
 
 
-def _lock(path: Path, of: Path) -> None:
+def _lock(path: Path, of: Path) -> bool:
     """Holds a lock for this process; the system lets go of it, however the process ends.
 
     Args:
       of: what it is of, for the message.
+
+    Returns:
+      Whether this took it: False where the process held it already, or where there are no locks.
     """
     if fcntl is None or path.resolve() in _held:
-        return
+        return False
     with refusing(path.parent):
         file = path.open("a+")
     try:
@@ -305,6 +307,7 @@ def _lock(path: Path, of: Path) -> None:
     except OSError as error:  # the disk is full
         raise cannot_write(path.parent, reason=error.strerror) from error
     _held[path.resolve()] = file
+    return True
 
 
 def read_config(folder: str | Path) -> dict[str, Any]:

@@ -20,7 +20,7 @@ from jax.typing import ArrayLike
 from scb.agents import networks
 from scb.agents.normalization import normalize
 from scb.agents.values import check_values
-from scb.errors import UserError, at_least, count_at_least, one_of
+from scb.errors import UserError, at_least, count_at_least, counted, one_of
 from scb.evaluation import Episodes, evaluate
 from scb.keys import split_key
 from scb.spaces import clip_to_space, flat_size, shapes
@@ -53,9 +53,7 @@ class AgentConfig(ABC):
         counts = [(f.name, getattr(self, f.name)) for f in fields(self) if f.type is int]
         counts += [(f"hidden_sizes[{i}]", size) for i, size in enumerate(self.hidden_sizes)]
         for name, value in counts:
-            if not isinstance(value, int | np.integer) or isinstance(value, bool):
-                raise UserError(f"{name} is {value!r}: it must be a whole number.")
-            at_least(1, **{name: int(value)})
+            at_least(1, **{name: counted(name, value)})
         for name in (f.name for f in fields(self) if f.type is bool):
             if not isinstance(getattr(self, name), bool):
                 raise UserError(f"{name} is {getattr(self, name)!r}: it must be true or false.")
@@ -115,14 +113,12 @@ def _check_params(env: environment.Environment[Any, Any], params: Any) -> None:
         return
     # One of somebody's own may come with parameters of a class that it does not name.
     if wanted is not environment.EnvParams and not isinstance(params, wanted):
-        given = type(params)
-        # gymnax calls those of every environment EnvParams.
-        where = [
-            f"{x.__module__}." if given.__name__ == wanted.__name__ else "" for x in (given, wanted)
-        ]
+        given, own = type(params).__name__, wanted.__name__
+        if given == own:  # gymnax calls those of every environment EnvParams
+            given, own = (f"{x.__module__}.{x.__name__}" for x in (type(params), wanted))
         raise UserError(
-            f"the environment's parameters are of the class {where[0]}{given.__name__}, and those of {env.name} of "
-            f"{where[1]}{wanted.__name__}: give the second of scb.make(NAME), of the same environment."
+            f"the environment's parameters are of the class {given}, and those of {env.name} of {own}: give the second "
+            "of scb.make(NAME), of the same environment."
         )
 
 

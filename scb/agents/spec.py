@@ -104,13 +104,14 @@ class AgentSpec:
         """
         values = {name: value for name, value in values.items() if value is not None}
         static, traced = ([f.name for f in fields(x)] for x in (self.config, self.hyperparameters))
-        for name, value in values.items():
+        for name in values:
             if name not in (*static, *traced):
                 raise UserError(
                     f"{self.algorithm} has no {name}: known are {', '.join((*static, *traced))}."
                 )
-            if name in traced and isinstance(value, int | float | str):
-                check_value(name, value)
+        # A drift's own may be any numbers, but what is given as one is PPO's clip.
+        if isinstance(clip := values.get("drift"), int | float | str):
+            check_value("drift", clip)
         config = configured(self.config, {k: v for k, v in values.items() if k in static})
         changed = {k: v for k, v in values.items() if k in traced}
         hyperparameters = replace(self.hyperparameters, **changed)

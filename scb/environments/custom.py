@@ -99,6 +99,11 @@ def _check(name: str, env: environment.Environment[Any, Any], params: Any) -> No
                 f"returns {number} of {of}, where gymnax 1.x returns {values}: return these"
             )
 
+    # gymnax's own step chooses between what is begun and what goes on, and asks is_truncated whether time is up.
+    base, made = environment.Environment, type(env)
+    selects = made.step is base.step
+    timed = selects and made.is_truncated is base.is_truncated
+
     def first_step(key: jax.Array) -> Any:
         found = env.reset(key, params)
         check_values("reset", found, "observation, state")
@@ -110,7 +115,7 @@ def _check(name: str, env: environment.Environment[Any, Any], params: Any) -> No
             raise wrong(
                 f"returns a terminated of the type {jnp.result_type(inner[3])} from step_env: return a bool"
             )
-        if whole_step:
+        if selects:
             check_same("a state", state, inner[1])
             # Of arrays of other shapes its space says more.
             if len({getattr(x, "shape", None) for x in (observation, inner[0])} - {None}) < 2:
@@ -123,11 +128,6 @@ def _check(name: str, env: environment.Environment[Any, Any], params: Any) -> No
         step = env.step(key, state, action, params)
         check_values("step", step, "observation, state, reward, terminated, truncated, info")
         return observation, step, state
-
-    # gymnax's own step chooses between what is begun and what goes on, and asks is_truncated whether time is up.
-    of = type(env)
-    whole_step = of.step is environment.Environment.step
-    timed = whole_step and of.is_truncated is environment.Environment.is_truncated
 
     def times(state: Any) -> Any:
         key = root_key(0)

@@ -75,7 +75,8 @@ def test_the_page_tells_errors_of_all_from_an_agents_own():
     }
     page = saturation.EXPERIMENT.page(report)
     assert (
-        "**Mostly each in its own way in hopper, ours. As one they are not much better in hopper, published.**" in page
+        "**Mostly each in its own way in hopper, ours. As one they are not much better in hopper, published.**"
+        in page
     )
     assert "beyond an end: 95 % in halfcheetah, published." in page
     assert (
