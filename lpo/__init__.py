@@ -22,7 +22,7 @@ _HOME = {
 }
 
 __all__ = list(_HOME)
-_HOME["__version__"] = "scb"
+_HOME |= dict.fromkeys(("UserError", "__version__"), "scb")
 
 
 def __dir__() -> list[str]:

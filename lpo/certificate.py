@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lpo.drifts.contract import Drift
-from scb.agents.ppo import MAX_LOG_RATIO
+from scb.agents.drift import MAX_LOG_RATIO, check_drift
 from scb.errors import UserError
 from scb.keys import root_key
 from scb.objectives import Objective
@@ -99,6 +99,9 @@ def certify(
       num_ratios: points of log-ratio, in [-3, 3] and, a quarter as many, out to the bound that
         training clips at.
       num_advantages: points of advantage in [-10, 10], the tails of a normalised minibatch.
+
+    Raises:
+      UserError: it is no drift, or cannot take the parameters.
     """
     if not isinstance(drift, Drift):
         if not isinstance(getattr(drift, "drift", None), Drift):
@@ -107,7 +110,12 @@ def certify(
                 "lpo.load_objective returns."
             )
         return certify(drift.drift, drift.parameters, num_ratios, num_advantages)
-    parameters = drift.init(root_key(0)) if parameters is None else parameters
+    if parameters is None:
+        parameters = drift.init(root_key(0))
+    else:
+        check_drift(
+            drift, parameters, "of an objective give the whole objective, or both of its own"
+        )
     inner = np.linspace(-3.0, 3.0, num_ratios | 1)
     outer = np.linspace(-MAX_LOG_RATIO, MAX_LOG_RATIO, (num_ratios // 4) | 1)
     log_ratios = jnp.asarray(np.union1d(inner, outer), jnp.float32)

@@ -20,7 +20,7 @@ from jax.typing import ArrayLike
 
 from lpo.drifts import Drift
 from lpo.objectives import Named, Objective, load_objective
-from scb.agents.ppo import MAX_LOG_RATIO
+from scb.agents.drift import MAX_LOG_RATIO
 from scb.errors import UserError
 
 if TYPE_CHECKING:

@@ -6,7 +6,7 @@ from typing import Any
 import chex
 import jax.numpy as jnp
 
-from scb.agents.ppo import clipped_surrogate_drift, relu
+from scb.agents.drift import clipped_surrogate_drift, relu
 
 # Lu et al. (2022), eq. 6.
 DPO_ALPHA = 2.0

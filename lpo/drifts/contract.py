@@ -12,7 +12,7 @@ import numpy as np
 
 from lpo.drifts.bases import BASES
 from scb import own
-from scb.agents.ppo import relu
+from scb.agents.drift import relu
 from scb.errors import UserError, at_least, one_of, positive
 from scb.keys import root_key
 
@@ -64,7 +64,7 @@ class Drift(ABC):
           advantage: [B] advantage, normalised over the minibatch.
           progress: [B] fraction of training done, in [0, 1].
           xp: `jax.numpy`, `numpy` or `torch`. What the three have alike is enough to write a formula
-            once: functions of the array API standard, and `relu` of `scb.agents.ppo`.
+            once: functions of the array API standard, and `relu` of `scb.agents.drift`.
 
         Returns:
           [B] penalty.

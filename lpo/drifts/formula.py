@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lpo.drifts.contract import Array, CorrectedDrift
-from scb.agents.ppo import MAX_LOG_RATIO
+from scb.agents.drift import MAX_LOG_RATIO
 from scb.errors import UserError
 
 # What an expression is made of, beside numbers, +, -, * and parentheses: with its largest magnitude

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 from lpo.drifts.bases import DPO_ALPHA, DPO_BETA, discovered_drift
 from lpo.drifts.contract import Array, Drift
-from scb.agents.ppo import clipped_surrogate_drift
+from scb.agents.drift import clipped_surrogate_drift
 from scb.errors import positive
 from scb.keys import root_key
 

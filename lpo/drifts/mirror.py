@@ -24,7 +24,7 @@ import jax
 import jax.numpy as jnp
 
 from lpo.drifts.contract import Array, Drift
-from scb.agents.ppo import relu
+from scb.agents.drift import relu
 from scb.errors import at_least, positive
 from scb.keys import split_key
 

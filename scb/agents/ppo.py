@@ -7,9 +7,8 @@ typed keys and traced numbers: one compiled program trains a population with dif
 hyperparameters, bandits or drifts.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple, TypeAlias, cast
+from typing import Any, NamedTuple, cast
 
 import chex
 import distrax
@@ -22,48 +21,21 @@ from jax.typing import ArrayLike
 
 from scb.agents import networks
 from scb.agents.agent import Agent, AgentConfig, Algorithm, clipped_adam
+from scb.agents.drift import (
+    MAX_LOG_RATIO,
+    USUAL_CLIP,
+    DriftFunction,
+    check_drift,
+    clipped_surrogate_drift,
+)
 from scb.agents.normalization import RunningStatistics, update_statistics
-from scb.errors import UserError, first_line
+from scb.errors import UserError
 from scb.keys import split_key
 from scb.spaces import action_size
 
-DriftFunction: TypeAlias = Callable[[Any, jax.Array, jax.Array, jax.Array], jax.Array]
-
-# exp(20) squared still fits into float32; beyond it a learned drift would meet infinities that
-# PPO's never does.
-MAX_LOG_RATIO = 20.0
-USUAL_CLIP = 0.2
 # Iterations: enough that single batches don't show, few beside a training's thousands.
 DIAGNOSED = 4
 DIAGNOSIS = ("kl", "outside", "gain", "value_error", "entropy")
-
-
-def relu(x: Any, xp: Any = jnp) -> Any:
-    """max(x, 0) of an array of `xp`, `jax.numpy`, `numpy` or `torch`, with slope 0 at 0 in each."""
-    if xp is jnp:
-        return jax.nn.relu(x)
-    # NumPy has none, nor slopes.
-    return xp.relu(x) if hasattr(xp, "relu") else xp.maximum(x, 0)
-
-
-def clipped_surrogate_drift(
-    clip: Any, log_ratio: Any, advantage: Any, progress: Any, xp: Any = jnp
-) -> Any:
-    """PPO's clip written as a drift (Lu et al., 2022, eq. 4).
-
-    Args:
-      clip: the half-width of the trust interval, > 0.
-      log_ratio: [B] log pi(a|s) - log pi_behaviour(a|s), in nats.
-      advantage: [B] normalised advantage.
-      progress: [B] fraction of training done; unused here.
-      xp: the arrays' library, `jax.numpy`, `numpy` or `torch`.
-
-    Returns:
-      [B] non-negative penalty; ratio * advantage - drift equals PPO's minimum.
-    """
-    chex.assert_equal_shape([log_ratio, advantage, progress])
-    ratio = xp.exp(log_ratio)
-    return relu((ratio - xp.clip(ratio, 1.0 - clip, 1.0 + clip)) * advantage, xp)
 
 
 @dataclass(frozen=True)
@@ -215,31 +187,18 @@ class PPO(Agent):
         policy = of(action_size(space), sizes, activation)
         return policy, networks.ValueNetwork(sizes, activation)
 
-    def _check_parameters(self, parameters: Any) -> None:
-        """A UserError where the drift cannot take what the hyperparameters hold, such as their default clip."""
-        one = jnp.zeros(1)
-        try:
-            penalty = jax.eval_shape(self.drift, parameters, one, one, one)
-        except UserError:  # a drift's own sentence
-            raise
-        except Exception as error:  # what a drift raises for parameters of another kind is its own
-            raise UserError(
-                "the agent's drift cannot take the hyperparameters' drift: of an objective give objective.drift to the "
-                "agent, and objective.parameters as the hyperparameters' drift; one of your own takes (parameters, "
-                f"log_ratio [B], advantage [B], progress [B]), and says here: {first_line(error).rstrip('.')}."
-            ) from error
-        if getattr(penalty, "shape", None) != one.shape:
-            raise UserError(
-                f"the agent's drift returns {getattr(penalty, 'shape', penalty)} for one ratio: give a penalty for "
-                "each, of the shape of log_ratio."
-            )
-
     def init(
         self, key: jax.Array, hyperparameters: PPOHyperparameters, env_params: Any
     ) -> PPOState:
         """A fresh agent, its environments at their first observation."""
         self.check_inputs(hyperparameters, env_params)
-        self._check_parameters(hyperparameters.drift)
+        check_drift(
+            self.drift,
+            hyperparameters.drift,
+            "of an objective give objective.drift to the agent, and objective.parameters as the hyperparameters' drift",
+            "the agent's drift",
+            "the hyperparameters' drift",
+        )
         key_policy, key_value, key_reset, key_train = split_key(key, 4)
         policy, value = self._networks(env_params)
         size = self.observation_size(env_params)

@@ -8,6 +8,8 @@ import jax
 import jax.numpy as jnp
 import pytest
 
+import lpo
+import scb
 from lpo.certificate import Certificate, certify
 from lpo.drifts import ClipDrift, DPODrift, Drift, LearnedDrift, NoDrift
 from lpo.objectives import load_objective
@@ -139,6 +141,16 @@ def test_slope_of_a_clip_between_the_two_points():
     # Clip 0.005 charges from |r - 1| = 0.005 on, with slope |A|, which is at most 10.
     found = certify(ClipDrift(), jnp.float32(0.005), **GRID)
     assert (found.slope_at_0_001, found.slope_at_0_01) == (0.0, 10.0)
+
+
+def test_parameters_of_another_drift_are_told():
+    assert lpo.UserError is scb.UserError
+    clip, dpo = load_objective("ppo"), load_objective("dpo")
+    for drift, parameters in ((dpo.drift, clip.parameters), (clip.drift, dpo.parameters)):
+        with pytest.raises(
+            lpo.UserError, match="the drift cannot take these parameters: of an objective give"
+        ):
+            certify(drift, parameters, **GRID)
 
 
 def test_a_certificate_says_on_which_grid():

@@ -14,7 +14,7 @@ from lpo.certificate import certify
 from lpo.drifts import DRIFTS, ClipDrift, DPODrift, Drift, LearnedDrift, drift_from_config
 from lpo.drifts.contract import BASES
 from lpo.drifts.network import FEATURES, drift_features
-from scb.agents.ppo import MAX_LOG_RATIO
+from scb.agents.drift import MAX_LOG_RATIO
 from scb.errors import UserError
 
 EXPRESSION = "0.5*A*d - tanh(2*log_r)"

@@ -16,7 +16,7 @@ from lpo.drifts import ClosedFormDrift, LearnedDrift, MirrorDrift
 from lpo.drifts.contract import BASES
 from lpo.objectives import KNOWN, Objective, load_objective, zoo_names
 from lpo.portable import _policy_loss, drift_function, numpy_drift, torch_drift, torch_loss
-from scb.agents.ppo import MAX_LOG_RATIO
+from scb.agents.drift import MAX_LOG_RATIO
 from scb.errors import UserError
 
 ROOT = Path(__file__).parents[2]

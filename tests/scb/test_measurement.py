@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 
 from scb import measurement
 from scb.agents.agent import evaluated_after
-from scb.agents.ppo import DIAGNOSIS, PPOConfig, PPOHyperparameters, clipped_surrogate_drift
+from scb.agents.drift import clipped_surrogate_drift
+from scb.agents.ppo import DIAGNOSIS, PPOConfig, PPOHyperparameters
 from scb.agents.spec import AgentSpec, environment_agent
 from scb.errors import UserError
 from scb.measurement import Agents, Judge, Place, measure, spaced, train_and_judge

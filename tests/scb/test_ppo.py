@@ -12,12 +12,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
+from scb.agents.drift import clipped_surrogate_drift
 from scb.agents.normalization import RunningStatistics
 from scb.agents.ppo import (
     PPO,
     PPOConfig,
     PPOHyperparameters,
-    clipped_surrogate_drift,
     generalized_advantages,
     random_order,
 )
