@@ -6,12 +6,14 @@ from pathlib import Path
 import jax
 import pytest
 
+import scb
 import scb.cli
 from lpo import cli
 from lpo.drifts import LearnedDrift
 from lpo.inner_loop import MetaTrainingConfig
 from lpo.objectives import save_objective
 from scb.agents.ppo import PPOConfig
+from scb.agents.spec import AgentSpec
 from scb.evolution import EvolutionConfig
 
 # What an artefact must say beside its weights.
@@ -29,6 +31,12 @@ def tiny_agent() -> PPOConfig:
         total_steps=24,
         hidden_sizes=(4,),
     )
+
+
+@pytest.fixture(scope="session")
+def tiny_spec() -> AgentSpec:
+    """Two batches on a bandit."""
+    return scb.environment_agent("ppo", "Pendulum-v1").on_bandit(20).with_steps(40)
 
 
 @pytest.fixture(scope="session")
