@@ -79,9 +79,9 @@ def config_of(environment: str, search: str, seed: int, plan: Mapping[str, Any])
 
 def seeds_of(plan: Mapping[str, Any], environment: str, search: str) -> int:
     """How many searches of a kind the plan has."""
+    usual: int = plan["environments"][environment]["seeds"]
     learned = search in rows(environment)[LEARNED].values()
-    further = plan["learned_seeds"] if learned else {}
-    return further.get(environment, plan["environments"][environment]["seeds"])
+    return plan["learned_seeds"].get(environment, usual) if learned else usual
 
 
 def parts(plan: Mapping[str, Any], report: dict[str, Any]) -> Iterator[Part]:

@@ -257,13 +257,14 @@ def shipped() -> list[dict[str, Any]]:
     """A row a bandit of the zoo: its expert's return, steps, minutes, cores, and whether those lack the expert's."""
     rows = []
     for name in sorted(zoo_names(), key=lambda x: rank(environment_spec(x).evaluation_environment)):
-        cost = bandit_metadata(name)["cost"]
+        metadata = bandit_metadata(name)
+        warm_start = listing.warm_start_cost(metadata)
         rows.append(
             {
                 **listing.entry(name),
-                "expert": cost["warm_start"]["expert_return"],
-                "cores": cost["machine"]["cores"],
-                "in_part": "seconds" not in cost["warm_start"],
+                "expert": warm_start["expert_return"],
+                "cores": metadata["cost"]["machine"]["cores"],
+                "in_part": "seconds" not in warm_start,
             }
         )
     return rows

@@ -22,6 +22,7 @@ _HOME = {
 }
 
 __all__ = list(_HOME)
+# Of `scb`, which lists them as its own.
 _HOME |= dict.fromkeys(("UserError", "__version__"), "scb")
 
 

@@ -110,12 +110,9 @@ def certify(
                 "lpo.load_objective returns."
             )
         return certify(drift.drift, drift.parameters, num_ratios, num_advantages)
-    if parameters is None:
-        parameters = drift.init(root_key(0))
-    else:
-        check_drift(
-            drift, parameters, "of an objective give the whole objective, or both of its own"
-        )
+    parameters = drift.init(root_key(0)) if parameters is None else parameters
+    advice = "it takes those of its own family, as objective.drift takes objective.parameters"
+    check_drift(drift, parameters, advice=advice)
     inner = np.linspace(-3.0, 3.0, num_ratios | 1)
     outer = np.linspace(-MAX_LOG_RATIO, MAX_LOG_RATIO, (num_ratios // 4) | 1)
     log_ratios = jnp.asarray(np.union1d(inner, outer), jnp.float32)

@@ -92,6 +92,15 @@ def found(metadata: Mapping[str, Any]) -> str:
     return f"{start}, evolved" if evolved and not start.endswith("evolved") else start
 
 
+def warm_start_cost(metadata: Mapping[str, Any]) -> Mapping[str, Any]:
+    """What the expert and the fit of a bandit cost, or of what its search goes on from; empty where there were none."""
+    cost, earlier = metadata["cost"], metadata["config"].get("started_from")
+    while "warm_start" not in cost and earlier:
+        cost, earlier = earlier["cost"], earlier["started_from"]
+    found: Mapping[str, Any] = cost.get("warm_start", {})
+    return found
+
+
 def _total(cost: Mapping[str, Any], earlier: Mapping[str, Any] | None, *names: str) -> float:
     """Of a search, the warm start and refinement before it, and the searches that it goes on from."""
     before = _total(earlier["cost"], earlier["started_from"], *names) if earlier else 0.0

@@ -48,15 +48,16 @@ def clipped_surrogate_drift(
 def check_drift(
     drift: DriftFunction,
     parameters: Any,
+    *,
     advice: str,
-    called: str = "the drift",
-    given: str = "these parameters",
+    drift_name: str = "the drift",
+    parameters_name: str = "these parameters",
 ) -> None:
     """A UserError where a drift cannot take its parameters, or returns no penalty for each ratio.
 
     Args:
       advice: what to give of an objective.
-      called, given: the drift and its parameters, as whoever gave them knows them.
+      drift_name, parameters_name: as whoever gave them knows them.
     """
     one = jnp.zeros(1)
     try:
@@ -65,11 +66,11 @@ def check_drift(
         raise
     except Exception as error:  # what a drift raises for parameters of another kind is its own
         raise UserError(
-            f"{called} cannot take {given}: {advice}; one of your own takes (parameters, log_ratio [B], advantage "
-            f"[B], progress [B]), and says here: {first_line(error).rstrip('.')}."
+            f"{drift_name} cannot take {parameters_name}: {advice}; a drift of your own takes (parameters, log_ratio "
+            f"[B], advantage [B], progress [B]), and says here: {first_line(error).rstrip('.')}."
         ) from error
     if getattr(penalty, "shape", None) != one.shape:
         raise UserError(
-            f"{called} returns {getattr(penalty, 'shape', penalty)} for one ratio: give a penalty for each, of the "
+            f"{drift_name} returns {getattr(penalty, 'shape', penalty)} for one ratio: give a penalty for each, of the "
             "shape of log_ratio."
         )

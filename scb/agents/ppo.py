@@ -195,9 +195,10 @@ class PPO(Agent):
         check_drift(
             self.drift,
             hyperparameters.drift,
-            "of an objective give objective.drift to the agent, and objective.parameters as the hyperparameters' drift",
-            "the agent's drift",
-            "the hyperparameters' drift",
+            advice="of an objective give objective.drift to the agent, and objective.parameters as the "
+            "hyperparameters' drift",
+            drift_name="the agent's drift",
+            parameters_name="the hyperparameters' drift",
         )
         key_policy, key_value, key_reset, key_train = split_key(key, 4)
         policy, value = self._networks(env_params)

@@ -148,7 +148,7 @@ def test_parameters_of_another_drift_are_told():
     clip, dpo = load_objective("ppo"), load_objective("dpo")
     for drift, parameters in ((dpo.drift, clip.parameters), (clip.drift, dpo.parameters)):
         with pytest.raises(
-            lpo.UserError, match="the drift cannot take these parameters: of an objective give"
+            lpo.UserError, match="the drift cannot take these parameters: it takes those of its own"
         ):
             certify(drift, parameters, **GRID)
 

@@ -538,6 +538,18 @@ def test_how_a_bandit_was_found():
         assert listing.found({"config": config, "cost": cost}) == expected
 
 
+def test_what_the_fit_cost_that_a_bandit_goes_back_to():
+    fit = {"expert_return": 7.0}
+    first = {"cost": {"warm_start": fit}, "started_from": None}
+    second = {"cost": {"seconds": 1.0}, "started_from": first}
+    for metadata, expected in (
+        ({"cost": first["cost"], "config": {}}, fit),
+        ({"cost": {}, "config": {"started_from": second}}, fit),
+        ({"cost": {}, "config": {"started_from": None}}, {}),
+    ):
+        assert listing.warm_start_cost(metadata) == expected
+
+
 def test_the_programs_say_their_version_and_complete_their_words():
     result = call("--version")
     assert (result.code, result.err) == (0, "")
