@@ -35,7 +35,6 @@ LATENTS = {
     "categorical": "categorical, equal",
     "softmax_categorical": "categorical, softmax",
 }
-LEARNED = "what is learned"
 SHAPES = ("linear", "quadratic", "cosine", "exponential", "step")
 
 
@@ -48,7 +47,7 @@ def rows(environment: str) -> dict[str, dict[str, str]]:
     """{row of the figure: {label: search}}; a search may stand in several rows."""
     best = "linear" if environment in WITH_CURRICULUM else NONE
     learned = {x: name_of(x, "normal", NONE) for x in ("T", "TI", "I")}
-    found = {LEARNED: learned}
+    found = {"what is learned": learned}
     if environment in WITH_CURRICULUM:
         learned["IC"] = name_of("I", "normal", "linear")
     found["latent"] = {label: name_of("I", x, best) for x, label in LATENTS.items()}
@@ -77,19 +76,13 @@ def config_of(environment: str, search: str, seed: int, plan: Mapping[str, Any])
     )
 
 
-def seeds_of(plan: Mapping[str, Any], environment: str, search: str) -> int:
-    """How many searches of a kind the plan has."""
-    usual: int = plan["environments"][environment]["seeds"]
-    learned = search in rows(environment)[LEARNED].values()
-    return plan["learned_seeds"].get(environment, usual) if learned else usual
-
-
 def parts(plan: Mapping[str, Any], report: dict[str, Any]) -> Iterator[Part]:
     """Searches, seeds outermost, so that an interrupted run has all lines."""
-    number = {(x, name): seeds_of(plan, x, name) for x in ENVIRONMENTS for name in searches_of(x)}
-    for seed in range(max(number.values())):
-        for environment, name in number:
-            if seed < number[environment, name]:
+    for seed in range(max(x["seeds"] for x in plan["environments"].values())):
+        for environment in ENVIRONMENTS:
+            for name in searches_of(environment):
+                if seed >= plan["environments"][environment]["seeds"]:
+                    continue
                 folder = f"{plan['runs']}/{environment}/{name.replace(' | ', '-')}-{seed}"
                 config = config_of(environment, name, seed, plan)
                 searched = partial(searches.searched_curve, config, folder)
@@ -130,8 +123,8 @@ def _claims_of(report: Report, environment: str) -> list[Claim]:
         return Claim(f"{environment}: {text}", evidence, 0.0, margin, reason, places=0)
 
     found = [
-        above("TI is better than T", LEARNED, "TI", "T"),
-        above("I is no worse than TI", LEARNED, "I", "TI", of_the_way(environment)),
+        above("TI is better than T", "what is learned", "TI", "T"),
+        above("I is no worse than TI", "what is learned", "I", "TI", of_the_way(environment)),
     ]
     for latent in ("normal", "uniform"):
         for other in ("categorical, equal", "categorical, softmax"):

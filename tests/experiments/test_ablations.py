@@ -11,7 +11,6 @@ TINY = {
     "evaluation_episodes": 2,
     "mean_evaluations": 2,
     "evaluate_mean_every": 1,
-    "learned_seeds": {},
     "environments": {
         "MountainCar-v0": {
             "generations": 1,
@@ -66,20 +65,6 @@ def test_a_search_is_the_papers_recipe_with_one_thing_changed():
     assert (
         ablations.config_of("Pendulum-v1", name_of("T", "normal", NONE), 0, plan).curriculum is None
     )
-
-
-def test_of_what_is_learned_there_may_be_more_searches_than_of_the_rest(monkeypatch):
-    monkeypatch.setattr(ablations, "ENVIRONMENTS", ("MountainCar-v0",))
-    plan = {**TINY, "runs": "runs", "learned_seeds": {"MountainCar-v0": 3}}
-    _, _, names, seeds = zip(*(part.path for part in ablations.parts(plan, {})), strict=True)
-    learned = [f"{x} | normal | none" for x in ("T", "TI", "I")] + ["I | normal | linear"]
-    every = ablations.searches_of("MountainCar-v0")
-    assert list(zip(seeds, names, strict=True)) == [
-        *(("0", x) for x in every),
-        *((seed, x) for seed in "12" for x in learned),
-    ]
-    fewer = {**TINY, "runs": "runs"}
-    assert [part.path[-1] for part in ablations.parts(fewer, {})] == ["0"] * len(every)
 
 
 @pytest.mark.slow
