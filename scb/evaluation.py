@@ -17,6 +17,8 @@ Policy = Callable[
 
 
 class Episodes(NamedTuple):
+    """What episodes were like, whose number is E."""
+
     returns: jax.Array  # [E] undiscounted sum of rewards
     lengths: jax.Array  # [E] steps
     observations: RunningStatistics | None = None  # of what the policy saw, where asked for

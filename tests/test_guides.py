@@ -23,16 +23,23 @@ def block(page):
 
 
 def test_an_agent_is_kept_and_acts_in_gymnasiums_environment(tmp_path, capsys):
-    kept, _ = blocks("agents.md")
+    kept, *_ = blocks("agents.md")
     exec(compile(kept.replace("/tmp/agent", str(tmp_path / "agent")), "agents.md", "exec"), {})
     assert -1000 < float(capsys.readouterr().out) < 0
 
 
 def test_agents_of_several_learning_rates_train_at_once(capsys):
-    _, together = blocks("agents.md")
-    exec(compile(together, "agents.md", "exec"), {})
+    _, vmapped, _ = blocks("agents.md")
+    exec(compile(vmapped, "agents.md", "exec"), {})
     returns = [float(x) for x in capsys.readouterr().out.strip(" []\n").split()]
     assert len(set(returns)) == 4 and min(returns) > -1600 and max(returns) < -50
+
+
+def test_agents_act_as_one(capsys):
+    *_, as_one = blocks("agents.md")
+    exec(compile(as_one, "agents.md", "exec"), {})
+    mean, worst, together = map(float, capsys.readouterr().out.split())
+    assert worst < mean < together < 0
 
 
 def test_objectives_are_compared_under_settings_of_ones_own(capsys):
