@@ -1,7 +1,7 @@
 """What ships with the library, as a table or as JSON: `scb list`."""
 
 import json as json_format
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from rich.table import Column, Table
@@ -47,14 +47,13 @@ def list_command(json: bool = False) -> None:
 def entry(name: str) -> dict[str, Any]:
     """What `scb list --json` says of a bandit."""
     metadata = bandit_metadata(name)
-    cost, earlier = metadata["cost"], metadata["config"].get("started_from")
     return {
         "name": name,
         "environment": environment_spec(name).evaluation_environment,
         "found": found(metadata),
-        "minutes": round(_total(cost, earlier, "seconds") / 60, 2),
-        "environment_steps": int(_total(cost, earlier, "environment_steps", *_IN_ENVIRONMENT)),
-        "bandit_steps": int(_total(cost, earlier, *_IN_BANDIT)),
+        "minutes": round(_total(metadata, "seconds") / 60, 2),
+        "environment_steps": int(_total(metadata, "environment_steps", *_IN_ENVIRONMENT)),
+        "bandit_steps": int(_total(metadata, *_IN_BANDIT)),
         "results": metadata["results"],
         "command": metadata["command"],
     }
@@ -94,18 +93,29 @@ def found(metadata: Mapping[str, Any]) -> str:
 
 def warm_start_cost(metadata: Mapping[str, Any]) -> Mapping[str, Any]:
     """What the expert and the fit of a bandit cost, or of what its search goes on from; empty where there were none."""
-    cost, earlier = metadata["cost"], metadata["config"].get("started_from")
-    while "warm_start" not in cost and earlier:
-        cost, earlier = earlier["cost"], earlier["started_from"]
-    found: Mapping[str, Any] = cost.get("warm_start", {})
-    return found
+    found: Iterator[Mapping[str, Any]] = (
+        x["warm_start"] for x in _costs(metadata) if "warm_start" in x
+    )
+    return next(found, {})
 
 
-def _total(cost: Mapping[str, Any], earlier: Mapping[str, Any] | None, *names: str) -> float:
+def _costs(metadata: Mapping[str, Any]) -> Iterator[Mapping[str, Any]]:
+    """Of a search, and of those that it goes on from, the last first."""
+    yield metadata["cost"]
+    earlier = metadata["config"].get("started_from")
+    while earlier:
+        yield earlier["cost"]
+        earlier = earlier["started_from"]
+
+
+def _total(metadata: Mapping[str, Any], *names: str) -> float:
     """Of a search, the warm start and refinement before it, and the searches that it goes on from."""
-    before = _total(earlier["cost"], earlier["started_from"], *names) if earlier else 0.0
-    stages = (cost, cost.get("warm_start", {}), cost.get("refinement", {}))
-    return before + sum(stage.get(name, 0.0) for stage in stages for name in names)
+    stages = (
+        stage
+        for cost in _costs(metadata)
+        for stage in (cost, cost.get("warm_start", {}), cost.get("refinement", {}))
+    )
+    return sum(stage.get(name, 0.0) for stage in stages for name in names)
 
 
 def _cell(result: Mapping[str, Any] | None) -> str:
