@@ -39,7 +39,7 @@ def loss_with(objective: str) -> Any:
         raise SystemExit(
             f"{objective} changes with the training, and Brax's loss doesn't know how far it is."
         )
-    drift = lpo.drift_function(objective)
+    objective_loss = lpo.loss_function(objective)
 
     def loss(
         params: Any, normalizer: Any, data: Any, key: jax.Array, ppo_network: Any, **settings: Any
@@ -66,8 +66,7 @@ def loss_with(objective: str) -> Any:
         )
         advantages = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
         log_ratio = log_prob - taken["log_prob"]
-        penalty = drift(log_ratio, advantages, 0.0)
-        policy_loss = -jnp.mean(jnp.exp(log_ratio) * advantages - penalty)
+        policy_loss = objective_loss(log_ratio, advantages)
         total = total - metrics["policy_loss"] + policy_loss
         return total, {**metrics, "total_loss": total, "policy_loss": policy_loss}
 

@@ -75,7 +75,7 @@ def make_train(objective: str, total_steps: int) -> Any:
     env, params = gymnax.make("Pendulum-v1")
     space = env.action_space(params)
     network = ActorCritic(space.shape[0])
-    drift = lpo.drift_function(objective)  # objective
+    objective_loss = lpo.loss_function(objective)  # objective
     batches = total_steps // (ENVS * STEPS)
     reset = jax.vmap(env.reset, in_axes=(0, None))
     step_env = jax.vmap(env.step, in_axes=(0, 0, 0, None))
@@ -106,9 +106,8 @@ def make_train(objective: str, total_steps: int) -> Any:
         policy, value = network.apply(parameters, batch.observation)
         log_ratio = policy.log_prob(batch.action) - batch.log_prob
         advantage = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
-        # The objective: PPO's two clipped terms and their minimum become these two lines.
-        penalty = drift(log_ratio, advantage, progress)
-        policy_loss = -jnp.mean(jnp.exp(log_ratio) * advantage - penalty)
+        # The objective: PPO's two clipped terms and their minimum become this line.
+        policy_loss = objective_loss(log_ratio, advantage, progress)
         value_loss = 0.5 * jnp.mean((value - target) ** 2)
         return policy_loss + VALUE * value_loss - ENTROPY * policy.entropy().mean()
 

@@ -61,7 +61,8 @@ class LPO(PPO):
             )
             advantages = batch.advantages - batch.advantages.mean()
             advantages = advantages / (batch.advantages.std() + 1e-8)
-            log_ratio = log_prob - batch.trajectories.log_prob
+            # As in the drift: beyond it the penalty is bounded, and a ratio that is not would outweigh it.
+            log_ratio = jnp.clip(log_prob - batch.trajectories.log_prob, -20.0, 20.0)
             penalty = self.drift(log_ratio, advantages)  # the objective
             surrogate = jnp.mean(jnp.exp(log_ratio) * advantages - penalty)  # the objective
             return -surrogate - self.ent_coef * entropy.mean()

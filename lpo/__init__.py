@@ -16,7 +16,13 @@ _HOME = {
         "inner_loop": ("MetaTrainingConfig",),
         "meta_training": ("meta_train",),
         "objectives": ("Objective", "load_objective", "save_objective"),
-        "portable": ("drift_function", "numpy_drift", "torch_drift", "torch_loss"),
+        "portable": (
+            "drift_function",
+            "loss_function",
+            "numpy_drift",
+            "torch_drift",
+            "torch_loss",
+        ),
     }.items()
     for name in names
 }

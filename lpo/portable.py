@@ -4,7 +4,7 @@ A PPO that is not this project's maximises `mean(ratio * advantage - drift)` in 
 its clipped minimum (Lu et al., 2022). What a drift was learned on comes with it: log-ratios clipped
 at ±`MAX_LOG_RATIO`, and advantages that the caller has normalised over the minibatch.
 
-    policy_loss = lpo.torch_loss("lpo-pendulum")
+    policy_loss = lpo.loss_function("lpo-pendulum")  # in PyTorch lpo.torch_loss
     loss = policy_loss(new_log_prob - old_log_prob, advantage, progress)
 """
 
@@ -53,6 +53,17 @@ def drift_function(
     return partial(_in_jax, objective.drift, objective.parameters)
 
 
+def loss_function(objective: Named) -> Callable[..., jax.Array]:
+    """What takes the place of PPO's policy loss in JAX: the mean of drift - ratio * advantage, to be minimised.
+
+    Arguments and errors as for `drift_function`, and a UserError for an empty batch; what is returned gives a scalar.
+    The gradient of a log-ratio beyond ±MAX_LOG_RATIO is zero, as in training, where a drift alone, which is bounded
+    there, would leave a ratio that is not.
+    """
+    objective = load_objective(objective)
+    return partial(_loss_in_jax, objective.drift, objective.parameters)
+
+
 def numpy_drift(
     objective: Named,
 ) -> Callable[..., np.ndarray]:
@@ -79,15 +90,16 @@ def torch_drift(objective: Named) -> "TorchFunction":
 
 
 def torch_loss(objective: Named) -> "TorchFunction":
-    """What takes the place of PPO's policy loss in PyTorch: the mean of drift - ratio * advantage, to be minimised.
-
-    Arguments and errors as for `torch_drift`; what is returned gives a scalar. The gradient of a
-    log-ratio beyond ±MAX_LOG_RATIO is zero, as in training.
-    """
+    """`loss_function` for PyTorch; arguments and errors as for `torch_drift`, and a UserError for an empty batch."""
     return _for_torch(_loss_in_torch, objective)
 
 
 def _policy_loss(xp: Any, penalty: Any, log_ratio: Any, advantage: Any) -> Any:
+    if 0 in penalty.shape:
+        raise UserError(
+            f"log_ratio and advantage have shape {tuple(penalty.shape)}, which is of no actions: a loss is the mean "
+            "over a minibatch of one or more."
+        )
     ratio = xp.exp(xp.clip(log_ratio, -MAX_LOG_RATIO, MAX_LOG_RATIO))
     return (penalty - ratio * advantage).mean()
 
@@ -108,6 +120,15 @@ def _for_torch(function: "TorchFunction", objective: Named) -> "TorchFunction":
 
 def _in_jax(drift: Drift, parameters: Any, *arguments: Any, **named: Any) -> Any:
     return _converted(jnp, drift, parameters, *arguments, **named)
+
+
+def _loss_in_jax(
+    drift: Drift, parameters: Any, log_ratio: Any, advantage: Any, progress: Any = None
+) -> Any:
+    penalty = _in_jax(drift, parameters, log_ratio, advantage, progress)
+    return _policy_loss(
+        jnp, penalty, *(jnp.asarray(x, penalty.dtype) for x in (log_ratio, advantage))
+    )
 
 
 def _in_numpy(drift: Drift, parameters: Any, *arguments: Any, **named: Any) -> Any:

@@ -15,7 +15,14 @@ import pytest
 from lpo.drifts import ClosedFormDrift, LearnedDrift, MirrorDrift
 from lpo.drifts.contract import BASES
 from lpo.objectives import KNOWN, Objective, load_objective, zoo_names
-from lpo.portable import _policy_loss, drift_function, numpy_drift, torch_drift, torch_loss
+from lpo.portable import (
+    _policy_loss,
+    drift_function,
+    loss_function,
+    numpy_drift,
+    torch_drift,
+    torch_loss,
+)
 from scb.agents.drift import MAX_LOG_RATIO
 from scb.errors import UserError
 
@@ -67,6 +74,17 @@ def contract(objective: Objective, log_ratio, advantage, progress) -> jax.Array:
 def contract_slope(objective: Objective, log_ratio, advantage, progress) -> jax.Array:
     """[B] derivative of the penalty with respect to the log-ratio."""
     return jax.grad(lambda x: contract(objective, x, advantage, progress).sum())(log_ratio)
+
+
+def minimised(objective: Objective, log_ratio, advantage, progress) -> tuple[jax.Array, jax.Array]:
+    """The policy loss of training, with log-ratios clipped as there, and its slope."""
+
+    def loss(log_ratio):
+        penalty = contract(objective, log_ratio, advantage, progress)
+        ratio = jnp.exp(jnp.clip(log_ratio, -MAX_LOG_RATIO, MAX_LOG_RATIO))
+        return -jnp.mean(ratio * advantage - penalty)
+
+    return jax.value_and_grad(loss)(log_ratio)
 
 
 # -- NumPy and JAX ------------------------------------------------------------------------------
@@ -216,7 +234,34 @@ def test_an_unknown_name_is_refused_as_everywhere(make):
         make("dppo")
 
 
-@pytest.mark.parametrize("made", [drift_function, numpy_drift])
+@every_objective
+@pytest.mark.parametrize("largest_log_ratio", [2.0, 30.0])
+def test_the_loss_for_jax_is_what_training_minimises(objective, largest_log_ratio):
+    batch = [jnp.float32(x) for x in points(largest_log_ratio)]
+    expected, expected_slope = minimised(objective, *batch)
+    loss, slope = jax.jit(jax.value_and_grad(loss_function(objective)))(*batch)
+    assert float(loss) == pytest.approx(float(expected), rel=1e-5)
+    scale = float(jnp.abs(expected_slope).max())
+    np.testing.assert_allclose(slope, expected_slope, rtol=1e-4, atol=1e-6 * max(scale, 1.0))
+
+
+@pytest.mark.parametrize("objective", ["ppo", "dpo", "lpo-pendulum"])
+def test_in_a_loss_for_jax_a_far_ratio_pulls_at_nothing(objective):
+    far = jnp.float32([25.0, jnp.inf, -jnp.inf, 0.1])
+    loss, slope = jax.value_and_grad(loss_function(objective))(far, jnp.ones(4))
+    assert np.isfinite(loss) and np.isfinite(slope).all()
+    np.testing.assert_array_equal(slope[:3], 0.0)
+    assert slope[3] < 0.0
+
+
+def test_a_loss_takes_a_minibatch_of_one_or_more(one_sentence):
+    with pytest.raises(UserError, match=r"shape \(0,\), which is of no actions") as error:
+        loss_function("ppo")(jnp.zeros(0), jnp.zeros(0))
+    one_sentence(str(error.value))
+    assert drift_function("ppo")(jnp.zeros(0), jnp.zeros(0)).shape == (0,)
+
+
+@pytest.mark.parametrize("made", [drift_function, loss_function, numpy_drift])
 def test_what_a_user_holds_can_be_pickled(made):
     function = made("lpo-pendulum")
     again = pickle.loads(pickle.dumps(function))
@@ -312,12 +357,7 @@ class TestTorch:
     @every_objective
     def test_loss_is_what_training_minimises(self, objective, torch):
         batch = [x.astype(np.float32) for x in points(2.0)]
-
-        def surrogate(log_ratio, advantage, progress):
-            penalty = contract(objective, log_ratio, advantage, progress)
-            return -jnp.mean(jnp.exp(log_ratio) * advantage - penalty)
-
-        expected, expected_slope = jax.value_and_grad(surrogate)(*map(jnp.asarray, batch))
+        expected, expected_slope = minimised(objective, *map(jnp.asarray, batch))
         loss, slope = in_torch(torch_loss(objective), *batch[:2], torch.tensor(batch[2]))
         assert float(loss) == pytest.approx(float(expected), rel=1e-5)
         np.testing.assert_allclose(slope, expected_slope, rtol=1e-4, atol=1e-6)
@@ -328,6 +368,11 @@ class TestTorch:
         # -(e^20 + e^-20) / 2 = -242582597.7
         assert float(loss) == pytest.approx(-242582597.7, rel=1e-6)
         np.testing.assert_array_equal(slope, 0.0)
+
+    def test_a_minibatch_is_of_one_or_more(self, torch, one_sentence):
+        with pytest.raises(UserError, match=r"shape \(0,\), which is of no actions") as error:
+            torch_loss("ppo")(torch.zeros(0), torch.zeros(0))
+        one_sentence(str(error.value))
 
     def test_shapes_that_would_broadcast_are_refused(self, torch):
         with pytest.raises(UserError, match="same shape"):
