@@ -35,10 +35,18 @@ def text(value: Estimate | Mapping[str, Any] | Any, places: int = 0, sign: bool 
     if not isinstance(value, Mapping | Estimate):
         value = estimate(value)
     values: Any = value if isinstance(value, Mapping) else value.as_dict()
-    found = number(values["value"], places, sign)
-    if values["low"] is not None:
-        found += f" [{number(values['low'], places)}, {number(values['high'], places)}]"
-    return found
+    found, low, high = (values[x] for x in ("value", "low", "high"))
+    if low is None:
+        return number(found, places, sign)
+    shown = _seen(found, places) if low * high > 0 else places
+    ends = [number(end, _seen(end, places)) for end in (low, high)]
+    return f"{number(found, shown, sign)} [{', '.join(ends)}]"
+
+
+def _seen(value: float, places: int) -> int:
+    """Decimal places, one more where that shows a digit that is not zero: an end's side of zero decides a claim."""
+    hidden = places and round(value, places) == 0 != round(value, places + 1)
+    return places + bool(hidden)
 
 
 def digits(interval: Mapping[str, Any] | None, sign: bool = False) -> str:

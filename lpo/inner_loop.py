@@ -50,7 +50,7 @@ class MetaTrainingConfig:
         transfer (return of the bandit-trained agent in the bandit's evaluation environment).
       agent: PPO's static configuration; None takes `task_agent`'s.
       contexts: that a batch of a bandit holds.
-      horizons: how long inner agents train, as fractions of the setting's number of updates (0.25,0.5,1), of
+      horizons: how long inner agents train, as multiples of the setting's number of updates (0.25,0.5,1), of
         which one is drawn for each generation. None: always in full. A temporally-aware drift
         learns here that the fraction of training done is what matters.
       hyperparameters: values that inner agents draw PPO's hyperparameters from (such as learning_rate=0.001

@@ -65,8 +65,14 @@ class Objective:
             )
 
     def __repr__(self) -> str:
-        sizes = [x.size for x in jax.tree.leaves(self.parameters) if hasattr(x, "size")]
-        return f"Objective({self.name!r}, {self.drift!r}, {sum(sizes)} parameters)"
+        drift, given = repr(self.drift), self.parameters
+        # Their own settings are the defaults, so that one program is for all.
+        if isinstance(self.drift, ClipDrift | DPODrift):
+            named = given if isinstance(given, Mapping) else {"clip": given}
+            settings = ", ".join(f"{name}={value!s}" for name, value in named.items())
+            drift = f"{type(self.drift).__name__}({settings})"
+        sizes = [x.size for x in jax.tree.leaves(given) if hasattr(x, "size")]
+        return f"Objective({self.name!r}, {drift}, {sum(sizes)} parameters)"
 
     @property
     def digests(self) -> dict[str, str]:

@@ -71,7 +71,7 @@ class DiscoveryConfig:
         SHAPE:INITIAL:FINAL:BEGIN:TRANSITION such as linear:100:1000:20:160 (lengths in steps, then
         generations).
       init: expert (fit the bandit to an expert first, in a minute) or random (as the paper).
-      start: start from this bandit (a zoo name or file.npz) instead.
+      start: start from this bandit (a zoo name or file.npz) instead, whatever the initialisation.
       reward_std: scale the reward that the search starts from to this standard deviation, over
         contexts and uniform actions, and shift it to mean zero. PPO, which normalises advantages, is
         nearly indifferent; SAC, whose temperature starts at 1 and whose critics start near 0, is not.

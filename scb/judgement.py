@@ -7,7 +7,7 @@ import numpy as np
 from gymnax.environments import environment
 
 from scb.agents.spec import AgentSpec, algorithms_for, bandit_agent
-from scb.console import console
+from scb.console import console, progress_console
 from scb.environments.registry import environment_spec
 from scb.environments.synthetic import SyntheticBandit, Weights
 from scb.environments.synthetic_mdp import SyntheticMDP
@@ -102,8 +102,11 @@ def judge_all(
     num_episodes: int = EPISODES,
 ) -> dict[str, Any]:
     """What agents of every fitting algorithm earn, by name of the algorithm in capitals, printed as it comes."""
+    algorithms = algorithms_for(judge_in.env.action_space(judge_in.params))
+    names = ", ".join(map(str.upper, algorithms))
+    progress_console(quiet=False).print(f"judging by {num_agents} agents each of {names}")
     results = {}
-    for algorithm in algorithms_for(judge_in.env.action_space(judge_in.params)):
+    for algorithm in algorithms:
         spec = bandit_agent(algorithm, judge_in.name, sampled)
         found = judge(
             spec, synthetic, weights, judge_in, VALIDATING.start, num_agents, num_episodes

@@ -280,6 +280,7 @@ def warm_start(
             f"the expert of {place.name} earns {expert.mean_return:.4g} and random actions {random:.4g}: give it more "
             "steps or generations, or choose another expert."
         )
+    progress_console(quiet).print(f"fitting a bandit to an expert of {expert.mean_return:.4g}")
     dataset, steps = expert_dataset(expert, place, key_data, config)
     found = fit(dataset, key_fit)
     if config.aggregation_rounds:

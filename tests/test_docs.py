@@ -173,6 +173,7 @@ def test_what_is_said_of_suites_beside_the_tables_follows_from_the_data():
     three = five.without("CartPole-v1", "Pendulum-v1")
     for row, one, other in (
         ("`lpo-pendulum` − clip 0.5", "lpo-pendulum", "ppo-0.5"),
+        ("`lpo-pendulum` − DPO", "lpo-pendulum", "dpo"),
         ("`lpo-pendulum` − DPO, tuned", "lpo-pendulum", "dpo-2-0.3"),
         ("DPO, tuned − DPO", "dpo-2-0.3", "dpo"),
     ):

@@ -108,6 +108,18 @@ def test_an_objective_bears_the_name_that_it_was_loaded_by(name):
     assert load_objective(name).name == name
 
 
+@pytest.mark.parametrize(
+    ("name", "drift"),
+    [
+        ("ppo-0.3", "ClipDrift(clip=0.3)"),
+        ("dpo-4-1.2", "DPODrift(alpha=4.0, beta=1.2)"),
+        ("none", "NoDrift()"),
+    ],
+)
+def test_an_objective_is_shown_with_the_constants_that_it_trains_with(name, drift):
+    assert f"Objective('{name}', {drift}, " in repr(load_objective(name))
+
+
 def test_every_listed_name_loads():
     for name in [*KNOWN, *zoo_names()]:
         assert load_objective(name).name == name
