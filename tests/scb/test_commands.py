@@ -82,6 +82,8 @@ def test_a_discovery_says_what_its_bandit_is_worth_and_where_it_lies(discovered)
     assert text.count("; mode actions IQM ") == 3
     assert Path(lines[-1].removeprefix("bandit: ")) == folder / "Synthetic-CartPole-v1.npz"
     assert "generation 2/2: fitness" in result.err
+    # Which may take longer than the search.
+    assert result.err.splitlines()[-1] == "judging by 20 agents each of PPO, SAC, DQN"
 
 
 def test_a_bandit_is_there_before_it_is_judged(discovered, tmp_path, monkeypatch):

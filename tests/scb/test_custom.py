@@ -394,6 +394,7 @@ def test_a_bandit_is_discovered_for_it_and_says_what_its_returns_are_to_be_compa
     assert status == 0, said.err
     assert f"to compare with, on {name}: random actions: 2" in said.out
     assert "the expert that the bandit was fitted to, in 20 episodes: " in said.out
+    assert "fitting a bandit to an expert of " in said.err
     path = out / f"Synthetic-{module}-pole.npz"
     assert bandit_metadata(str(path))["config"]["evaluation_environment"] == name
     assert environment_spec(str(path)).evaluation_environment == name
