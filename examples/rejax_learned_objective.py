@@ -61,8 +61,9 @@ class LPO(PPO):
             )
             advantages = batch.advantages - batch.advantages.mean()
             advantages = advantages / (batch.advantages.std() + 1e-8)
-            # As in the drift: beyond it the penalty is bounded, and a ratio that is not would outweigh it.
-            log_ratio = jnp.clip(log_prob - batch.trajectories.log_prob, -20.0, 20.0)
+            log_ratio = log_prob - batch.trajectories.log_prob
+            # Clipped for the ratio too: what lies further out costs no more, but the ratio would grow.
+            log_ratio = jnp.clip(log_ratio, -20.0, 20.0)  # the objective
             penalty = self.drift(log_ratio, advantages)  # the objective
             surrogate = jnp.mean(jnp.exp(log_ratio) * advantages - penalty)  # the objective
             return -surrogate - self.ent_coef * entropy.mean()

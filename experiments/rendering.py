@@ -44,9 +44,9 @@ def text(value: Estimate | Mapping[str, Any] | Any, places: int = 0, sign: bool 
 
 
 def _seen(value: float, places: int) -> int:
-    """Decimal places, one more where that shows a digit that is not zero: an end's side of zero decides a claim."""
-    hidden = places and round(value, places) == 0 != round(value, places + 1)
-    return places + bool(hidden)
+    """Decimal places, up to two more for a digit that is not zero: an end's side of zero decides a claim."""
+    enough = (x for x in range(places, places + 3) if round(value, x))
+    return next(enough, places) if places else 0
 
 
 def digits(interval: Mapping[str, Any] | None, sign: bool = False) -> str:

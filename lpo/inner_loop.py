@@ -236,7 +236,7 @@ class TaskTraining:
         """[number] fitnesses of as many agents, each trained with these drift parameters.
 
         Args:
-          horizon: how long they train, as a fraction of the inner loop's iterations; traced.
+          horizon: how long they train, as a multiple of the inner loop's iterations; traced.
         """
         key_draw, key_agents = split_key(key)
         hyperparameters = self.spec.sample(key_draw, number)

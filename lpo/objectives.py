@@ -1,5 +1,6 @@
 """Objectives by name or file: PPO's clip, DPO, no drift, the learned ones of the zoo, and formulas."""
 
+import contextlib
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass, field, replace
@@ -65,14 +66,12 @@ class Objective:
             )
 
     def __repr__(self) -> str:
-        drift, given = repr(self.drift), self.parameters
-        # Their own settings are the defaults, so that one program is for all.
-        if isinstance(self.drift, ClipDrift | DPODrift):
-            named = given if isinstance(given, Mapping) else {"clip": given}
-            settings = ", ".join(f"{name}={value!s}" for name, value in named.items())
-            drift = f"{type(self.drift).__name__}({settings})"
-        sizes = [x.size for x in jax.tree.leaves(given) if hasattr(x, "size")]
-        return f"Objective({self.name!r}, {drift}, {sum(sizes)} parameters)"
+        drift = self.drift
+        # Parameters of another drift are told where they are used, and not where they are shown.
+        with contextlib.suppress(Exception):
+            drift = drift.with_parameters(self.parameters)
+        sizes = [x.size for x in jax.tree.leaves(self.parameters) if hasattr(x, "size")]
+        return f"Objective({self.name!r}, {drift!r}, {sum(sizes)} parameters)"
 
     @property
     def digests(self) -> dict[str, str]:

@@ -39,12 +39,15 @@ def drift_function(
 
     Returns:
       (log_ratio, advantage, progress) -> penalty:
-        log_ratio: [...] log pi(a|s) - log pi_behaviour(a|s), in nats; clipped at ±MAX_LOG_RATIO.
+        log_ratio: [...] log pi(a|s) - log pi_behaviour(a|s), in nats; clipped at ±MAX_LOG_RATIO. A loss has to clip it
+          for its ratio too, as `loss_function` does: further out the penalty stays, and the ratio grows.
         advantage: [...] normalised over the minibatch.
         progress: a number or [...], the fraction of training done, in [0, 1]. Only temporal drifts
           depend on it, and others need none.
         penalty: [...], in units of the advantage.
-      It raises a UserError where log_ratio and advantage differ in shape, or a temporal drift is given no progress.
+      It raises a UserError where log_ratio and advantage differ in shape, where progress is neither one number nor
+      one for each, and where a temporal drift is given none. So it does for progress outside of [0, 1], but of tensors
+      and of JAX's arrays, whose values are not looked at.
 
     Raises:
       UserError: as `load_objective`.
@@ -57,8 +60,7 @@ def loss_function(objective: Named) -> Callable[..., jax.Array]:
     """What takes the place of PPO's policy loss in JAX: the mean of drift - ratio * advantage, to be minimised.
 
     Arguments and errors as for `drift_function`, and a UserError for an empty batch; what is returned gives a scalar.
-    The gradient of a log-ratio beyond ±MAX_LOG_RATIO is zero, as in training, where a drift alone, which is bounded
-    there, would leave a ratio that is not.
+    Ratio and penalty are both of the clipped log-ratio, as in training: beyond ±MAX_LOG_RATIO the gradient is zero.
     """
     objective = load_objective(objective)
     return partial(_loss_in_jax, objective.drift, objective.parameters)
@@ -144,7 +146,7 @@ def _in_torch(
         if not isinstance(value, torch.Tensor):
             raise UserError(
                 f"{name} is no tensor of PyTorch but of the class {type(value).__name__}: give a tensor, such as "
-                "torch.as_tensor makes, or use lpo.numpy_drift or lpo.drift_function."
+                "torch.as_tensor makes, or use lpo.numpy_drift, or lpo.loss_function in JAX."
             )
     if not log_ratio.is_floating_point():  # which would cut the advantage's decimals off
         log_ratio = log_ratio.to(advantage if advantage.is_floating_point() else torch.float32)

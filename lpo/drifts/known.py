@@ -1,11 +1,12 @@
 """Drifts that are known in closed form: PPO's clip, DPO, and none."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import chex
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from lpo.drifts.bases import DPO_ALPHA, DPO_BETA, discovered_drift
 from lpo.drifts.contract import Array, Drift
@@ -27,6 +28,9 @@ class ClipDrift(Drift):
 
     def init(self, key: jax.Array, scale: float = 1.0) -> jax.Array:
         return jnp.float32(self.clip)
+
+    def with_parameters(self, parameters: Any) -> "ClipDrift":
+        return replace(self, clip=_shortest(parameters))
 
     def __call__(
         self, parameters: Any, log_ratio: Array, advantage: Array, progress: Array, xp: Any = jnp
@@ -51,10 +55,10 @@ class DPODrift(Drift):
 
     def with_parameters(self, parameters: Any) -> "DPODrift":
         given, own = (
-            {name: float(x) for name, x in of.items()}
+            {name: _shortest(x) for name, x in of.items()}
             for of in (parameters, self.init(root_key(0)))
         )
-        return self if given == own else DPODrift(**given)
+        return self if given == own else replace(self, **given)
 
     def __call__(
         self, parameters: Any, log_ratio: Array, advantage: Array, progress: Array, xp: Any = jnp
@@ -79,3 +83,8 @@ class NoDrift(Drift):
         chex.assert_equal_shape([log_ratio, advantage, progress])
         # Not zeros_like, which PyTorch refuses to differentiate.
         return log_ratio - log_ratio
+
+
+def _shortest(number: Any) -> float:
+    """With no more decimals than tell it from its neighbours in 32 bits: 0.3, and not 0.30000001192092896."""
+    return float(str(np.float32(number)))

@@ -320,13 +320,14 @@ def test_returns_that_are_no_number_count_as_a_random_policy():
     assert rendering.span([3, 3]) == "3" and rendering.span([30, 60, 30]) == "30 to 60"
 
 
-def test_an_end_that_is_not_zero_is_not_written_as_zero():
+def test_an_end_that_is_not_zero_within_two_more_places_is_not_written_as_zero():
     assert text({"value": 0.134, "low": 0.004, "high": 0.26}, 2, sign=True) == "+0.13 [0.004, 0.26]"
     assert (
         text({"value": 0.004, "low": -0.004, "high": 0.02}, 2) == "0.00 [\N{MINUS SIGN}0.004, 0.02]"
     )
     assert text({"value": 0.002, "low": 0.001, "high": 0.004}, 2) == "0.002 [0.001, 0.004]"
-    assert text({"value": 0.0, "low": 0.0, "high": 0.0002}, 2) == "0.00 [0.00, 0.00]"
+    assert text({"value": 0.03, "low": 0.0004, "high": 0.06}, 2) == "0.03 [0.0004, 0.06]"
+    assert text({"value": 0.0, "low": 0.0, "high": 0.00002}, 2) == "0.00 [0.00, 0.00]"
     # Of whole points a tenth says nothing.
     assert text({"value": 4.0, "low": 0.2, "high": 9.0}) == "4 [0, 9]"
 

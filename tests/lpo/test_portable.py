@@ -148,7 +148,7 @@ def test_a_progress_in_per_cent_is_told():
 
 
 @pytest.mark.parametrize("progress", [50.0, np.float32(50), np.array(-0.1), [0.5, 0.5, np.nan]])
-@pytest.mark.parametrize("make", [numpy_drift, drift_function])
+@pytest.mark.parametrize("make", [numpy_drift, drift_function, loss_function])
 def test_no_progress_outside_of_0_and_1_is_taken(make, progress, one_sentence):
     with pytest.raises(UserError, match=r"the fraction of training done, in \[0, 1\]") as error:
         make("ta-lpo")(np.zeros(3), np.ones(3), progress)
@@ -220,7 +220,7 @@ def test_a_function_for_jax_is_differentiated_and_compiled():
     assert float(slope(25.0)) == 0.0  # beyond the clip
 
 
-@pytest.mark.parametrize("make", [numpy_drift, drift_function])
+@pytest.mark.parametrize("make", [numpy_drift, drift_function, loss_function])
 def test_shapes_that_would_broadcast_are_refused(make, one_sentence):
     with pytest.raises(UserError) as error:
         make("ppo")(np.zeros((5, 1)), np.zeros(5), 0.0)
@@ -228,7 +228,7 @@ def test_shapes_that_would_broadcast_are_refused(make, one_sentence):
     assert "(5, 1)" in message and "(5,)" in message
 
 
-@pytest.mark.parametrize("make", [numpy_drift, drift_function])
+@pytest.mark.parametrize("make", [numpy_drift, drift_function, loss_function])
 def test_an_unknown_name_is_refused_as_everywhere(make):
     with pytest.raises(UserError, match="unknown objective 'dppo'"):
         make("dppo")
@@ -390,7 +390,8 @@ class TestTorch:
         given = {"log_ratio": torch.zeros(5), "advantage": torch.zeros(5), wrong: np.zeros(5)}
         with pytest.raises(UserError) as error:
             torch_loss("ppo")(**given, progress=0.0)
-        assert f"{wrong} is no tensor of PyTorch but" in one_sentence(str(error.value))
+        message = one_sentence(str(error.value))
+        assert f"{wrong} is no tensor of PyTorch but" in message and "loss_function" in message
 
     @pytest.mark.slow
     @pytest.mark.parametrize("objective", ["ppo", "dpo", "lpo-pendulum"])
