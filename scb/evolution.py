@@ -46,8 +46,7 @@ class EvolutionConfig:
     Attributes:
       strategy: any of evosax's, by name (SNES, Open_ES, CMA_ES, ...).
       population_size: candidates a generation.
-      num_generations: how many of them. A search for a bandit takes 0 too: what it would start from is what it ends
-        with.
+      num_generations: how many of them; of a search for a bandit also 0, which ends with what it would start from.
       sigma: initial standard deviation of the search distribution.
       sigma_decay: factor on it a generation, for strategies with a schedule (Open_ES).
       sigma_limit: what it decays down to.
