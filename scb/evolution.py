@@ -46,7 +46,7 @@ class EvolutionConfig:
     Attributes:
       strategy: any of evosax's, by name (SNES, Open_ES, CMA_ES, ...).
       population_size: candidates a generation.
-      num_generations: how many of them; of a search for a bandit also 0, which ends with what it would start from.
+      num_generations: how many of them; with 0 a search for a bandit, which alone takes that, ends with its start.
       sigma: initial standard deviation of the search distribution.
       sigma_decay: factor on it a generation, for strategies with a schedule (Open_ES).
       sigma_limit: what it decays down to.
