@@ -97,14 +97,19 @@ def of_searches(
     return Estimate(one - other, None, None, np.size(ours))
 
 
+def corrected(number: int) -> float:
+    """The confidence of each of so many intervals: Bonferroni's, so that all hold together with 95 %."""
+    return 1.0 - (1.0 - CONFIDENCE) / max(1, number)
+
+
 def judge(claims: Sequence[Claim]) -> list[Judged]:
-    """Every claim's outcome; intervals that can be are Bonferroni's, so that all hold together with 95 %."""
+    """Every claim's outcome; intervals that can be are `corrected` for their number."""
     return [_judge(claim, confidence(claims)) for claim in claims]
 
 
 def confidence(claims: Sequence[Claim]) -> float:
     """Of the interval of each claim."""
-    return 1.0 - (1.0 - CONFIDENCE) / max(1, sum(callable(c.evidence) for c in claims))
+    return corrected(sum(callable(c.evidence) for c in claims))
 
 
 def _judge(claim: Claim, confidence: float) -> Judged:

@@ -75,6 +75,8 @@ def collect(folders: Sequence[Path]) -> dict[str, Any]:
             left_out.append({"name": folder.resolve().name, "why": outcome})
         else:
             runs.append(outcome)
+    if not folders:
+        raise UserError("no folders: name those of runs of scb discover, such as runs/discover.")
     if not runs:
         reasons = "; ".join(f"{x['name']}: {x['why']}" for x in left_out)
         raise UserError(f"no run starts warm or random and was judged once ({reasons}).")
@@ -290,6 +292,8 @@ def figure(report: Mapping[str, Any]) -> Figure:
     runs = [run for run in report["runs"] if run["target"] is not None]
     environments = list(dict.fromkeys(run["environment"] for run in runs))
     drawn = Figure(figsize=(plotting.WIDTH, 2.4 * len(environments) + 1.2))
+    if not environments:
+        return drawn
     grid = drawn.subplots(len(environments), 2, sharey="row", squeeze=False)
     columns: Any = (
         (1, "minutes", (1, 2, 5), "{x:g}"),  # which span few decades

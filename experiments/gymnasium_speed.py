@@ -19,7 +19,7 @@ from gymnax.wrappers.gym import GymnaxToGymWrapper, GymnaxToVectorGymWrapper
 
 from experiments.harness import Experiment, Report, Save, settled
 from experiments.timing import OWN, in_turn
-from scb.errors import at_least
+from scb.errors import UserError, at_least, positive
 from scb.gymnasium import NAMESPACE
 
 PEER = "gymnax's wrapper"
@@ -44,6 +44,9 @@ class Options:
 
     def __post_init__(self) -> None:
         at_least(1, self, "num_envs", "repeats")
+        positive(self, "seconds")
+        if not self.bandits:
+            raise UserError("no bandits: name one at least.")
 
 
 def steps_a_second(step: Callable[[], Any], steps: int, seconds: float) -> float:

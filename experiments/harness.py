@@ -205,7 +205,9 @@ class Experiment:
             needed = self.keys if files.only_render else ()
             report = read(out, missing_is_new=not files.only_render, keys=needed)
             if report and report.get("experiment") != self.name:
-                raise UserError(f"{out} is no report of {self.name}: choose another --out.")
+                raise UserError(
+                    f"{out} is no report of {self.name}: choose another --out, or of all experiments --data."
+                )
             if not files.only_render:
                 self._measure(options, report, out, jobs)
         self.render(report, docs)
@@ -218,15 +220,16 @@ class Experiment:
             preset = options.preset
             if report.get("preset", preset) != preset:
                 raise UserError(
-                    f"{out} holds the preset {report['preset']}: choose another --out for the preset {preset}; "
-                    "its page is then written beside it."
+                    f"{out} holds the preset {report['preset']}: choose another --out for the preset {preset}, beside "
+                    "which its page is then written; of all experiments another --data and --docs."
                 )
             plan = json.loads(json.dumps(dict(self.presets[preset])))
             stored = report.get("plan", plan)
             more = {x: plan[x] for x in self.grows if grown(stored.get(x), plan[x])}
             if {**stored, **more} != plan:
                 raise UserError(
-                    f"{out} was measured when the preset {preset} was another one: choose another --out."
+                    f"{out} was measured when the preset {preset} was another one: choose another --out, or of all "
+                    "experiments --data."
                 )
             fixed = {"preset": preset, "plan": plan, "complete": False}
             forget_replaced(report)

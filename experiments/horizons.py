@@ -15,7 +15,7 @@ import jax
 import numpy as np
 from matplotlib.figure import Figure
 
-from experiments.claims import CONFIDENCE
+from experiments.claims import corrected
 from experiments.harness import Experiment, Report, packed, settled, unpacked
 from experiments.parts import InParts, Part
 from lpo import figures
@@ -25,6 +25,7 @@ from scb import plotting
 from scb.environments.zoo import bandit_metadata
 from scb.errors import UserError, at_least
 from scb.keys import named_key, root_key
+from scb.measurement import Place, as_random
 from scb.statistics import Estimate, estimate
 
 TASK = "Synthetic-Pendulum-v1"
@@ -59,8 +60,8 @@ def measured(name: str, options: Options) -> dict[str, Any]:
     earned = jax.jit(lambda of, horizon: task.fitness(of, key, options.agents, horizon))
     found = {}
     for horizon in options.horizons:
-        returns = np.asarray(earned(objective.parameters, horizon)) / scale
-        found[f"{horizon:g}"] = packed([returns])[0]
+        returns, _ = as_random(np.asarray(earned(objective.parameters, horizon)), Place.named(TASK))
+        found[f"{horizon:g}"] = packed([returns / scale])[0]
     digests = {"sha256": bandit_metadata(TASK)["sha256"], "objective_sha256": _digest(objective)}
     return {**digests, "returns": found}
 
@@ -91,7 +92,7 @@ def leads(report: Report) -> dict[str, dict[str, Estimate]]:
         for name, entry in report["objectives"].items()
     }
     reference = returns.pop(REFERENCE)
-    confidence = 1.0 - (1.0 - CONFIDENCE) / sum(map(len, returns.values()))
+    confidence = corrected(sum(map(len, returns.values())))
     return {
         name: {h: estimate(x - reference[h], np.mean, confidence) for h, x in of_it.items()}
         for name, of_it in returns.items()
@@ -135,7 +136,8 @@ def draw(report: Mapping[str, Any]) -> Figure:
     axes.set_xticks(ticks, [f"{x:g}" for x in ticks])
     axes.set(xlabel="length of the training, in trainings of the search")
     axes.set_ylabel("more than with PPO's clip,\nin deviations of the reward")
-    axes.legend(fontsize=8)
+    if found:
+        axes.legend(fontsize=8)
     return figure
 
 

@@ -6,7 +6,7 @@ from functools import partial
 
 import numpy as np
 
-from experiments.claims import CONFIDENCE, Claim, Judged, judge, of_agents
+from experiments.claims import Claim, Judged, corrected, judge, of_agents
 from experiments.harness import Report
 from lpo.comparison import LearningCurves
 from lpo.full_size import REFERENCE, Confirmation, as_comparison, looked_at, with_pairs
@@ -120,7 +120,7 @@ def leading(curves: Sequence[LearningCurves]) -> tuple[int, dict[str, dict[str, 
         for steps, one, other in zip(reference.steps, ours.T, theirs.T, strict=True):
             if not steps:
                 continue
-            apart = paired_difference(one, other, 1.0 - (1.0 - CONFIDENCE) / number)
+            apart = paired_difference(one, other, corrected(number))
             assert apart.low is not None and apart.high is not None
             if apart.low > 0 or apart.high < 0:
                 side = found["ahead" if apart.low > 0 else "behind"]

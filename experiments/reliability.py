@@ -83,10 +83,11 @@ class Options:
 def measure(options: Options, report: dict[str, Any], save: Save) -> None:
     """Kills first; what a report holds already is not done again."""
     settled(report, seed=options.seed)
+    kills = report.setdefault("kills", {})
     with tempfile.TemporaryDirectory() as folder:
         for name in options.commands:
             command = COMMANDS[name]
-            killed = report.setdefault("kills", {}).setdefault(name, [])
+            killed = kills.setdefault(name, [])
             if len(killed) < options.kills:
                 torment(Path(folder), name, command, options, killed, save)
         if report.get("mutations", {}).get("number", -1) < options.mutations:

@@ -24,7 +24,7 @@ from scb.environments.synthetic import BanditConfig, bandit_for
 from scb.errors import at_least
 from scb.expert_data import expert_dataset
 from scb.fitting import fit_bandit
-from scb.judgement import judge
+from scb.judgement import counted, judge, told
 from scb.keys import root_key, split_key
 from scb.measurement import Place
 from scb.statistics import estimate
@@ -114,7 +114,8 @@ def measure(options: Options, report: dict[str, Any], save: Save) -> None:
             for algorithm in options.algorithms or algorithms_for(space):
                 spec = bandit_agent(algorithm, name)
                 size = options.agents, options.episodes
-                returns = judge(spec, bandit, weights, judge_in, SEED, *size)
+                found = judge(spec, bandit, weights, judge_in, SEED, *size)
+                returns, failed = counted(found, judge_in)
                 row[algorithm] = {
                     actions: {
                         "iqm": estimate(x).as_dict(),
@@ -123,7 +124,7 @@ def measure(options: Options, report: dict[str, Any], save: Save) -> None:
                     for actions, x in returns.items()
                 }
                 both = ", ".join(f"{actions} {estimate(x)}" for actions, x in returns.items())
-                print(f"{name} | {arm} | {algorithm} | {both}", flush=True)
+                print(f"{name} | {arm} | {algorithm} | {both}{told(failed)}", flush=True)
             result["returns"][arm] = row
         report["environments"][name] = result
         save()

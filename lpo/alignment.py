@@ -32,7 +32,7 @@ from scb.objectives import families
 from scb.population import map_population, rank_failed_last
 from scb.rows import Rows
 from scb.runs import Stopwatch
-from scb.statistics import iqm, rank_correlations, spearman
+from scb.statistics import iqm, places_apart, rank_correlations, spearman
 
 RESAMPLES = 1000
 
@@ -369,4 +369,7 @@ def correlation_text(correlation: Mapping[str, float | None]) -> str:
     value = correlation["spearman"]
     if value is None:
         return "none: all alike"
-    return f"{value:.2f} [{correlation['low']:.2f}, {correlation['high']:.2f}]"
+    ends = correlation["low"], correlation["high"]
+    places = places_apart(2, *ends)
+    low, high = (f"{end:.{places}f}" for end in ends)
+    return f"{value:.{places}f} [{low}, {high}]"

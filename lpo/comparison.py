@@ -78,7 +78,12 @@ class LearningCurves:
     @property
     def early(self) -> np.ndarray:
         """[S] mean return over the first half of the training, the untrained agent left out."""
-        return self.returns[:, (self.steps > 0) & (self.steps <= 0.5 * self.steps[-1])].mean(axis=1)
+        chosen = (self.steps > 0) & (self.steps <= 0.5 * self.steps[-1])
+        if not chosen.any():
+            raise UserError(
+                "no evaluation lies in the first half of the training: compare with 2 points or more."
+            )
+        return self.returns[:, chosen].mean(axis=1)
 
     @property
     def area(self) -> np.ndarray:

@@ -95,7 +95,7 @@ def looked_at(report: Mapping[str, Any]) -> dict[str, Any]:
     pending = [asked for asked, seeds in with_pairs(report) if len(seeds) < len(asked.seeds)]
     found = {}
     for environment, entry in report["environments"].items():
-        agents = {name: dict(of_it) for name, of_it in entry["agents"].items()}
+        agents = {name: dict(of_it) for name, of_it in entry.get("agents", {}).items()}
         for asked in pending:
             for name in asked.trained if asked.environment == environment else ():
                 for seed in asked.seeds:

@@ -16,7 +16,7 @@ import jinja2
 
 from lpo.certificate import LARGEST_KINK, Certificate
 from scb.plotting import ratio_text, thousands
-from scb.statistics import DECIDING
+from scb.statistics import DECIDING, places_apart
 
 Verdict = Literal["better", "worse", "undecided", "few seeds", "not compared"]
 
@@ -153,9 +153,7 @@ def _interval(estimate: Mapping[str, Any], signed: bool = False) -> str:
     if low is None or high is None:
         return f"{_number(value, _places(abs(value), 4), signed)} [no interval]"
     places = _places((high - low) / 2, 2) if high > low else _places(abs(value), 4)
-    # An end that is not zero must not be printed as zero: the verdict hangs on its sign.
-    while places < 6 and any(end != 0 and round(end, places) == 0 for end in (low, high)):
-        places += 1
+    places = places_apart(places, low, high)
     value, low, high = (_number(x, places, signed) for x in (value, low, high))
     return f"{value} [{low}, {high}]"
 

@@ -38,6 +38,7 @@ class Estimate:
         # Four digits for the largest number, and the same places for all: the eye compares columns.
         largest = max(abs(end) for end in known)
         places = max(0, 3 - math.floor(math.log10(largest))) if largest > 0 else 1
+        places = places_apart(places, self.low, self.high)
         if self.low is None or self.high is None:
             return f"{self.value:.{places}f} [no interval] (n={self.n})"
         return (
@@ -51,6 +52,14 @@ class Estimate:
     def as_dict(self) -> dict[str, float | int | None]:
         """{"value", "low", "high", "n"}, ready for JSON: an unknown end is None, never NaN."""
         return asdict(self)
+
+
+def places_apart(places: int, *ends: float | None) -> int:
+    """Decimal places with which no end of an interval looks like 0 that is not, for its sign decides; at most 6."""
+    given = [end for end in ends if end]
+    while places < 6 and not all(round(end, places) for end in given):
+        places += 1
+    return places
 
 
 def iqm(x: ArrayLike, axis: int | None = None) -> NDArray[np.floating]:

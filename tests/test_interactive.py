@@ -6,13 +6,14 @@ import re
 import shutil
 import subprocess
 import sys
+from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
 
 from lpo import cli as lpo_cli
-from lpo.objectives import load_objective
+from lpo.objectives import load_objective, save_objective
 from lpo.update_regions import analyze
 from scb import cli as scb_cli
 from scb.environments.zoo import load_bandit
@@ -89,6 +90,15 @@ def test_what_is_shown_is_also_in_numbers(objective_page, capsys, tmp_path):
     assert lpo_cli.main(["show", "ppo", "--beside", "--out", str(tmp_path)]) == 0
     assert re.search(r"^ppo: flat \d+%, free \d+%$", capsys.readouterr().out, re.M)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["show.json", "show.png"]
+
+
+def test_objectives_of_runs_are_shown_apart_by_their_folders(monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    objective = load_objective("lpo-pendulum")
+    for name in ("a", "b"):
+        save_objective(Path("runs", name, "objective.npz"), objective.drift, objective.parameters)
+        assert lpo_cli.main(["show", f"runs/{name}/objective", "--beside"]) == 0
+    assert sorted(x.name for x in Path("runs/show").iterdir()) == ["a", "b"]
 
 
 @pytest.mark.parametrize(

@@ -145,6 +145,14 @@ def test_runs_that_start_elsewhere_are_left_out_and_named(tmp_path):
     )
     with pytest.raises(UserError, match="no run starts warm or random"):
         discovery_cost.collect([continued])
+    with pytest.raises(UserError, match="no folders"):
+        discovery_cost.collect([])
+
+
+def test_a_figure_of_runs_that_have_no_target_is_empty(tmp_path):
+    folder = run_folder(tmp_path / "a", environment="swimmer", backend="generalized")
+    report = discovery_cost.collect([folder])
+    assert not discovery_cost.EXPERIMENT.figures(report)["discovery_cost"].axes
 
 
 def test_a_run_in_progress_is_read_up_to_its_last_whole_line(tmp_path):

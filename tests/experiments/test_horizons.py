@@ -7,6 +7,7 @@ import pytest
 
 from experiments import horizons as module
 from experiments.harness import packed
+from scb.environments.registry import environment_spec
 from scb.errors import UserError
 
 NOISE = np.random.default_rng(0).normal(size=(2, 40)) / 10
@@ -56,12 +57,16 @@ def test_agents_are_trained_for_as_long_as_is_asked(monkeypatch, tmp_path):
 
         def fitness(self, parameters, key, number, horizon):
             lengths.append(number)
-            return np.arange(10.0) * horizon
+            return np.array([np.nan, *range(1, 10)]) * horizon
 
     monkeypatch.setattr(module, "TaskTraining", Task)
     out, report = module.Options(("dpo",), (0.5, 2.0), agents=10), {}
     module.measure(out, report, lambda: None)
-    assert report["objectives"]["dpo"]["returns"]["2"] == "0 1 2 3 4 5 6 7 8 9"
+    # One that diverged counts as random actions do.
+    diverged, *others = report["objectives"]["dpo"]["returns"]["2"].split()
+    random = environment_spec("Synthetic-Pendulum-v1").random_return()
+    assert float(diverged) == pytest.approx(random / 2, rel=1e-3)
+    assert others == ["1", "2", "3", "4", "5", "6", "7", "8", "9"]
     assert list(report["objectives"]) == ["ppo", "dpo"] and set(lengths) == {10}
     assert json.loads(json.dumps(report))["horizons"] == [0.5, 2.0]
     # What is there is not measured again, but for an objective that has become another.
@@ -72,6 +77,13 @@ def test_agents_are_trained_for_as_long_as_is_asked(monkeypatch, tmp_path):
     for wrong in ({"horizons": ()}, {"horizons": (0.0,)}, {"agents": 3}):
         with pytest.raises(UserError):
             module.Options(**wrong)
+
+
+def test_the_clip_alone_leads_nowhere(report):
+    del report["objectives"]["dpo"], report["objectives"]["ta-lpo"]
+    assert module.leads(report) == {}
+    assert "at every length none is ahead" in module.EXPERIMENT.page(report)
+    module.EXPERIMENT.figures(report)
 
 
 def test_all_names_are_read_before_the_first_is_measured():

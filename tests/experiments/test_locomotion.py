@@ -445,5 +445,10 @@ def test_the_shipped_curves_are_of_the_full_size_and_stand_beside_shorter_traini
     assert full_size.full_size("Pendulum-v1") is None
 
 
+def test_an_environment_of_which_only_clips_were_compared_so_far_is_left_out():
+    begun = {"environments": {"walker2d": {"backend": "generalized", "sweep": {}}}}
+    assert full_size.looked_at(begun) == {}
+
+
 def test_the_file_is_where_the_library_looks_for_it():
     assert Path(full_size.PATH).samefile(module.EXPERIMENT.out)

@@ -60,6 +60,9 @@ def test_differences_are_of_what_is_asked_for():
     assert found.differences("area")["dpo"].value == 3
     with pytest.raises(UserError, match="kind of return"):
         found.differences("middle")
+    once = [replace(x, steps=x.steps[[0, 2]], returns=x.returns[:, [0, 2]]) for x in found.curves]
+    with pytest.raises(UserError, match="2 points or more"):
+        Comparison(once).differences("early")
     assert [axes.get_ylabel() for axes in found.figure().axes] == [
         "return (interquartile mean)",
         "final return",
