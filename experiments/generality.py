@@ -259,6 +259,12 @@ def facts(report: Report) -> dict[str, Any]:
             name: [entry[x]["generation"] for x in (DRAWN, FIXED)]
             for name, entry in report["environments"].items()
         },
+        "by_task": {
+            name: estimate(x)
+            for name, x in zip(
+                report["environments"], normalized(report, ZOO, TOGETHER), strict=True
+            )
+        },
         "sources": SOURCES,
         "columns": {
             name: {source: estimates(entry[source]) for source in SOURCES}

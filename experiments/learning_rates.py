@@ -228,6 +228,22 @@ def claims(report: Report) -> list[Claim]:
     return [claim for *_, claim in compared(report)]
 
 
+def at_home(report: Report) -> dict[tuple[str, str], dict[float, Estimate]]:
+    """{(objective, environment that it was learned for): {rate: how much more it earns there than PPO's clip}}."""
+    scored, found = scores(report), {}
+    for name in named(scored):
+        for place in filter(scored.__contains__, learned_for(report, name)):
+            both = scored[place].keys() >= {name, REFERENCE}
+            rates = scored[place][name].keys() & scored[place][REFERENCE].keys() if both else ()
+            found[name, place] = {
+                rate: stratified_estimate(
+                    *([scored[place][of][rate]] for of in (name, REFERENCE)), statistic=np.mean
+                )
+                for rate in sorted(rates)
+            }
+    return found
+
+
 def facts(report: Report) -> dict[str, Any]:
     """What is shown, in words; and a row for each objective: its rate in each environment, and what it earns there."""
     scored, best = scores(report), chosen(report)
@@ -255,6 +271,7 @@ def facts(report: Report) -> dict[str, Any]:
     pairs = list(zip(found, judge([claim for *_, claim in found]), strict=True))
     return {
         "rows": rows,
+        "at_home": at_home(report),
         "more": _shown(pairs, HOLDS),
         "less": {where: names for where, names in _shown(pairs, FAILS).items() if names},
         "own": {place: entry["own"] for place, entry in entries.items()},

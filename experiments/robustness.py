@@ -186,8 +186,7 @@ def claims(report: Report) -> list[Claim]:
     for name in named(scored):
         if name in REFERENCES:
             continue
-        homes = learned_for(report, name)
-        unseen = {place: x for place, x in scored.items() if place not in homes}
+        unseen = without_homes(report, scored, name)
         for other in (REFERENCE, "dpo"):
             ours, theirs = groups(unseen, name, other)
             if not ours:
@@ -196,6 +195,12 @@ def claims(report: Report) -> list[Claim]:
                 better = partial(over_environments, ours, theirs, statistic=statistic)
                 found.append(Claim(f"{name}: a higher {what} than {other}", better))
     return found
+
+
+def without_homes(report: Report, scored: Scores, objective: str) -> Scores:
+    """The scores of the environments that an objective was not learned for."""
+    homes = learned_for(report, objective)
+    return {place: x for place, x in scored.items() if place not in homes}
 
 
 def named(scored: Mapping[str, Mapping[str, Any]]) -> list[str]:
@@ -218,8 +223,10 @@ def facts(report: Report) -> dict[str, Any]:
     """A row for each objective, over all environments and in each."""
     rows, scored = [], scores(report)
     for name in named(scored):
-        ours, theirs = groups(scored, name, REFERENCE)
-        above = [(a > b) + (a == b) / 2 for a, b in zip(ours, theirs, strict=True)]
+        ours, _ = groups(scored, name, REFERENCE)
+        # As where claims are made.
+        unseen = groups(without_homes(report, scored, name), name, REFERENCE)
+        above = [(a > b) + (a == b) / 2 for a, b in zip(*unseen, strict=True)]
         failing = [(a < TENTH).astype(float) for a in ours]
         rows.append(
             {
@@ -230,7 +237,7 @@ def facts(report: Report) -> dict[str, Any]:
                 },
                 "fails": over_environments(failing, statistic=np.mean),
                 "improves": None
-                if name == REFERENCE
+                if name == REFERENCE or not above
                 else over_environments(above, statistic=np.mean),
                 "in": {e: x[name].mean() for e, x in scored.items() if name in x},
                 "agents": sum(x.size for x in ours),

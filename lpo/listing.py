@@ -52,6 +52,7 @@ def entry(name: str) -> dict[str, Any]:
         "results": _results(metadata["results"], name),
         "certificate": metadata.get("certificate"),
         "command": metadata["command"],
+        **{x: metadata[x] for x in ("random_keys",) if x in metadata},
     }
 
 

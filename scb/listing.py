@@ -56,6 +56,7 @@ def entry(name: str) -> dict[str, Any]:
         "bandit_steps": int(_total(metadata, *_IN_BANDIT)),
         "results": metadata["results"],
         "command": metadata["command"],
+        **{x: metadata[x] for x in ("random_keys",) if x in metadata},
     }
 
 

@@ -12,8 +12,10 @@ import yaml
 
 from experiments import rendering
 from experiments.harness import bandit_of, forget_replaced
+from lpo.full_size import full_size
 from lpo.suite import SuiteScores
 from scb.environments.zoo import bandit_metadata, zoo_names
+from scb.statistics import estimate
 from tests.site import public_names
 
 ROOT = Path(__file__).parents[1]
@@ -210,6 +212,17 @@ def test_what_readme_says_of_objectives_stands_in_the_results():
     assert len(numbers) == 12
     for number in numbers:
         assert number in pages, number
+
+
+def test_what_readme_says_of_hopper_is_of_the_seeds_that_all_three_have():
+    of_it = {curve.objective: curve for curve in full_size("hopper").curves}
+    curves = [of_it[name] for name in ("ppo", "dpo", "lpo-pendulum")]
+    shared = sorted(set.intersection(*(set(curve.seeds) for curve in curves)))
+    ends = [[c.final[c.seeds.index(seed)] for seed in shared] for c in curves]
+    readme = (ROOT / "README.md").read_text()
+    row = " | ".join(rendering.text(estimate(end)) for end in ends)
+    assert f"| [Brax Hopper](docs/locomotion.md), at the end | {row} |" in readme
+    assert f"Hopper: the {len(shared)} seeds that all three have" in readme
 
 
 def test_what_is_folded_is_closed_and_rendered():
