@@ -25,12 +25,13 @@ from matplotlib.ticker import EngFormatter
 
 from experiments.harness import Experiment, Save
 from experiments.rendering import plain
-from experiments.searches import each_once, judgements, machines, read_log
+from experiments.searches import each_once, machines, read_log
 from experiments.zoo_table_page import TARGETS, label, rank
 from scb import listing, plotting
 from scb.environments.registry import environment_spec
 from scb.environments.zoo import bandit_metadata, zoo_names
 from scb.errors import UserError
+from scb.evolution import judgements
 from scb.runs import read_config
 
 # How a run's line is drawn by its start.

@@ -230,18 +230,17 @@ def claims(report: Report) -> list[Claim]:
 
 def at_home(report: Report) -> dict[tuple[str, str], dict[float, Estimate]]:
     """{(objective, environment that it was learned for): {rate: how much more it earns there than PPO's clip}}."""
-    scored, found = scores(report), {}
-    for name in named(scored):
-        for place in filter(scored.__contains__, learned_for(report, name)):
-            both = scored[place].keys() >= {name, REFERENCE}
-            rates = scored[place][name].keys() & scored[place][REFERENCE].keys() if both else ()
-            found[name, place] = {
-                rate: stratified_estimate(
-                    *([scored[place][of][rate]] for of in (name, REFERENCE)), statistic=np.mean
-                )
-                for rate in sorted(rates)
-            }
-    return found
+    scored = scores(report)
+    return {
+        (name, place): {
+            rate: stratified_estimate([x], [scored[place][REFERENCE][rate]], statistic=np.mean)
+            for rate, x in scored[place][name].items()
+            if rate in scored[place][REFERENCE]
+        }
+        for name in named(scored)
+        for place in learned_for(report, name)
+        if name in scored.get(place, {})
+    }
 
 
 def facts(report: Report) -> dict[str, Any]:

@@ -113,7 +113,7 @@ def leading(curves: Sequence[LearningCurves]) -> tuple[int, dict[str, dict[str, 
       of 0, corrected for that number.
     """
     reference, *others = curves
-    number = len(others) * np.count_nonzero(reference.steps)
+    number = len(others) * int(np.count_nonzero(reference.steps))
     found: dict[str, dict[str, list[int]]] = {"ahead": {}, "behind": {}}
     for curve in others:
         ours, theirs = curve.paired(reference, "returns")
@@ -125,7 +125,7 @@ def leading(curves: Sequence[LearningCurves]) -> tuple[int, dict[str, dict[str, 
             if apart.low > 0 or apart.high < 0:
                 side = found["ahead" if apart.low > 0 else "behind"]
                 side.setdefault(curve.objective, []).append(int(steps))
-    return int(number), found
+    return number, found
 
 
 def _by_name(environment: str, entry: Report) -> dict[str, LearningCurves]:

@@ -23,10 +23,11 @@ import numpy as np
 from experiments import meta_training_cost
 from experiments.harness import Experiment, Preset, Save, settled
 from experiments.lpo_on_bandits_page import claims, draw, facts
-from experiments.searches import judgements, machines, objective_of_run, read_log
+from experiments.searches import machines, objective_of_run, read_log
 from lpo.comparison import compare
 from lpo.objectives import CLIPS, Objective, load_objective
 from scb.agents.spec import AgentSpec, environment_agent
+from scb.evolution import judgements
 from scb.machine import machine_description
 from scb.rows import Rows
 from scb.seeds import reporting, validation

@@ -18,7 +18,7 @@ from scb.command_line import SharedOutput
 from scb.curriculum import CurriculumConfig, paper_curriculum
 from scb.discovery import DiscoveryConfig, discover
 from scb.errors import UserError
-from scb.evolution import EvolutionConfig
+from scb.evolution import EvolutionConfig, judgements
 from scb.runs import log_lines, released
 from scb.statistics import Estimate, Statistic, estimate, stratified_estimate
 
@@ -129,20 +129,6 @@ def each_once(found: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
 
 def _timing(folder: Path) -> list[dict[str, Any]]:
     return log_lines(folder / "timing.jsonl", "seconds")
-
-
-def judgements(metrics: Sequence[Mapping[str, Any]]) -> list[tuple[int, dict[str, Any]]]:
-    """(generation before which, {"fitness", "fitness_iqm", ...}) of each judgement that a search's log has of its mean.
-
-    The last comes after all generations.
-    """
-    found = []
-    for line in metrics:
-        for later, start in enumerate(("mean/", "final_mean/")):
-            judged = {k.removeprefix(start): x for k, x in line.items() if k.startswith(start)}
-            if judged:
-                found.append((line["generation"] + later, judged))
-    return found
 
 
 def curve(metrics: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]:

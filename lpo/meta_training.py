@@ -26,7 +26,7 @@ from scb.configurations import config_dict, with_defaults
 from scb.environments.registry import environment_spec
 from scb.environments.zoo import digests
 from scb.errors import UserError, of_class
-from scb.evolution import EnvironmentSteps, EvolutionConfig, Outcome, evolve
+from scb.evolution import EnvironmentSteps, EvolutionConfig, Outcome, evolve, judgements
 from scb.keys import root_key, split_key
 from scb.runs import Run, run_of
 from scb.seeds import VALIDATING
@@ -177,11 +177,8 @@ def _story(problem: MetaTraining, outcome: Outcome, mean: Any, command: str) -> 
     """What a learned objective's .json says of its meta-training."""
     evolution: EvolutionConfig = problem.config.evolution
     judged = [
-        # The last judgement is of what the last generation left.
-        {"generation": line["generation"] + (key == "final_mean/fitness"), "fitness": value}
-        for line in outcome.metrics
-        for key, value in line.items()
-        if key in ("mean/fitness", "final_mean/fitness")
+        {"generation": generation, "fitness": of_it["fitness"]}
+        for generation, of_it in judgements(outcome.metrics)
     ]
     end = outcome.validate(mean)["fitness"]
     return {

@@ -77,15 +77,6 @@ class PipelineConfig:
         return replace(self.search, evolution=replace(self.search.evolution, seed=self.seed))
 
 
-def _tiny(given: Mapping[str, str]) -> PipelineConfig:
-    search = MetaTrain.presets["quick"]({})
-    evolution = replace(search.evolution, population_size=4, num_generations=2)
-    return PipelineConfig(
-        search=replace(search, agents_per_candidate=1, evolution=evolution),
-        evaluations=(Evaluation("Pendulum-v1", None, seeds=2, steps=10_000),),
-    )
-
-
 def _quick(given: Mapping[str, str]) -> PipelineConfig:
     return PipelineConfig(
         search=MetaTrain.presets["quick"]({}),
@@ -252,7 +243,7 @@ class RunAll(LongRun):
     """
 
     program = "lpo run"
-    presets = MappingProxyType({"tiny": _tiny, "quick": _quick, "paper": _paper})
+    presets = MappingProxyType({"quick": _quick, "paper": _paper})
 
     config: Annotated[PipelineConfig, tyro.conf.arg(name="")] = field(
         default_factory=lambda: _quick({})

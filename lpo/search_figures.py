@@ -9,6 +9,7 @@ from matplotlib.ticker import EngFormatter, MaxNLocator, NullFormatter
 
 from lpo.inner_loop import MetaTrainingConfig
 from scb.errors import UserError
+from scb.evolution import judgements
 from scb.plotting import (
     BLUE,
     GREY,
@@ -43,14 +44,7 @@ def meta_training_curve(metrics: list[dict[str, Any]], config: MetaTrainingConfi
         np.array([row.get(f"fitness/{kind}") for row in metrics], float)
         for kind in ("mean", "std", "max")
     )
-    judged = [
-        (row["generation"], row["mean/fitness"])
-        for row in metrics
-        if row.get("mean/fitness") is not None
-    ]
-    if metrics[-1].get("final_mean/fitness") is not None:
-        # Judged after the last generation, and so where the next would be.
-        judged.append((metrics[-1]["generation"] + 1, metrics[-1]["final_mean/fitness"]))
+    judged = [(g, x["fitness"]) for g, x in judgements(metrics) if x["fitness"] is not None]
     with figure_style():
         figure = Figure(figsize=(WIDTH, 4.2))
         axes = figure.add_subplot()

@@ -6,7 +6,7 @@ a failed candidate gets, the sign, sharding over devices, the evaluation of the 
 distribution's mean, checkpoints, resume, and logs.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from typing import Annotated, Any, Protocol, runtime_checkable
@@ -19,7 +19,7 @@ import tyro
 from scb import termination
 from scb.checkpoints import continued
 from scb.console import Progress, progress_console
-from scb.errors import UserError, agents_at_least, at_least, numbers, one_of, positive, unused
+from scb.errors import UserError, agents_at_least, at_least, one_of, positive, unused
 from scb.files import plain
 from scb.keys import key_at, root_key, split_key
 from scb.machine import machine_description
@@ -84,12 +84,7 @@ class EvolutionConfig:
         one_of("evolution strategy", self.strategy, STRATEGIES)
         one_of("combination of tasks", self.combine, COMBINATIONS)
         at_least(0, self, "num_generations")
-        numbers(self, "population_size")
-        if self.population_size < 2:
-            raise UserError(
-                f"population_size is {self.population_size}: evolution compares candidates, so it needs at least 2."
-            )
-        agents_at_least(2, self, "population_size")
+        agents_at_least(2, self, "population_size")  # which evolution compares
         if self.strategy == "Open_ES" and self.population_size % 2:
             raise UserError(
                 f"population_size is {self.population_size}: Open_ES samples antithetic pairs, so it must be even."
@@ -134,8 +129,6 @@ class EnvironmentSteps:
 
     def __mul__(self, number: int) -> "EnvironmentSteps":
         return EnvironmentSteps(number * self.training, number * self.evaluation)
-
-    __rmul__ = __mul__
 
 
 class Problem(Protocol):
@@ -215,10 +208,7 @@ class Outcome:
 
     def cost(self, problem: Problem, config: EvolutionConfig, best: bool) -> dict[str, Any]:
         """What an artefact says of the search's cost; `best` where the mean judged best was taken."""
-        judgements = sum(
-            name in line for line in self.metrics for name in ("mean/fitness", "final_mean/fitness")
-        )
-        agents = judgements * config.mean_evaluations
+        agents = len(judgements(self.metrics)) * config.mean_evaluations
         judging = problem.judgement_steps()
         return {
             "environment_steps_training": self.steps.training,
@@ -229,6 +219,20 @@ class Outcome:
             **({"generation": self.best_mean_generation} if best else {}),
             "machine": machine_description(),
         }
+
+
+def judgements(metrics: Sequence[Mapping[str, Any]]) -> list[tuple[int, dict[str, Any]]]:
+    """(generation before which, {"fitness", "fitness_iqm", ...}) of each judgement that a search's log has of its mean.
+
+    The last comes after all generations.
+    """
+    found = []
+    for line in metrics:
+        for later, start in enumerate(("mean/", "final_mean/")):
+            judged = {k.removeprefix(start): x for k, x in line.items() if k.startswith(start)}
+            if judged:
+                found.append((line["generation"] + later, judged))
+    return found
 
 
 def evolve(

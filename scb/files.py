@@ -71,16 +71,11 @@ def plain(number: Any) -> float | int | None:
     return int(number) if isinstance(number, int | np.integer) else float(number)
 
 
-def write_bytes(path: Path, content: bytes) -> None:
-    """Writes a file so that a kill leaves the old one or the new one, never half of one."""
-    write_together({path: content})
-
-
 def write_together(contents: Mapping[Path, bytes]) -> None:
-    """Writes files as `write_bytes` writes one; of several the last, which vouches for the others, is there last.
+    """Writes files so that a kill leaves the old ones or the new ones, never half of one.
 
-    It goes before the others are replaced, so that a kill leaves none that vouches for what it was not written with.
-    Where there is no room for all, nothing is replaced.
+    Of several the last, which vouches for the others, is there last. It goes before the others are replaced, so that
+    a kill leaves none that vouches for what it was not written with. Where there is no room for all, nothing is replaced.
     """
     # In the same folder, since a rename is atomic within one file system only.
     fresh = {path: path.with_name(f".{path.name}.{os.getpid()}.tmp") for path in contents}
@@ -101,10 +96,10 @@ def write_together(contents: Mapping[Path, bytes]) -> None:
 
 
 def write_text(path: Path, content: str) -> None:
-    """Writes text as `write_bytes` writes bytes."""
-    write_bytes(path, content.encode())
+    """Writes text as `write_together` writes bytes."""
+    write_together({path: content.encode()})
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
-    """Writes JSON as `write_bytes` writes bytes."""
+    """Writes JSON as `write_together` writes bytes."""
     write_text(path, json.dumps(content, indent=2) + "\n")

@@ -34,13 +34,13 @@ def discovered_drift(
     return xp.where(advantage >= 0, positive, negative)
 
 
-def _clip(clip: float, *arguments: Any) -> Any:
-    return clipped_surrogate_drift(clip, *arguments)
-
-
 def _dpo(clip: float, *arguments: Any) -> Any:
     return discovered_drift(DPO_ALPHA, DPO_BETA, *arguments)
 
 
 # {name: (clip, log_ratio, advantage, progress, xp) -> penalty}; None charges nothing.
-BASES: dict[str, Callable[..., Any] | None] = {"ppo": _clip, "dpo": _dpo, "none": None}
+BASES: dict[str, Callable[..., Any] | None] = {
+    "ppo": clipped_surrogate_drift,
+    "dpo": _dpo,
+    "none": None,
+}

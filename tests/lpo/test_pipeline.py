@@ -10,7 +10,7 @@ import pytest
 from lpo import cli, pipeline
 from lpo.comparison import Comparison, LearningCurves
 from lpo.objectives import load_objective
-from lpo.pipeline import RunAll
+from lpo.pipeline import Evaluation, RunAll
 from scb.agents.ppo import PPOConfig, PPOHyperparameters
 from scb.agents.spec import AgentSpec
 from scb.rows import pivot
@@ -19,15 +19,19 @@ from tests.recording import recorded_seeds
 
 @pytest.fixture(scope="module", autouse=True)
 def small(tiny_agent, tiny_drift):
-    """The preset "tiny" with smaller networks, fewer contexts and steps than any preset has."""
-    tiny = RunAll.presets["tiny"]({})
+    """A preset "tiny" with smaller networks, fewer contexts and steps than any preset has."""
+    quick = RunAll.presets["quick"]({})
+    evolution = replace(
+        quick.search.evolution, population_size=2, num_generations=2, mean_evaluations=2
+    )
     search = replace(
-        tiny.search,
+        quick.search,
         agent=tiny_agent,
         drift=tiny_drift,
         fitness="transfer",
+        agents_per_candidate=1,
         evaluation_episodes=2,
-        evolution=replace(tiny.search.evolution, population_size=2, mean_evaluations=2),
+        evolution=evolution,
     )
 
     def spec(algorithm, environment):
@@ -41,8 +45,8 @@ def small(tiny_agent, tiny_drift):
         )
         return AgentSpec(algorithm, agent, PPOHyperparameters())
 
-    evaluations = (replace(tiny.evaluations[0], steps=32),)
-    config = replace(tiny, search=search, evaluations=evaluations)
+    evaluations = (Evaluation("Pendulum-v1", None, seeds=2, steps=32),)
+    config = replace(quick, search=search, evaluations=evaluations)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(RunAll, "presets", {"tiny": lambda given: config})
         patch.setattr("lpo.comparison.environment_agent", spec)
