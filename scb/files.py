@@ -75,7 +75,7 @@ def write_together(contents: Mapping[Path, bytes]) -> None:
     """Writes files so that a kill leaves the old ones or the new ones, never half of one.
 
     Of several the last, which vouches for the others, is there last. It goes before the others are replaced, so that
-    a kill leaves none that vouches for what it was not written with. Where there is no room for all, nothing is replaced.
+    a kill leaves none that vouches for what it was not written with. Without room for all, nothing is replaced.
     """
     # In the same folder, since a rename is atomic within one file system only.
     fresh = {path: path.with_name(f".{path.name}.{os.getpid()}.tmp") for path in contents}
