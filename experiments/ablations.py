@@ -76,13 +76,19 @@ def config_of(environment: str, search: str, seed: int, plan: Mapping[str, Any])
     )
 
 
+def seeds_of(plan: Mapping[str, Any], environment: str, search: str) -> int:
+    """How many searches of a kind the plan has."""
+    usual: int = plan["environments"][environment]["seeds"]
+    more: Mapping[str, int] = plan["more_seeds"].get(environment, {})
+    return more.get(search, usual)
+
+
 def parts(plan: Mapping[str, Any], report: dict[str, Any]) -> Iterator[Part]:
     """Searches, seeds outermost, so that an interrupted run has all lines."""
-    for seed in range(max(x["seeds"] for x in plan["environments"].values())):
-        for environment in ENVIRONMENTS:
-            for name in searches_of(environment):
-                if seed >= plan["environments"][environment]["seeds"]:
-                    continue
+    number = {(x, name): seeds_of(plan, x, name) for x in ENVIRONMENTS for name in searches_of(x)}
+    for seed in range(max(number.values())):
+        for environment, name in number:
+            if seed < number[environment, name]:
                 folder = f"{plan['runs']}/{environment}/{name.replace(' | ', '-')}-{seed}"
                 config = config_of(environment, name, seed, plan)
                 searched = partial(searches.searched_curve, config, folder)
@@ -92,9 +98,22 @@ def parts(plan: Mapping[str, Any], report: dict[str, Any]) -> Iterator[Part]:
 measure = InParts(parts)
 
 
+def planned(report: Mapping[str, Any], environment: str) -> dict[str, dict[str, Any]]:
+    """{search: {seed: curve}} of as many searches of a kind as the report's plan has.
+
+    Who looks at a difference while it grows sees it pass its margin sooner or later: what was made beyond the plan
+    counts when the plan has it, that is when all are there.
+    """
+    found = {}
+    for search, curves in report["environments"][environment].items():
+        number = seeds_of(report["plan"], environment, search)
+        found[search] = {seed: curve for seed, curve in curves.items() if int(seed) < number}
+    return found
+
+
 def _never_reached(report: Mapping[str, Any], environment: str, search: str) -> bool:
     """Whether no agent of any judgement earned more than one that never reaches the goal."""
-    curves = report["environments"][environment][search].values()
+    curves = planned(report, environment)[search].values()
     means = [x for c in curves for x in c["mean"] if x is not None]
     return environment in WORST and bool(means) and max(means) <= WORST[environment]
 
@@ -102,7 +121,7 @@ def _never_reached(report: Mapping[str, Any], environment: str, search: str) -> 
 def _at_the_start(report: Mapping[str, Any], environment: str) -> bool:
     """Whether no search ends a tenth of the way from random actions to the expert: such searches test no claim."""
     least = environment_spec(environment).random_return() + of_the_way(environment)
-    curves = report["environments"][environment]
+    curves = planned(report, environment)
     return all(
         x < least for search in searches_of(environment) for x in searches.last(curves[search])
     )
@@ -114,7 +133,7 @@ def claims(report: Report) -> list[Claim]:
 
 
 def _claims_of(report: Report, environment: str) -> list[Claim]:
-    curves, untold = report["environments"][environment], _at_the_start(report, environment)
+    curves, untold = planned(report, environment), _at_the_start(report, environment)
 
     def above(text: str, row: str, label: str, other: str, margin: float = 0.0) -> Claim:
         one, than = (curves[rows(environment)[row][x]] for x in (label, other))
@@ -148,7 +167,7 @@ def facts(report: Report) -> dict[str, Any]:
         for row, labels in rows(environment).items():
             of_it = found.setdefault(environment, {}).setdefault(row, {})
             for label, search in labels.items():
-                curves = report["environments"][environment][search]
+                curves = planned(report, environment)[search]
                 of_it[label] = {
                     "final": searches.final(curves, np.mean),
                     "failing": max(max(c["failed"]) for c in curves.values()) / candidates,
@@ -157,7 +176,7 @@ def facts(report: Report) -> dict[str, Any]:
                 }
     untold = [x for x in ENVIRONMENTS if _at_the_start(report, x)]
     all_of_them = (
-        c for x in report["environments"].values() for s in x.values() for c in s.values()
+        c for x in ENVIRONMENTS for of_it in planned(report, x).values() for c in of_it.values()
     )
     ran = searches.elsewhere(all_of_them, report)
     return {"rows": found, "untold": untold, "enough": ENOUGH, "elsewhere": ran}
@@ -176,7 +195,7 @@ def draw(report: Mapping[str, Any]) -> Figure:
     styles = ("-", "--", "-.", ":", (0, (3, 1, 1, 1)), (0, (5, 1)))
     found = {
         f"{environment}:\n{row}": {
-            label: list(report["environments"][environment][search].values())
+            label: list(planned(report, environment)[search].values())
             for label, search in drawn.items()
         }
         for environment in ENVIRONMENTS

@@ -2,6 +2,7 @@ import pytest
 
 from experiments import ablations
 from experiments.ablations import LATENTS, NONE, SHAPES, name_of
+from experiments.claims import judge
 from experiments.searches import ENOUGH
 
 # TI and T, I and TI, two continuous latents and two categorical ones; of MountainCar also T's goal and the curricula.
@@ -11,6 +12,7 @@ TINY = {
     "evaluation_episodes": 2,
     "mean_evaluations": 2,
     "evaluate_mean_every": 1,
+    "more_seeds": {},
     "environments": {
         "MountainCar-v0": {
             "generations": 1,
@@ -65,6 +67,34 @@ def test_a_search_is_the_papers_recipe_with_one_thing_changed():
     assert (
         ablations.config_of("Pendulum-v1", name_of("T", "normal", NONE), 0, plan).curriculum is None
     )
+
+
+def test_of_some_there_may_be_more_searches_than_of_the_rest(monkeypatch):
+    monkeypatch.setattr(ablations, "ENVIRONMENTS", ("MountainCar-v0",))
+    more = [name_of("TI", "normal", NONE), name_of("I", "normal", "step")]
+    plan = {**TINY, "runs": "runs", "more_seeds": {"MountainCar-v0": dict.fromkeys(more, 3)}}
+    _, _, names, seeds = zip(*(part.path for part in ablations.parts(plan, {})), strict=True)
+    every = ablations.searches_of("MountainCar-v0")
+    assert list(zip(seeds, names, strict=True)) == [
+        *(("0", x) for x in every),
+        *((seed, x) for seed in "12" for x in more),
+    ]
+    fewer = {**TINY, "runs": "runs"}
+    assert [part.path[-1] for part in ablations.parts(fewer, {})] == ["0"] * len(every)
+
+
+def test_searches_beyond_the_plan_are_not_looked_at():
+    search, made = name_of("I", "normal", NONE), report(5)
+    of_it = made["environments"]["Acrobot-v1"][search]
+
+    def end():
+        return ablations.facts(made)["rows"]["Acrobot-v1"]["what is learned"]["I"]["final"]
+
+    before, claimed = end(), str(judge(ablations.claims(made)))
+    of_it["5"] = {**of_it["0"], "fitness": [-200.0, -500.0]}
+    assert end() == before and str(judge(ablations.claims(made))) == claimed
+    made["plan"] = {**made["plan"], "more_seeds": {"Acrobot-v1": {search: 6}}}
+    assert end() != before and str(judge(ablations.claims(made))) != claimed
 
 
 @pytest.mark.slow
