@@ -36,7 +36,7 @@ from lpo.objectives import Objective, check_names, learned_in, load_objective
 from lpo.suite import suite
 from scb.agents.spec import AgentSpec
 from scb.environments.registry import environment_spec
-from scb.errors import at_least
+from scb.errors import UserError, at_least
 from scb.measurement import Agents, Place, measure
 from scb.plotting import BLUE, VERMILLION, estimate_row, figure_title
 from scb.rows import Rows
@@ -48,6 +48,7 @@ REFERENCE = "ppo"
 DRAWN = "ppo-drawn"
 REFERENCES = (REFERENCE, DRAWN, "dpo")
 FIRST_SEED = REPORTING[12_000]
+FIRST_TO_CONFIRM = REPORTING[13_000]
 FIRST_TO_CHOOSE = VALIDATING[1000]
 STATISTICS: dict[str, Statistic] = {"mean": np.mean, "worst decile": worst_decile}
 # Every environment is given the same draws, of seeds and of what they draw.
@@ -72,16 +73,23 @@ class Options:
     """of hyperparameters for each setting of epochs and minibatches, of which an environment has three"""
     validation: bool = False
     """on seeds that report nothing, to choose among objectives; in a report of its own (--out)"""
+    confirmation: bool = False
+    """on further seeds that report, of what was stated first; in a report of its own (--out)"""
     runs: Path = Path("runs/robustness")
     """for agents until they are saved"""
 
     def __post_init__(self) -> None:
         at_least(2, self, "draws")
+        if self.validation and self.confirmation:
+            raise UserError(
+                "seeds either choose or confirm: leave out --validation or --confirmation."
+            )
 
 
 def parts(options: Options, report: dict[str, Any]) -> Iterator[Part]:
     """One setting of one environment with one objective at a time."""
-    first = FIRST_TO_CHOOSE if options.validation else FIRST_SEED
+    first = FIRST_TO_CONFIRM if options.confirmation else FIRST_SEED
+    first = FIRST_TO_CHOOSE if options.validation else first
     settled(report, first_seed=first, lists=_PLAN["lists"])
     # Without PPO's clip there is nothing to compare with.
     names = dict.fromkeys([REFERENCE, *options.objectives])
