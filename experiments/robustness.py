@@ -20,7 +20,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from experiments.claims import TENTH, Claim
+from experiments.claims import TENTH, Claim, Judged, judge
 from experiments.harness import (
     Experiment,
     Report,
@@ -30,7 +30,7 @@ from experiments.harness import (
     settled,
     unpacked,
 )
-from experiments.parts import InParts, Part
+from experiments.parts import InParts, Keys, Part
 from lpo.comparison import ppo_spec
 from lpo.objectives import Objective, check_names, learned_in, load_objective
 from lpo.suite import suite
@@ -44,6 +44,7 @@ from scb.seeds import REPORTING, VALIDATING
 from scb.statistics import Statistic, normalized_score, stratified_estimate, worst_decile
 
 _PLAN = plan_of("robustness")
+STATED = _PLAN["confirmation"]
 REFERENCE = "ppo"
 DRAWN = "ppo-drawn"
 REFERENCES = (REFERENCE, DRAWN, "dpo")
@@ -74,7 +75,7 @@ class Options:
     validation: bool = False
     """on seeds that report nothing, to choose among objectives; in a report of its own (--out)"""
     confirmation: bool = False
-    """on further seeds that report, of what was stated first; in a report of its own (--out)"""
+    """instead, what was stated first (plans/robustness.toml), on further seeds that report"""
     runs: Path = Path("runs/robustness")
     """for agents until they are saved"""
 
@@ -85,11 +86,32 @@ class Options:
                 "seeds either choose or confirm: leave out --validation or --confirmation."
             )
 
+    @property
+    def asked(self) -> "Options":
+        """What is to be measured."""
+        if not self.confirmation:
+            return self
+        return replace(
+            self,
+            environments=tuple(STATED["environments"]),
+            objectives=(*STATED["more_than"], STATED["objective"]),
+            draws=STATED["draws"],
+        )
+
+    @property
+    def first_seed(self) -> int:
+        """Of the first setting."""
+        if self.confirmation:
+            return FIRST_TO_CONFIRM
+        return FIRST_TO_CHOOSE if self.validation else FIRST_SEED
+
 
 def parts(options: Options, report: dict[str, Any]) -> Iterator[Part]:
     """One setting of one environment with one objective at a time."""
-    first = FIRST_TO_CONFIRM if options.confirmation else FIRST_SEED
-    first = FIRST_TO_CHOOSE if options.validation else first
+    options, first = options.asked, options.first_seed
+    path: Keys = ("confirmation",) if options.confirmation else ()
+    for key in path:
+        report = report.setdefault(key, {})
     settled(report, first_seed=first, lists=_PLAN["lists"])
     # Without PPO's clip there is nothing to compare with.
     names = dict.fromkeys([REFERENCE, *options.objectives])
@@ -105,7 +127,8 @@ def parts(options: Options, report: dict[str, Any]) -> Iterator[Part]:
             for name, objective in objectives.items():
                 place = (environment, name, key)
                 trained = partial(_trained, *place, objective, spec, drawn, options.runs)
-                yield Part(("environments", environment), trained, (("returns", name, key),))
+                there = (*path, "environments", environment)
+                yield Part(there, trained, (("returns", name, key),))
 
 
 def settings_of(environment: str) -> dict[str, dict[str, Any]]:
@@ -205,6 +228,27 @@ def claims(report: Report) -> list[Claim]:
     return found
 
 
+def confirmed(report: Report) -> list[Judged]:
+    """What becomes of the claims that were stated first; empty until all of their agents are there."""
+    scored = scores(report.get("confirmation", {"environments": {}}))
+    asked = (*STATED["more_than"], STATED["objective"])
+    number = STATED["draws"] * len(_PLAN["settings"]["classic"])
+    for place in STATED["environments"]:
+        of_it = scored.get(place, {})
+        if any(name not in of_it or of_it[name].size != number for name in asked):
+            return []
+    both = {other: groups(scored, STATED["objective"], other) for other in STATED["more_than"]}
+    return judge(
+        [
+            Claim(
+                f"{STATED['objective']}: a higher mean than {other}",
+                partial(over_environments, *pair, statistic=np.mean),
+            )
+            for other, pair in both.items()
+        ]
+    )
+
+
 def without_homes(report: Report, scored: Scores, objective: str) -> Scores:
     """The scores of the environments that an objective was not learned for."""
     homes = learned_for(report, objective)
@@ -228,6 +272,17 @@ def learned_for(report: Report, objective: str) -> list[str]:
 
 
 def facts(report: Report) -> dict[str, Any]:
+    """A row for each objective, over all environments and in each; the same of what was stated first."""
+    found: dict[str, Any] = {"rows": table(report), "places": list(scores(report)), "tenth": TENTH}
+    stated = confirmed(report)
+    if not stated:
+        return {**found, "stated": None}
+    of_it = report["confirmation"]
+    rows = {"rows": table(of_it), "places": list(scores(of_it)), "seed": of_it["first_seed"]}
+    return {**found, "stated": {"claims": stated, **rows, **STATED}}
+
+
+def table(report: Report) -> list[dict[str, Any]]:
     """A row for each objective, over all environments and in each."""
     rows, scored = [], scores(report)
     for name in named(scored):
@@ -255,12 +310,12 @@ def facts(report: Report) -> dict[str, Any]:
                 ),
             }
         )
-    return {"rows": rows, "places": list(scored), "tenth": TENTH}
+    return rows
 
 
 def draw(report: Mapping[str, Any]) -> Figure:
     """One panel a statistic, one line an objective."""
-    rows = facts(report)["rows"]
+    rows = table(report)
     panels = {
         "mean": "mean score",
         "worst decile": "worst decile of the scores",

@@ -15,6 +15,7 @@ from experiments.harness import packed
 from lpo.comparison import ppo_spec
 from lpo.objectives import load_objective
 from scb.environments.registry import environment_spec
+from scb.errors import UserError
 from scb.measurement import Agents
 from scb.seeds import REPORTING, VALIDATING
 
@@ -172,3 +173,47 @@ def test_two_objectives_of_one_name_are_refused(tmp_path, capsys):
     flags = ["--objectives", "lpo-multi", str(tmp_path / "lpo-multi.npz")]
     assert module.EXPERIMENT.main([*flags, "--out", str(tmp_path / "report.json")]) == 2
     assert "objective 'lpo-multi' is there twice" in capsys.readouterr().err
+
+
+@pytest.fixture
+def stated(monkeypatch):
+    of_it = {
+        "objective": "lpo-pendulum",
+        "environments": ["CartPole-v1", "Acrobot-v1"],
+        "draws": 20,
+        "more_than": ["ppo", "dpo"],
+    }
+    monkeypatch.setattr(module, "STATED", of_it)
+    monkeypatch.setitem(module._PLAN["settings"], "classic", [{"num_epochs": 4}])
+    return of_it
+
+
+def test_what_was_stated_is_decided_when_all_of_its_agents_are_there(report, stated):
+    assert module.confirmed(report) == [] and module.facts(report)["stated"] is None
+    scored = {"ppo": 0.1, "dpo": 0.4, "lpo_pendulum": 0.3}
+    entries = {name: entry(name, **scored) for name in stated["environments"]}
+    later = entries["Acrobot-v1"]["returns"].pop("dpo")
+    report["confirmation"] = {"environments": entries, "first_seed": 7}
+    assert module.confirmed(report) == []
+    assert "stated first" not in module.EXPERIMENT.page(report)
+    entries["Acrobot-v1"]["returns"]["dpo"] = later
+    assert [x.outcome for x in module.confirmed(report)] == [HOLDS, FAILS]
+    page = module.EXPERIMENT.page(report)
+    assert "confirmed by 40 draws: lpo-pendulum: a higher mean than ppo. " in page
+    assert "20 draws of each setting, seeds from 7 on" in page
+    # The claims of the first report are judged without it.
+    assert len(module.claims(report)) == 4
+
+
+def test_a_confirmation_is_of_what_was_stated_and_stands_apart_in_the_report(stated, tmp_path):
+    report, options = {}, module.Options(confirmation=True, runs=tmp_path)
+    parts = list(module.parts(options, report))
+    assert [x.path[:3] for x in parts[::3]] == [
+        ("confirmation", "environments", name) for name in stated["environments"]
+    ]
+    assert [x.names[0][1] for x in parts] == ["ppo", "dpo", "lpo-pendulum"] * 2
+    assert report == {"confirmation": report["confirmation"]}
+    assert report["confirmation"]["first_seed"] == module.FIRST_TO_CONFIRM
+    assert module.FIRST_TO_CONFIRM in REPORTING
+    with pytest.raises(UserError, match="either choose or confirm"):
+        module.Options(confirmation=True, validation=True)
