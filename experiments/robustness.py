@@ -67,6 +67,7 @@ class Options:
         "lpo-pendulum",
         "lpo-multi",
         "lpo-pendulum-ee",
+        "lpo-cartpole-ee",
         "ta-lpo",
     )
     """as `lpo evaluate` takes them, and ppo-drawn; a file's name is the objective's"""
@@ -278,8 +279,14 @@ def facts(report: Report) -> dict[str, Any]:
     if not stated:
         return {**found, "stated": None}
     of_it = report["confirmation"]
-    rows = {"rows": table(of_it), "places": list(scores(of_it)), "seed": of_it["first_seed"]}
-    return {**found, "stated": {"claims": stated, **rows, **STATED}}
+    scored = scores(of_it)
+    rows = {"rows": table(of_it), "places": list(scored), "seed": of_it["first_seed"]}
+    leads = {
+        other: over_environments(*groups(scored, other, REFERENCE), statistic=np.mean)
+        for other in STATED["more_than"]
+        if other != REFERENCE
+    }
+    return {**found, "stated": {"claims": stated, **rows, "leads": leads, **STATED}}
 
 
 def table(report: Report) -> list[dict[str, Any]]:
