@@ -38,14 +38,15 @@ def text(value: Estimate | Mapping[str, Any] | Any, places: int = 0, sign: bool 
     found, low, high = (values[x] for x in ("value", "low", "high"))
     if low is None:
         return number(found, places, sign)
-    shown = _seen(found, places) if low * high > 0 else places
-    ends = [number(end, _seen(end, places)) for end in (low, high)]
+    decides = low * high > 0
+    shown = _seen(found, places) if decides else places
+    ends = [number(end, _seen(end, places, 4 if decides else 2)) for end in (low, high)]
     return f"{number(found, shown, sign)} [{', '.join(ends)}]"
 
 
-def _seen(value: float, places: int) -> int:
-    """Decimal places, up to two more for a digit that is not zero: an end's side of zero decides a claim."""
-    enough = (x for x in range(places, places + 3) if round(value, x))
+def _seen(value: float, places: int, more: int = 2) -> int:
+    """Decimal places, up to so many more for a digit that is not zero: an end's side of zero decides a claim."""
+    enough = (x for x in range(places, places + more + 1) if round(value, x))
     return next(enough, places) if places else 0
 
 

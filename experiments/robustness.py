@@ -36,12 +36,12 @@ from lpo.objectives import Objective, check_names, learned_in, load_objective
 from lpo.suite import suite
 from scb.agents.spec import AgentSpec
 from scb.environments.registry import environment_spec
-from scb.errors import UserError, at_least
+from scb.errors import UserError, at_least, unused
 from scb.measurement import Agents, Place, measure
 from scb.plotting import BLUE, VERMILLION, estimate_row, figure_title
 from scb.rows import Rows
 from scb.seeds import REPORTING, VALIDATING
-from scb.statistics import Statistic, normalized_score, stratified_estimate, worst_decile
+from scb.statistics import Estimate, Statistic, normalized_score, stratified_estimate, worst_decile
 
 _PLAN = plan_of("robustness")
 STATED = _PLAN["confirmation"]
@@ -86,6 +86,10 @@ class Options:
             raise UserError(
                 "seeds either choose or confirm: leave out --validation or --confirmation."
             )
+        if self.confirmation:
+            stated = ("environments", "objectives", "draws")
+            because = "what is confirmed was stated before"
+            unused(self, because, stated, "leave out --confirmation")
 
     @property
     def asked(self) -> "Options":
@@ -97,6 +101,7 @@ class Options:
             environments=tuple(STATED["environments"]),
             objectives=(*STATED["more_than"], STATED["objective"]),
             draws=STATED["draws"],
+            confirmation=False,
         )
 
     @property
@@ -109,8 +114,10 @@ class Options:
 
 def parts(options: Options, report: dict[str, Any]) -> Iterator[Part]:
     """One setting of one environment with one objective at a time."""
-    options, first = options.asked, options.first_seed
     path: Keys = ("confirmation",) if options.confirmation else ()
+    if options.confirmation:
+        check_stated(load_objective(STATED["objective"]))
+    options, first = options.asked, options.first_seed
     for key in path:
         report = report.setdefault(key, {})
     settled(report, first_seed=first, lists=_PLAN["lists"])
@@ -229,6 +236,15 @@ def claims(report: Report) -> list[Claim]:
     return found
 
 
+def check_stated(objective: Objective) -> None:
+    """Raises a UserError where an objective of the stated name is not the one that was meant."""
+    if objective.metadata.get("sha256") != STATED["objective_sha256"]:
+        raise UserError(
+            f"{objective.name} is not the objective that was stated: take the file whose checksum "
+            "plans/robustness.toml has."
+        )
+
+
 def confirmed(report: Report) -> list[Judged]:
     """What becomes of the claims that were stated first; empty until all of their agents are there."""
     scored = scores(report.get("confirmation", {"environments": {}}))
@@ -286,7 +302,21 @@ def facts(report: Report) -> dict[str, Any]:
         for other in STATED["more_than"]
         if other != REFERENCE
     }
-    return {**found, "stated": {"claims": stated, **rows, "leads": leads, **STATED}}
+    tasks = {other: by_task(scored, STATED["objective"], other) for other in STATED["more_than"]}
+    draws = STATED["draws"] * len(_PLAN["settings"]["classic"])
+    each = {"leads": leads, "tasks": tasks, "draws": draws}
+    return {**found, "stated": {**STATED, "claims": stated, **rows, **each}}
+
+
+def by_task(scored: Scores, name: str, other: str) -> dict[str, dict[str, Estimate]]:
+    """{"in it" or "in the others": {environment: how much higher one objective's mean is}}, each for itself."""
+    mean = partial(over_environments, statistic=np.mean)
+    alone = {place: {place: scored[place]} for place in scored}
+    others = {x: {place: of_it for place, of_it in scored.items() if place != x} for x in scored}
+    return {
+        words: {place: mean(*groups(of_it, name, other)) for place, of_it in sets.items()}
+        for words, sets in (("in it", alone), ("in the others", others))
+    }
 
 
 def table(report: Report) -> list[dict[str, Any]]:

@@ -55,11 +55,13 @@ class Estimate:
 
 
 def places_apart(places: int, *ends: float | None) -> int:
-    """Decimal places with which no end of an interval looks like 0 that is not, for its sign decides; at most 6."""
+    """Decimal places with which no end of an interval looks like 0 that is not, for its sign decides.
+
+    Where even 6 do not show it, as many as were asked for.
+    """
     given = [end for end in ends if end]
-    while places < 6 and not all(round(end, places) for end in given):
-        places += 1
-    return places
+    enough = (x for x in range(places, 7) if all(round(end, x) for end in given))
+    return next(enough, places)
 
 
 def iqm(x: ArrayLike, axis: int | None = None) -> NDArray[np.floating]:

@@ -146,6 +146,17 @@ def test_rates_that_an_objective_lacks_yet_are_compared_for_none(report):
     assert "| not tested at this size |" in module.EXPERIMENT.page(report)
 
 
+def test_where_an_objective_was_learned_its_lead_is_told_at_each_rate_that_ppo_has(report):
+    found = module.at_home(report)
+    # Of no formula, and nowhere else.
+    assert list(found) == [("lpo-pendulum", "Pendulum-v1")]
+    leads = {rate: x.value for rate, x in found["lpo-pendulum", "Pendulum-v1"].items()}
+    assert leads == pytest.approx({0.0003: -0.3, 0.003: -0.4, 0.01: -0.7}, abs=1e-3)
+    assert "| lpo-pendulum, Pendulum-v1 | −0.30 [" in module.EXPERIMENT.page(report)
+    del report["environments"]["Pendulum-v1"][module.REPORTED]["ppo"]["0.01"]
+    assert list(module.at_home(report)["lpo-pendulum", "Pendulum-v1"]) == [0.0003, 0.003]
+
+
 def test_few_agents_decide_nothing(report):
     for place in report["environments"]:
         report["environments"][place] = entry(place, CHOOSING, REPORTED, number=9)

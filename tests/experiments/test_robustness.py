@@ -182,6 +182,8 @@ def stated(monkeypatch):
         "environments": ["CartPole-v1", "Acrobot-v1"],
         "draws": 20,
         "more_than": ["ppo", "dpo"],
+        "objective_sha256": load_objective("lpo-pendulum").metadata["sha256"],
+        "suggested": {x: {"value": 0.1, "low": 0.0, "high": 0.2} for x in ("ppo", "dpo")},
     }
     monkeypatch.setattr(module, "STATED", of_it)
     monkeypatch.setitem(module._PLAN["settings"], "classic", [{"num_epochs": 4}])
@@ -199,8 +201,15 @@ def test_what_was_stated_is_decided_when_all_of_its_agents_are_there(report, sta
     entries["Acrobot-v1"]["returns"]["dpo"] = later
     assert [x.outcome for x in module.confirmed(report)] == [HOLDS, FAILS]
     page = module.EXPERIMENT.page(report)
-    assert "confirmed by 40 draws: lpo-pendulum: a higher mean than ppo. " in page
-    assert "20 draws of each setting, seeds from 7 on" in page
+    assert (
+        "lpo-pendulum has a higher mean than ppo, which was stated first, and confirmed by 20 "
+        in page
+    )
+    assert (
+        "draws in each of 2 tasks. That lpo-pendulum has a higher mean than dpo was stated" in page
+    )
+    assert "too, and does not hold. " in page and "seeds from 7 on" in page
+    assert "no lead is shown" not in page.split("\n\n")[1]
     # The claims of the first report are judged without it.
     assert len(module.claims(report)) == 4
 
@@ -217,3 +226,23 @@ def test_a_confirmation_is_of_what_was_stated_and_stands_apart_in_the_report(sta
     assert module.FIRST_TO_CONFIRM in REPORTING
     with pytest.raises(UserError, match="either choose or confirm"):
         module.Options(confirmation=True, validation=True)
+    with pytest.raises(UserError, match="draws is 18, and what is confirmed was stated before"):
+        module.Options(confirmation=True, draws=18)
+    stated["objective_sha256"] = "of another"
+    with pytest.raises(UserError, match="lpo-pendulum is not the objective that was stated"):
+        next(module.parts(options, {}))
+
+
+def test_a_lead_of_one_task_alone_is_said_to_be_that(report, stated):
+    entries = {
+        "CartPole-v1": entry("CartPole-v1", ppo=0.1, dpo=0.1, lpo_pendulum=0.9),
+        "Acrobot-v1": entry("Acrobot-v1", ppo=0.1, dpo=0.1, lpo_pendulum=0.1),
+    }
+    report["confirmation"] = {"environments": entries, "first_seed": 7}
+    tasks = module.facts(report)["stated"]["tasks"]["ppo"]
+    assert {k: round(x.value, 2) for k, x in tasks["in it"].items()} == {
+        "CartPole-v1": 0.8,
+        "Acrobot-v1": 0.0,
+    }
+    assert tasks["in the others"]["Acrobot-v1"] == tasks["in it"]["CartPole-v1"]
+    assert "Without CartPole-v1 no lead is shown: +0.000" in module.EXPERIMENT.page(report)

@@ -161,3 +161,6 @@ def test_objectives_are_listed_with_what_ppo_earns_with_them(capsys):
     assert entry["command"] == metadata["command"]
     assert entry["results"]["Pendulum-v1"]["n"] == 20 and entry["certificate"]["holds"]
     assert entry["learned_on"] == ["Synthetic-Pendulum-v1", "Synthetic-CartPole-v1"]
+    # A command that finds others now says so.
+    assert entry["random_keys"] == metadata["random_keys"]
+    assert "random_keys" not in listed["lpo-cartpole-ee"]

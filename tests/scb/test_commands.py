@@ -510,6 +510,8 @@ def test_listing_as_json_has_the_command_that_found_a_bandit():
     for name, x in listed.items():
         metadata = bandit_metadata(name)
         assert x["command"] == metadata["command"] and x["results"] == metadata["results"]
+        # A command that finds others now says so.
+        assert x.get("random_keys") == metadata.get("random_keys")
     assert listed["Synthetic-Acrobot-v1"]["found"] == "fitted"
     assert listed["Synthetic-Acrobot-v1"]["environment"] == "Acrobot-v1"
     # An expert of 7 085 274 steps, refinement of 2 016 747, 320 000 of candidates and 32 000 of judgements, whose
