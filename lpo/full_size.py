@@ -59,6 +59,9 @@ CONFIRMATIONS = (
     Confirmation("hopper", "ta-lpo", reporting(40, offset=30), "area", "dpo", known="ta-lpo"),
     Confirmation("hopper at 0.0005", "ta-lpo", reporting(40), "area"),
     Confirmation("hopper at 0.0005", "ta-lpo", reporting(40, offset=40), "late lead"),
+    # Suggested by four pairs that report nothing, 58 to 168 more than the clip and 150 to 316 more than DPO.
+    Confirmation("hopper", "lpo-cartpole-ee", reporting(60), "area", known=REFERENCE),
+    Confirmation("hopper", "lpo-cartpole-ee", reporting(60), "area", "dpo", known="dpo"),
 )
 
 
