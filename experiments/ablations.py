@@ -98,22 +98,28 @@ def parts(plan: Mapping[str, Any], report: dict[str, Any]) -> Iterator[Part]:
 measure = InParts(parts)
 
 
-def planned(report: Mapping[str, Any], environment: str) -> dict[str, dict[str, Any]]:
-    """{search: {seed: curve}} of as many searches of a kind as the report's plan has.
+def planned(report: Mapping[str, Any]) -> dict[str, dict[str, dict[str, Any]]]:
+    """{environment: {search: {seed: curve}}} of as many searches of a kind as the report's plan has.
 
     Who looks at a difference while it grows sees it pass its margin sooner or later: what was made beyond the plan
     counts when the plan has it, that is when all are there.
     """
-    found = {}
-    for search, curves in report["environments"][environment].items():
-        number = seeds_of(report["plan"], environment, search)
-        found[search] = {seed: curve for seed, curve in curves.items() if int(seed) < number}
-    return found
+    return {
+        environment: {
+            search: {
+                seed: curve
+                for seed, curve in curves.items()
+                if int(seed) < seeds_of(report["plan"], environment, search)
+            }
+            for search, curves in of_it.items()
+        }
+        for environment, of_it in report["environments"].items()
+    }
 
 
 def _never_reached(report: Mapping[str, Any], environment: str, search: str) -> bool:
     """Whether no agent of any judgement earned more than one that never reaches the goal."""
-    curves = planned(report, environment)[search].values()
+    curves = planned(report)[environment][search].values()
     means = [x for c in curves for x in c["mean"] if x is not None]
     return environment in WORST and bool(means) and max(means) <= WORST[environment]
 
@@ -121,7 +127,7 @@ def _never_reached(report: Mapping[str, Any], environment: str, search: str) -> 
 def _at_the_start(report: Mapping[str, Any], environment: str) -> bool:
     """Whether no search ends a tenth of the way from random actions to the expert: such searches test no claim."""
     least = environment_spec(environment).random_return() + of_the_way(environment)
-    curves = planned(report, environment)
+    curves = planned(report)[environment]
     return all(
         x < least for search in searches_of(environment) for x in searches.last(curves[search])
     )
@@ -133,7 +139,7 @@ def claims(report: Report) -> list[Claim]:
 
 
 def _claims_of(report: Report, environment: str) -> list[Claim]:
-    curves, untold = planned(report, environment), _at_the_start(report, environment)
+    curves, untold = planned(report)[environment], _at_the_start(report, environment)
 
     def above(text: str, row: str, label: str, other: str, margin: float = 0.0) -> Claim:
         one, than = (curves[rows(environment)[row][x]] for x in (label, other))
@@ -162,12 +168,13 @@ def _claims_of(report: Report, environment: str) -> list[Claim]:
 def facts(report: Report) -> dict[str, Any]:
     """{environment: {row of the figure: {label: what its searches were worth}}}, and where they led nowhere."""
     found: dict[str, dict[str, dict[str, Any]]] = {}
+    made = planned(report)
     for environment in ENVIRONMENTS:
         candidates = report["plan"]["environments"][environment]["population_size"]
         for row, labels in rows(environment).items():
             of_it = found.setdefault(environment, {}).setdefault(row, {})
             for label, search in labels.items():
-                curves = planned(report, environment)[search]
+                curves = made[environment][search]
                 of_it[label] = {
                     "final": searches.final(curves, np.mean),
                     "failing": max(max(c["failed"]) for c in curves.values()) / candidates,
@@ -175,9 +182,7 @@ def facts(report: Report) -> dict[str, Any]:
                     "machines": searches.ran_on(curves.values(), report),
                 }
     untold = [x for x in ENVIRONMENTS if _at_the_start(report, x)]
-    all_of_them = (
-        c for x in ENVIRONMENTS for of_it in planned(report, x).values() for c in of_it.values()
-    )
+    all_of_them = (c for x in made.values() for s in x.values() for c in s.values())
     ran = searches.elsewhere(all_of_them, report)
     return {"rows": found, "untold": untold, "enough": ENOUGH, "elsewhere": ran}
 
@@ -193,10 +198,10 @@ def draw(report: Mapping[str, Any]) -> Figure:
         plotting.PURPLE,
     )
     styles = ("-", "--", "-.", ":", (0, (3, 1, 1, 1)), (0, (5, 1)))
+    made = planned(report)
     found = {
         f"{environment}:\n{row}": {
-            label: list(planned(report, environment)[search].values())
-            for label, search in drawn.items()
+            label: list(made[environment][search].values()) for label, search in drawn.items()
         }
         for environment in ENVIRONMENTS
         for row, drawn in rows(environment).items()

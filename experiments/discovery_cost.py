@@ -69,6 +69,8 @@ def collect(folders: Sequence[Path]) -> dict[str, Any]:
     Raises:
       UserError: a folder is no run, or no run is left.
     """
+    if not folders:
+        raise UserError("no folders: name those of runs of scb discover, such as runs/discover.")
     runs, left_out = [], []
     for folder in folders:
         outcome = _run(folder)
@@ -76,8 +78,6 @@ def collect(folders: Sequence[Path]) -> dict[str, Any]:
             left_out.append({"name": folder.resolve().name, "why": outcome})
         else:
             runs.append(outcome)
-    if not folders:
-        raise UserError("no folders: name those of runs of scb discover, such as runs/discover.")
     if not runs:
         reasons = "; ".join(f"{x['name']}: {x['why']}" for x in left_out)
         raise UserError(f"no run starts warm or random and was judged once ({reasons}).")

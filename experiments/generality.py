@@ -259,11 +259,8 @@ def facts(report: Report) -> dict[str, Any]:
             name: [entry[x]["generation"] for x in (DRAWN, FIXED)]
             for name, entry in report["environments"].items()
         },
-        "experts": {
-            name: environment_spec(name).reference_return() for name in report["environments"]
-        },
         "by_task": {
-            name: estimate(x)
+            name: (estimate(x), environment_spec(name).reference_return())
             for name, x in zip(
                 report["environments"], normalized(report, ZOO, TOGETHER), strict=True
             )

@@ -58,9 +58,9 @@ def measured(name: str, options: Options) -> dict[str, Any]:
     scale = float(task.env.reward_scale(task.env_params, named_key(root_key(SEED), "scale")))
     key = named_key(root_key(SEED), "horizons")
     earned = jax.jit(lambda of, horizon: task.fitness(of, key, options.agents, horizon))
-    found = {}
+    found, place = {}, Place.named(TASK)
     for horizon in options.horizons:
-        returns, _ = as_random(np.asarray(earned(objective.parameters, horizon)), Place.named(TASK))
+        returns, _ = as_random(np.asarray(earned(objective.parameters, horizon)), place)
         found[f"{horizon:g}"] = packed([returns / scale])[0]
     digests = {"sha256": bandit_metadata(TASK)["sha256"], "objective_sha256": _digest(objective)}
     return {**digests, "returns": found}

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from experiments.claims import FAILS, HOLDS, OUTCOMES, UNDECIDED, UNTESTED, Judged
 from scb.plotting import thousands
-from scb.statistics import Estimate, estimate
+from scb.statistics import Estimate, estimate, places_apart
 
 TEMPLATES = Path(__file__).with_name("templates")
 
@@ -39,15 +39,14 @@ def text(value: Estimate | Mapping[str, Any] | Any, places: int = 0, sign: bool 
     if low is None:
         return number(found, places, sign)
     decides = low * high > 0
-    shown = _seen(found, places) if decides else places
-    ends = [number(end, _seen(end, places, 4 if decides else 2)) for end in (low, high)]
-    return f"{number(found, shown, sign)} [{', '.join(ends)}]"
 
+    def shown(x: float, most: int) -> int:
+        # Of whole points a tenth says nothing.
+        return places_apart(places, x, most=most) if places else 0
 
-def _seen(value: float, places: int, more: int = 2) -> int:
-    """Decimal places, up to so many more for a digit that is not zero: an end's side of zero decides a claim."""
-    enough = (x for x in range(places, places + more + 1) if round(value, x))
-    return next(enough, places) if places else 0
+    ends = [number(end, shown(end, 6 if decides else places + 2)) for end in (low, high)]
+    middle = number(found, shown(found, places + 2) if decides else places, sign)
+    return f"{middle} [{', '.join(ends)}]"
 
 
 def digits(interval: Mapping[str, Any] | None, sign: bool = False) -> str:

@@ -114,12 +114,11 @@ class Options:
 
 def parts(options: Options, report: dict[str, Any]) -> Iterator[Part]:
     """One setting of one environment with one objective at a time."""
-    path: Keys = ("confirmation",) if options.confirmation else ()
+    path: Keys = ()
     if options.confirmation:
         check_stated(load_objective(STATED["objective"]))
+        path, report = ("confirmation",), report.setdefault("confirmation", {})
     options, first = options.asked, options.first_seed
-    for key in path:
-        report = report.setdefault(key, {})
     settled(report, first_seed=first, lists=_PLAN["lists"])
     # Without PPO's clip there is nothing to compare with.
     names = dict.fromkeys([REFERENCE, *options.objectives])
@@ -249,10 +248,9 @@ def confirmed(report: Report) -> list[Judged]:
     """What becomes of the claims that were stated first; empty until all of their agents are there."""
     scored = scores(report.get("confirmation", {"environments": {}}))
     asked = (*STATED["more_than"], STATED["objective"])
-    number = STATED["draws"] * len(_PLAN["settings"]["classic"])
     for place in STATED["environments"]:
         of_it = scored.get(place, {})
-        if any(name not in of_it or of_it[name].size != number for name in asked):
+        if any(name not in of_it or of_it[name].size != _stated_draws() for name in asked):
             return []
     both = {other: groups(scored, STATED["objective"], other) for other in STATED["more_than"]}
     return judge(
@@ -264,6 +262,11 @@ def confirmed(report: Report) -> list[Judged]:
             for other, pair in both.items()
         ]
     )
+
+
+def _stated_draws() -> int:
+    """Of each objective in each task."""
+    return int(STATED["draws"]) * len(_PLAN["settings"]["classic"])
 
 
 def without_homes(report: Report, scored: Scores, objective: str) -> Scores:
@@ -303,8 +306,7 @@ def facts(report: Report) -> dict[str, Any]:
         if other != REFERENCE
     }
     tasks = {other: by_task(scored, STATED["objective"], other) for other in STATED["more_than"]}
-    draws = STATED["draws"] * len(_PLAN["settings"]["classic"])
-    each = {"leads": leads, "tasks": tasks, "draws": draws}
+    each = {"leads": leads, "tasks": tasks, "draws": _stated_draws()}
     return {**found, "stated": {**STATED, "claims": stated, **rows, **each}}
 
 

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from lpo.objectives import KNOWN, load_objective, zoo_names
-from scb.listing import print_table
+from scb.listing import made_by, print_table
 
 PLACES = {
     "Pendulum-v1, policy_output_scale 0.01": "Pendulum, small last layer",
@@ -51,8 +51,7 @@ def entry(name: str) -> dict[str, Any]:
         "minutes": round(metadata["cost"]["seconds"] / 60, 2),
         "results": _results(metadata["results"], name),
         "certificate": metadata.get("certificate"),
-        "command": metadata["command"],
-        **{x: metadata[x] for x in ("random_keys",) if x in metadata},
+        **made_by(metadata),
     }
 
 

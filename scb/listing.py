@@ -55,9 +55,13 @@ def entry(name: str) -> dict[str, Any]:
         "environment_steps": int(_total(metadata, "environment_steps", *_IN_ENVIRONMENT)),
         "bandit_steps": int(_total(metadata, *_IN_BANDIT)),
         "results": metadata["results"],
-        "command": metadata["command"],
-        **{x: metadata[x] for x in ("random_keys",) if x in metadata},
+        **made_by(metadata),
     }
+
+
+def made_by(metadata: Mapping[str, Any]) -> dict[str, str]:
+    """The command that made what ships, and why it now makes another of its kind, where it does."""
+    return {x: metadata[x] for x in ("command", "random_keys") if x in metadata}
 
 
 def print_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> None:

@@ -54,13 +54,13 @@ class Estimate:
         return asdict(self)
 
 
-def places_apart(places: int, *ends: float | None) -> int:
+def places_apart(places: int, *ends: float | None, most: int = 6) -> int:
     """Decimal places with which no end of an interval looks like 0 that is not, for its sign decides.
 
-    Where even 6 do not show it, as many as were asked for.
+    Where even `most` do not show it, as many as were asked for.
     """
     given = [end for end in ends if end]
-    enough = (x for x in range(places, 7) if all(round(end, x) for end in given))
+    enough = (x for x in range(places, most + 1) if all(round(end, x) for end in given))
     return next(enough, places)
 
 

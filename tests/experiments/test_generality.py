@@ -224,7 +224,10 @@ def test_robustness_is_not_scored_by_what_drops_the_worst():
             for kind in (agent, f"{agent}, {WIDE}", f"{agent}, {SWISH}"):
                 entry[source]["returns"][kind] = [400.0] * 10
         entry[ZOO]["returns"][agent] = [410.0] * 8 + [20.0] * 2
-    scores = generality.facts(found)["scores"]
+    facts = generality.facts(found)
+    scores, (of_the_task, expert) = facts["scores"], facts["by_task"]["CartPole-v1"]
+    # The only task.
+    assert of_the_task.value == pytest.approx(scores[ZOO][0].value) and expert == 500.0
     assert scores[ZOO][0].value > scores[ENVIRONMENT][0].value
     assert scores[ZOO][1].value < scores[ENVIRONMENT][1].value and scores[ZOO][2].value == 0.0
     assert "holds" not in outcomes(found)[:2]
