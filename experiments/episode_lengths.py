@@ -26,7 +26,7 @@ from scb.environments.registry import environment_spec
 from scb.measurement import Agents, Judge, train_and_judge
 from scb.population import map_population
 from scb.seeds import REPORTING
-from scb.statistics import Estimate, estimate, normalized_score, paired_difference
+from scb.statistics import Estimate, estimate, paired_difference
 
 OWN = "max"  # the evaluation environment's own limit
 BINS = {"1": 1, "2": 2, "3 to 5": 5, "6 to 10": 10, "11 to 50": 50, "more": np.inf}
@@ -62,10 +62,7 @@ def _of_limit(environment: str, limit: str, plan: Mapping[str, Any]) -> dict[str
     folder = f"{plan['runs']}/{environment}-{limit}"
     problem, outcome = discover(config_of(environment, limit, plan), folder)
     place = environment_spec(environment)
-    entry: dict[str, Any] = {
-        "random": round(place.random_return(), 2),
-        "limit": place.episode_limit,
-    }
+    entry: dict[str, Any] = {"limit": place.episode_limit}
     space = problem.place.env.action_space(problem.place.params)
     returns: dict[str, list[float]] = {}
     failed = 0
@@ -73,7 +70,7 @@ def _of_limit(environment: str, limit: str, plan: Mapping[str, Any]) -> dict[str
         judged, lengths = returns_and_lengths(
             bandit_agent(algorithm, environment), problem, outcome.mean, plan
         )
-        returns[algorithm], number = finite(judged, entry["random"])
+        returns[algorithm], number = finite(judged, place.random_return())
         failed += number
         if limit == OWN:
             entry.setdefault("lengths", {})[algorithm] = binned(lengths)
@@ -125,9 +122,7 @@ def normalized(report: Mapping[str, Any], environment: str, limit: str) -> np.nd
     """[N] scores of the agents of all algorithms: 0 a random policy, 1 the paper's SAC expert."""
     entry = report["environments"][environment]
     returns = np.concatenate([np.asarray(x) for x in entry["returns"][limit].values()])
-    return normalized_score(
-        returns, entry["random"], environment_spec(environment).reference_return()
-    )
+    return environment_spec(environment).score(returns)
 
 
 def scores(report: Mapping[str, Any], environment: str, limit: str) -> Estimate:

@@ -39,7 +39,6 @@ from scb.statistics import (
     Estimate,
     estimate,
     iqm,
-    normalized_score,
     paired_difference,
     stratified_estimate,
     worst_decile,
@@ -90,17 +89,12 @@ def config_of(environment: str, source: str, plan: Mapping[str, Any]) -> Discove
 
 def parts(plan: Mapping[str, Any], report: dict[str, Any]) -> Iterator[Part]:
     """What agents of each kind earn, a source at a time."""
-    random = report.setdefault("random", {})
     for environment in plan["environments"]:
-        if environment not in random:
-            random[environment] = round(environment_spec(environment).random_return(), 2)
         for source in SOURCES:
             path = ("environments", environment, source)
             kinds = [x for x in agents_of(environment) if (x, source) != (OPTIMAL, ENVIRONMENT)]
             left = lacking(report, path, {("returns", kind): kind for kind in kinds})
-            measured = partial(
-                _measured, environment, source, list(left.values()), random[environment], plan
-            )
+            measured = partial(_measured, environment, source, list(left.values()), plan)
             yield Part(path, measured, tuple(left))
 
 
@@ -108,10 +102,11 @@ measure = InParts(parts)
 
 
 def _measured(
-    environment: str, source: str, kinds: Sequence[str], random: float, plan: Mapping[str, Any]
+    environment: str, source: str, kinds: Sequence[str], plan: Mapping[str, Any]
 ) -> dict[str, Any]:
     """What is said of a source, and {kind of agent: [N] returns}."""
     judge_in = Place.named(environment)
+    random = environment_spec(environment).random_return()
     train_in, said = _source(judge_in, source, plan)
     found = {kind: finite(_returns(kind, train_in, judge_in, plan), random) for kind in kinds}
     failed = {kind: number for kind, (_, number) in found.items() if number}
@@ -203,11 +198,7 @@ def estimates(entry: Mapping[str, Any]) -> dict[str, Estimate]:
 def normalized(report: Mapping[str, Any], source: str, column: str) -> list[np.ndarray]:
     """Per environment the scores [N] of one kind of agent: 0 a random policy, 1 the paper's expert."""
     return [
-        normalized_score(
-            columns(entry[source])[column],
-            report["random"][name],
-            environment_spec(name).reference_return(),
-        )
+        environment_spec(name).score(columns(entry[source])[column])
         for name, entry in report["environments"].items()
     ]
 

@@ -31,7 +31,7 @@ from scb.environments.registry import environment_spec
 from scb.errors import UserError, at_least
 from scb.rows import Rows
 from scb.seeds import reporting, validation
-from scb.statistics import Estimate, normalized_score, stratified_estimate
+from scb.statistics import Estimate, stratified_estimate
 
 REFERENCE = "ppo"
 REFERENCES = (REFERENCE, "dpo")
@@ -113,7 +113,6 @@ def _trained(
     ).curves
     earned = dict(zip(found.seeds, found.final, strict=True))
     return {
-        "random": environment_spec(environment).random_return(),
         "own": float(ppo_spec(environment).hyperparameters.learning_rate),
         "steps": int(found.steps[-1]),
         "learned_on": {name: learned_in([objective])},
@@ -130,11 +129,7 @@ def scores(report: Report, role: str = REPORTED) -> Scores:
     return {
         environment: {
             name: {
-                float(rate): normalized_score(
-                    unpacked([of_it[rate]])[0],
-                    entry["random"],
-                    environment_spec(environment).reference_return(),
-                )
+                float(rate): environment_spec(environment).score(unpacked([of_it[rate]])[0])
                 for rate in sorted(of_it, key=float)
             }
             for name, of_it in entry[role].items()

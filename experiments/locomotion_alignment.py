@@ -32,7 +32,7 @@ from scb import plotting
 from scb.environments.registry import environment_spec
 from scb.environments.zoo import bandit_metadata
 from scb.errors import UserError, at_least
-from scb.statistics import halves_agree, iqm, normalized_score
+from scb.statistics import halves_agree, iqm
 
 BACKEND = "generalized"
 PENDULUM, CARTPOLE = "Pendulum-v1", "CartPole-v1"
@@ -198,7 +198,10 @@ def ranked_elsewhere(report: Report) -> dict[str, dict[str, dict[str, Alignment]
         }
         earned[TOGETHER] = {
             of: {
-                name: np.mean([_scored(other, earned[other][of][name]) for other in others], axis=0)
+                name: np.mean(
+                    [environment_spec(other).score(earned[other][of][name]) for other in others],
+                    axis=0,
+                )
                 for name in curves
             }
             for of in OUTCOMES
@@ -230,12 +233,6 @@ def reporting_there(report: Report, environment: str) -> dict[str, LearningCurve
 def _everywhere(report: Report, curves: Mapping[str, LearningCurves]) -> dict[str, LearningCurves]:
     others = report.get("others", {}).values()
     return {name: curve for name, curve in curves.items() if all(name in x for x in others)}
-
-
-def _scored(environment: str, returns: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Returns as scores: 0 is a random policy, 1 the paper's expert."""
-    spec = environment_spec(environment)
-    return normalized_score(returns, spec.random_return(), spec.reference_return())
 
 
 def kind(objective: str) -> str:

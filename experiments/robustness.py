@@ -171,7 +171,6 @@ def _trained(
     earned, failed = finite([row["return"] for row in rows], random)
     print(f"{environment}, {name}, {key}: {np.mean(earned):.4g}", flush=True)
     return {
-        "random": random,
         "returns": {name: {key: packed([earned])[0]}},
         "failed": {name: {key: failed}},
         "draws": {
@@ -202,10 +201,11 @@ def scores(report: Report) -> Scores:
         }
         if returns:
             every = np.concatenate(list(returns.values()))
-            published = environment_spec(environment).reference()
+            spec = environment_spec(environment)
+            published = spec.reference()
             best = np.percentile(every, 95) if published is None else published.value
             found[environment] = {
-                name: normalized_score(x, entry["random"], best) for name, x in returns.items()
+                name: normalized_score(x, spec.random_return(), best) for name, x in returns.items()
             }
     return found
 

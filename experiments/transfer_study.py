@@ -33,7 +33,7 @@ from scb.measurement import check_seeds
 from scb.plotting import BLUE, GREY, VERMILLION, estimate_row
 from scb.rows import Rows
 from scb.seeds import REPORTING
-from scb.statistics import Estimate, estimate, normalized_score, pooled_estimate
+from scb.statistics import Estimate, estimate, pooled_estimate
 
 _PLAN = plan_of("transfer_study")
 VARIATIONS: dict[str, dict[str, Any]] = _PLAN["variations"]
@@ -266,8 +266,7 @@ def _earned(objective: Objective, environment: str, at: Evaluation, options: Opt
     ).curves
     if not at.normalized:
         return curves.final
-    spec = environment_spec(environment)
-    return normalized_score(curves.final, spec.random_return(), spec.reference_return())
+    return environment_spec(environment).score(curves.final)
 
 
 def _learned(name: str, seed: int, options: Options) -> tuple[Objective, dict[str, Any]]:

@@ -13,10 +13,13 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Any, TypeAlias
 
+import numpy as np
 from gymnax.environments import environment
+from numpy.typing import ArrayLike, NDArray
 
 from scb.environments.returns import RANDOM, Returns, random_return, table
 from scb.errors import UserError
+from scb.statistics import normalized_score
 
 Made: TypeAlias = tuple[environment.Environment[Any, Any], Any]
 
@@ -164,6 +167,16 @@ class EnvironmentSpec:
             physics = f" with {self.physics(backend)} physics" if self.backends else ""
             raise UserError(f"no reference return of {self.name}{physics} is known: measure one.")
         return reference.value
+
+    def score(self, returns: ArrayLike, backend: str | None = None) -> NDArray[np.floating]:
+        """Returns, of any shape, as scores: 0 for random actions and 1 for the reference.
+
+        Raises:
+          UserError: as for `random_return`, `reference_return` and `scb.statistics.normalized_score`.
+        """
+        return normalized_score(
+            returns, self.random_return(backend), self.reference_return(backend)
+        )
 
     def standing_still(self, backend: str | None = None) -> float | None:
         """What an episode of full length without a fall and without moving earns; None where that means nothing."""

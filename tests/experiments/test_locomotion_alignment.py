@@ -8,6 +8,7 @@ import pytest
 
 from experiments import locomotion_alignment as module
 from lpo.fitness import LABELS
+from scb.environments.registry import environment_spec
 from scb.plotting import BLUE, GREY, VERMILLION
 
 EARNED = {"ppo": 3.0, "ppo-0.1": 1.0, "dpo": 4.0, "lpo-pendulum": 2.0}
@@ -135,9 +136,8 @@ def test_agents_that_report_are_a_second_witness(
 def test_the_mean_score_weighs_tasks_by_their_experts(tmp_path, environment, trained, elsewhere):
     report, _ = run(tmp_path)
     # A thousand points between random actions and the expert there, and about five hundred here.
-    apart = [
-        module._scored(name, np.array([0.0, 100.0])) for name in ("Pendulum-v1", "CartPole-v1")
-    ]
+    names = ("Pendulum-v1", "CartPole-v1")
+    apart = [environment_spec(name).score([0.0, 100.0]) for name in names]
     assert [1 / (b - a) * 100 for a, b in apart] == pytest.approx([1077, 477], rel=0.05)
     for of_it in report["others"]["CartPole-v1"].values():
         of_it["area"] = of_it["late"] = "0 0 0 0"

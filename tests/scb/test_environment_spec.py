@@ -1,5 +1,6 @@
 """What is known of environments, and what a new family of them takes: what `probes.Corridors` shows."""
 
+import numpy as np
 import pytest
 
 from experiments.returns import EXPERIMENT
@@ -117,3 +118,11 @@ def test_a_bandit_can_be_discovered_for_a_new_family(corridors):
     problem = BanditDiscovery(DiscoveryConfig(environment="Corridor-v0", init="random"))
     assert problem.bandit.name == "Synthetic-Corridor-v0"
     assert (problem.bandit.observation_size, problem.bandit.num_actions) == (3, 2)
+
+
+def test_a_score_is_0_for_random_actions_and_1_for_the_reference_of_its_physics():
+    hopper = environment_spec("hopper")
+    ends = [hopper.random_return("generalized"), hopper.reference_return("generalized")]
+    np.testing.assert_allclose(hopper.score([ends]), [[0, 1]], atol=1e-12)
+    with pytest.raises(UserError, match="no reference return of hopper with spring physics"):
+        hopper.score(ends, "spring")
