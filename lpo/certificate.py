@@ -76,6 +76,8 @@ class Certificate:
         verdict = "is a drift" if self.holds else "is NOT a drift"
         if self.holds and self.by_construction:
             verdict += " whatever its weights"
+        if not self.finite:
+            verdict += ", and no number on a part of the grid"
         if self.stalls:
             verdict += f", but one that MAY HOLD A POLICY STILL, with a kink above {LARGEST_KINK}"
         return (

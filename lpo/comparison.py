@@ -21,7 +21,7 @@ from scb.agents.spec import AgentSpec, environment_agent
 from scb.environments.registry import environment_spec
 from scb.errors import UserError, one_of
 from scb.files import make_folder, plain
-from scb.measurement import MODE, SAMPLED, Place, as_random, measure
+from scb.measurement import MODE, SAMPLED, Place, as_random, check_seeds, measure
 from scb.rows import Rows, pivot
 from scb.runs import held
 from scb.statistics import DECIDING, Estimate, estimate, paired_difference
@@ -286,13 +286,14 @@ def compare(
     loaded = load_apart(objectives)
     if not loaded:
         raise UserError("no objectives: give at least one, such as ppo.")
+    whole = check_seeds(seeds)
     spec = spec or ppo_spec(environment)
     place = Place.named(environment, backend)
     with _kept(rows) as kept:
         found = measure(
             spec,
             place,
-            agents=seeds,
+            agents=whole,
             objectives=loaded,
             points=points,
             episodes=episodes,
@@ -314,7 +315,7 @@ def compare(
                 objective.name,
                 steps,
                 measured["return"][i],
-                list(seeds),
+                whole,
                 episodes,
                 mode_actions,
                 other,

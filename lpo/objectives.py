@@ -26,8 +26,8 @@ CLIPS = ("ppo-0.1", "ppo", "ppo-0.3", "ppo-0.5", "ppo-1")  # among which a tuned
 _SUGGESTED = tuple(dict.fromkeys((*KNOWN, *CLIPS, "dpo-4-1.2")))  # to who mistypes a name
 _ZOO = Path(__file__).parent / "zoo"
 _NUMBER = r"(\d*\.?\d+(?:e-?\d+)?)"
-_CLIP_NAME = re.compile(f"ppo-{_NUMBER}$")
-_DPO_NAME = re.compile(f"dpo-{_NUMBER}-{_NUMBER}$")
+_CLIP_NAME = re.compile(f"ppo-{_NUMBER}")
+_DPO_NAME = re.compile(f"dpo-{_NUMBER}-{_NUMBER}")
 
 
 @dataclass(frozen=True, eq=False)  # parameters are arrays: `same_drift` compares
@@ -152,9 +152,9 @@ def load_objective(name: Named) -> Objective:
     text = str(name)
     if text in KNOWN:
         return closed_form(text, KNOWN[text])
-    if clip := _CLIP_NAME.match(text):
+    if clip := _CLIP_NAME.fullmatch(text):
         return closed_form(text, ClipDrift(float(clip.group(1))))
-    if constants := _DPO_NAME.match(text):
+    if constants := _DPO_NAME.fullmatch(text):
         return closed_form(text, DPODrift(*map(float, constants.groups())))
     return _from_file(artefacts.named(text, _ZOO, "objective", _SUGGESTED))
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import tyro
 
 from lpo.drift_figures import drift_and_gradient
-from lpo.objectives import load_apart
+from lpo.objectives import load_apart, load_objective
 from lpo.page import save_objective_page
 from lpo.update_regions import REGIONS, analyze
 from scb import interactive, plotting
@@ -39,7 +39,7 @@ def show_command(
     if html:
         interactive.plotly()  # before the work, not after it
     objectives = load_apart([*(name for name in beside if name != objective), objective])
-    folder = Path("runs") / "show" / objectives[-1].name if out is None else out
+    folder = Path("runs") / "show" / load_objective(objective).name if out is None else out
     make_folder(folder)
     found = [analyze(o, progress) for o in objectives]
     write_json(folder / "show.json", {"objectives": [analysis.as_dict() for analysis in found]})

@@ -145,8 +145,9 @@ class SyntheticVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
       file: NAME.npz, or the name of a bandit of the zoo.
       num_envs: how many.
       autoreset_mode: SameStep, NextStep or Disabled, see `gymnasium.vector.AutoresetMode`. With NextStep,
-        Gymnasium's usual one, every other step of a bandit is a reset, which pays nothing; but some of its wrappers
-        of many environments count nothing else: RecordEpisodeStatistics, NormalizeObservation.
+        Gymnasium's usual one, every other step of a bandit is a reset, which pays nothing; but its wrappers of
+        many environments need it: in SameStep RecordEpisodeStatistics records zeros from the second step on, and
+        those of observations are refused.
       render_mode: None, as many scripts say it.
 
     Raises:

@@ -9,6 +9,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import lru_cache
+from numbers import Real
 from operator import itemgetter
 from typing import Any, NamedTuple
 
@@ -193,10 +194,13 @@ def check_seeds(seeds: Sequence[int]) -> list[int]:
     given: object = seeds
     if not isinstance(given, Sequence | np.ndarray | jax.Array) or isinstance(given, str):
         raise UserError(f"the seeds are {given!r}: give a list, such as [0, 1] or range(10).")
+    if not isinstance(given, Sequence):
+        seeds = np.asarray(given).tolist()
     if not len(seeds):
         raise UserError("no seeds: give at least one.")
     for seed in seeds:
-        if not (0 <= seed < 2**32 and seed == int(seed)):
+        number = isinstance(seed, Real)
+        if not (number and 0 <= seed < 2**32 and seed == int(seed)):
             raise UserError(
                 f"a seed is {seed}: each must be a whole number, 0 or larger, and below 2^32."
             )

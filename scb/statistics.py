@@ -124,7 +124,7 @@ def paired_difference(a: ArrayLike, b: ArrayLike, confidence: float = 0.95) -> E
     Raises:
       UserError: different numbers of runs, no runs, NaN or infinity.
     """
-    return stratified_estimate([a], [b], confidence, num_resamples=10_000)
+    return stratified_estimate([_runs("a", a)], [_runs("b", b)], confidence, num_resamples=10_000)
 
 
 def stratified_estimate(

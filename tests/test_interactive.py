@@ -99,6 +99,11 @@ def test_objectives_of_runs_are_shown_apart_by_their_folders(monkeypatch, tmp_pa
         save_objective(Path("runs", name, "objective.npz"), objective.drift, objective.parameters)
         assert lpo_cli.main(["show", f"runs/{name}/objective", "--beside"]) == 0
     assert sorted(x.name for x in Path("runs/show").iterdir()) == ["a", "b"]
+    # Two of one name: it is told apart by its path, which is no folder's name.
+    other = Path("others/a/objective.npz").absolute()
+    save_objective(other, objective.drift, objective.parameters)
+    assert lpo_cli.main(["show", str(other), "--beside", "runs/a/objective"]) == 0
+    assert [x.name for x in other.parent.iterdir() if x.is_dir()] == []
 
 
 @pytest.mark.parametrize(

@@ -127,6 +127,11 @@ def _check(name: str, env: environment.Environment[Any, Any], params: Any) -> No
                 )
         step = env.step(key, state, action, params)
         check_values("step", step, "observation, state, reward, terminated, truncated, info")
+        if "final_observation" not in step[5]:
+            raise wrong(
+                "returns an info without final_observation from step: there give what was observed last, before any "
+                "reset, as gymnax's own step does, or write step_env and leave step to it"
+            )
         return observation, step, state
 
     def times(state: Any) -> Any:

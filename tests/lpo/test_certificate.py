@@ -91,6 +91,7 @@ def test_a_drift_that_is_not_finite_far_out_is_none(bad):
     assert not found.holds
     assert not found.finite
     assert (found.minimum, found.value_at_one, found.gradient_at_one) == (0.0, 0.0, 0.0)
+    assert str(found).startswith("is NOT a drift, and no number on a part of the grid")
 
 
 def test_a_bias_of_one_advantage_only_is_found():

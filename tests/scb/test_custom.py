@@ -50,6 +50,10 @@ class OlderStep(Pendulum):
         observation, state, reward, terminated, truncated, info = super().step(*arguments)
         return observation, state, reward, terminated | truncated, info
 
+class NoFinal(Pendulum):
+    def step(self, *arguments):
+        return *super().step(*arguments)[:5], {}
+
 class OlderReset(Pendulum):
     def reset(self, *arguments):
         return *super().reset(*arguments), {}
@@ -135,6 +139,7 @@ class ByName(Pendulum):
 class OwnStep(Untimed):
     def step(self, key, state, action, params):
         observation, state, reward, terminated, info = self.step_env(key, state, action, params)
+        info = info | {"final_observation": observation}
         return observation, state, reward, terminated, state.theta > 3.0, info
 
 class InFrames(Pendulum):
@@ -320,6 +325,7 @@ def test_the_physics_that_a_factory_takes_is_part_of_the_place(module):
         ),
         ("{}:OtherActions", "has a gymnax.environments.spaces.Tuple of actions: one Box or Disc"),
         ("{}:OlderStep", "returns 5 of step, where gymnax 1.x returns observation, state, reward"),
+        ("{}:NoFinal", "returns an info without final_observation from step"),
         ("{}:OlderReset", "returns 3 of reset, where gymnax 1.x returns observation, state: "),
         ("{}:NoStep", "returns 1 of step, where gymnax 1.x returns"),
         ("{}:FourValues", "returns 4 of step_env, where gymnax 1.x returns observation, state, re"),

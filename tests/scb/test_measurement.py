@@ -6,6 +6,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import given
@@ -17,7 +18,15 @@ from scb.agents.drift import clipped_surrogate_drift
 from scb.agents.ppo import DIAGNOSIS, PPOConfig, PPOHyperparameters
 from scb.agents.spec import AgentSpec, environment_agent
 from scb.errors import UserError
-from scb.measurement import Agents, Judge, Place, measure, spaced, train_and_judge
+from scb.measurement import (
+    Agents,
+    Judge,
+    Place,
+    check_seeds,
+    measure,
+    spaced,
+    train_and_judge,
+)
 from scb.population import map_population
 from scb.rows import Rows, _description, pivot
 
@@ -378,6 +387,7 @@ def test_seeds_of_numpy_are_kept_as_numbers(measured, file, tmp_path):
         ),
         ({"agents": [2**32]}, "a seed is 4294967296"),
         ({"agents": [1.5]}, "a seed is 1.5: each must be a whole number"),
+        ({"agents": ["1"]}, "a seed is 1: each must be a whole number"),
         ({"agents": [3, 4, 3]}, "seed 3 is there twice: give each once."),
         ({"actions": ("most likely",)}, "unknown kind of actions 'most likely'"),
         ({"actions": "modes"}, "unknown kind of actions 'modes': did you mean mode"),
@@ -460,3 +470,9 @@ def test_rows_in_memory_refuse_another_configuration_too():
     rows.add([row | {"configuration": digest}])
     with pytest.raises(UserError, match="the rows were measured under another configuration"):
         rows.cell({"environment": "e"}, {"a": 2}, 1)
+
+
+@pytest.mark.parametrize("seeds", [range(2), np.arange(2), jnp.arange(2), [0.0, 1.0]])
+def test_seeds_of_any_kind_become_pythons_integers(seeds):
+    found = check_seeds(seeds)
+    assert found == [0, 1] and {type(x) for x in found} == {int}

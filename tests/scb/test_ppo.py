@@ -224,6 +224,7 @@ def test_steps_are_rounded_up_to_whole_batches():
         ({"num_minibatches": 0}, "num_minibatches is 0: it must be at least 1"),
         ({"total_steps": 0}, "total_steps is 0: it must be at least 1"),
         ({"num_minibatches": 3}, "num_minibatches is 3, which does not divide a batch of 500"),
+        ({"num_minibatches": 500}, "leaves one transition of 500 in each"),
         ({"activation": "tan"}, "unknown activation 'tan': did you mean tanh?"),
     ],
 )

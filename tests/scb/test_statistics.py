@@ -133,6 +133,8 @@ def test_what_a_seed_does_to_both_methods_cancels_in_a_paired_difference():
 def test_paired_difference_wants_the_same_number_of_runs():
     with pytest.raises(UserError, match="have other sizes: pair run by run"):
         paired_difference([1.0, 2.0, 3.0], [1.0, 2.0])
+    with pytest.raises(UserError, match=r"a has shape \(2, 3\): give a vector"):
+        paired_difference(np.zeros((2, 3)), np.zeros((2, 3)))
 
 
 def test_normalized_score_is_zero_for_random_and_one_for_the_expert():
