@@ -49,9 +49,7 @@ def first_difference(stored: Any, given: Any, growing: Collection[str] = (), pat
     empty.
     """
     if isinstance(stored, dict) and isinstance(given, dict):
-        for key in dict.fromkeys(
-            (*given, *stored)
-        ):  # as it is asked for: what decides other settings comes first
+        for key in sorted(stored.keys() | given.keys()):
             inner = f"{path}.{key}".lstrip(".")
             difference = first_difference(stored.get(key), given.get(key), growing, inner)
             if difference:
