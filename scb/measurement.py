@@ -199,8 +199,7 @@ def check_seeds(seeds: Sequence[int]) -> list[int]:
     if not len(seeds):
         raise UserError("no seeds: give at least one.")
     for seed in seeds:
-        number = isinstance(seed, Real)
-        if not (number and 0 <= seed < 2**32 and seed == int(seed)):
+        if not (isinstance(seed, Real) and 0 <= seed < 2**32 and seed == int(seed)):
             raise UserError(
                 f"a seed is {seed}: each must be a whole number, 0 or larger, and below 2^32."
             )

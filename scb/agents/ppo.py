@@ -65,7 +65,7 @@ class PPOConfig(AgentConfig):
                 f"({self.num_envs} environments x {self.num_steps} steps): choose a divisor of {self.batch_size}."
             )
         # Advantages are normalised within a minibatch: of one alone it is 0, and nothing would be learned.
-        if self.batch_size < 2 * self.num_minibatches:
+        if self.num_minibatches == self.batch_size:
             raise UserError(
                 f"num_minibatches is {self.num_minibatches}, which leaves one transition of {self.batch_size} in each, "
                 "whose normalised advantage is 0: choose fewer."

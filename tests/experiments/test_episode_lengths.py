@@ -3,6 +3,7 @@ import pytest
 
 from experiments import episode_lengths as experiment
 from experiments.episode_lengths import BINS, OWN
+from scb.environments.registry import environment_spec
 
 TINY = {
     "seed": 0,
@@ -48,6 +49,7 @@ def test_a_limits_search_is_judged_and_its_episodes_are_counted(
     assert {x.name for x in tmp_path.iterdir()} == {"MountainCar-v0-max"}
     entry = found["environments"]["MountainCar-v0"]
     assert len(saved) == 1 and entry["limit"] == 200
+    assert environment_spec("MountainCar-v0").random_return() == -200.0
     assert sum(entry["lengths"]["ppo"].values()) == 2 * 3
     returns = entry["returns"][OWN]["ppo"]
     assert len(returns) == 2 and all(-200.0 <= x <= -80.0 for x in returns)

@@ -149,9 +149,8 @@ def test_a_replaced_bandit_is_measured_again_and_nothing_else(monkeypatch):
     assert measured == [(agent, ZOO) for agent in agents]
     again = {
         "sha256": ours,
-        "returns": {
-            x: [round(RANDOM, 2)] for x in agents
-        },  # what random actions earn instead of no number
+        # What random actions earn instead of no number.
+        "returns": {x: [round(RANDOM, 2)] for x in agents},
         "failed": {x: 1 for x in agents},
     }
     assert sources == before | {ZOO: again}
@@ -172,6 +171,7 @@ def test_agents_from_a_bandit_and_from_the_environment(tmp_path, monkeypatch, sm
     assert set(entry[ENVIRONMENT]["returns"]) == kinds - {OPTIMAL}
     # What is optimal in the zoo's bandit solves CartPole without any training.
     assert entry[ZOO]["returns"][OPTIMAL] == [500.0, 500.0]
+    assert 10.0 < RANDOM < 40.0
     generality.measure(plan, found, lambda: saved.append(1))
     assert len(saved) == 2  # a source each, once
 
