@@ -191,19 +191,19 @@ def check_seeds(seeds: Sequence[int]) -> list[int]:
     Raises:
       UserError: there are none, one is no whole number of 32 bits, or is there twice.
     """
-    given: object = seeds
+    given: Any = seeds
     if not isinstance(given, Sequence | np.ndarray | jax.Array) or isinstance(given, str):
         raise UserError(f"the seeds are {given!r}: give a list, such as [0, 1] or range(10).")
     if not isinstance(given, Sequence):
-        seeds = np.asarray(given).tolist()
-    if not len(seeds):
+        given = np.asarray(given).tolist()
+    if not len(given):
         raise UserError("no seeds: give at least one.")
-    for seed in seeds:
+    for seed in given:
         if not (isinstance(seed, Real) and 0 <= seed < 2**32 and seed == int(seed)):
             raise UserError(
                 f"a seed is {seed}: each must be a whole number, 0 or larger, and below 2^32."
             )
-    whole = [int(seed) for seed in seeds]
+    whole = [int(seed) for seed in given]
     if repeated := [seed for seed, number in Counter(whole).items() if number > 1]:
         raise UserError(f"seed {repeated[0]} is there twice: give each once.")
     return whole
