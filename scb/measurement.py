@@ -9,7 +9,6 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import lru_cache
-from numbers import Real
 from operator import itemgetter
 from typing import Any, NamedTuple
 
@@ -199,7 +198,9 @@ def check_seeds(seeds: Sequence[int]) -> list[int]:
     if not len(given):
         raise UserError("no seeds: give at least one.")
     for seed in given:
-        if not (isinstance(seed, Real) and 0 <= seed < 2**32 and seed == int(seed)):
+        if not (
+            isinstance(seed, int | float | np.number) and 0 <= seed < 2**32 and seed == int(seed)
+        ):
             raise UserError(
                 f"a seed is {seed}: each must be a whole number, 0 or larger, and below 2^32."
             )
