@@ -225,11 +225,12 @@ class Alignment:
       spearman: None where the fitness tells no two objectives apart.
       low, high: 95 % bootstrap interval over each objective's agents. The family is not resampled:
         the interval says how well this family's correlation is known, not how another's would be.
+        None where an objective has a single agent, of which nothing tells what another would earn.
     """
 
     spearman: float | None
-    low: float
-    high: float
+    low: float | None
+    high: float | None
 
 
 def alignment(fitness: Mapping[str, np.ndarray], outcome: Mapping[str, np.ndarray]) -> Alignment:
@@ -258,8 +259,11 @@ def alignment(fitness: Mapping[str, np.ndarray], outcome: Mapping[str, np.ndarra
 
     means = np.stack([np.mean(with_resamples(fitness[n]), axis=1) for n in names], axis=1)
     iqms = np.stack([iqm(with_resamples(outcome[n]), axis=1) for n in names], axis=1)
+    correlation = spearman(means[0], iqms[0])
+    if min(len(x) for of in (fitness, outcome) for x in of.values()) < 2:
+        return Alignment(correlation, None, None)
     low, high = np.percentile(rank_correlations(means[1:], iqms[1:]), [2.5, 97.5])
-    return Alignment(spearman(means[0], iqms[0]), float(low), float(high))
+    return Alignment(correlation, float(low), float(high))
 
 
 def measure_alignment(
@@ -366,10 +370,10 @@ def measure_alignment(
 
 def correlation_text(correlation: Mapping[str, float | None]) -> str:
     """Such as "0.93 [0.81, 0.98]"; where all earn the same there is nothing to rank."""
-    value = correlation["spearman"]
+    value, low, high = (correlation[name] for name in ("spearman", "low", "high"))
     if value is None:
         return "none: all alike"
-    ends = correlation["low"], correlation["high"]
-    places = places_apart(2, *ends)
-    low, high = (f"{end:.{places}f}" for end in ends)
-    return f"{value:.{places}f} [{low}, {high}]"
+    if low is None or high is None:
+        return f"{value:.2f}, one agent: no interval"
+    places = places_apart(2, low, high)
+    return f"{value:.{places}f} [{low:.{places}f}, {high:.{places}f}]"

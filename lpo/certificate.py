@@ -15,7 +15,7 @@ import numpy as np
 
 from lpo.drifts.contract import Drift
 from scb.agents.drift import MAX_LOG_RATIO, check_drift
-from scb.errors import UserError
+from scb.errors import UserError, count_at_least
 from scb.keys import root_key
 from scb.objectives import Objective
 
@@ -99,12 +99,13 @@ def certify(
       drift: any member of the contract, or an objective, which has its parameters.
       parameters: of a drift; what it starts with where they are left out.
       num_ratios: points of log-ratio, in [-3, 3] and, a quarter as many, out to the bound that
-        training clips at.
-      num_advantages: points of advantage in [-10, 10], the tails of a normalised minibatch.
+        training clips at; at least 3, and one more where they are even.
+      num_advantages: points of advantage in [-10, 10], the tails of a normalised minibatch; so are they.
 
     Raises:
-      UserError: it is no drift, or cannot take the parameters.
+      UserError: it is no drift, or cannot take the parameters, or there are fewer points.
     """
+    count_at_least(3, num_ratios=num_ratios, num_advantages=num_advantages)
     if not isinstance(drift, Drift):
         if not isinstance(getattr(drift, "drift", None), Drift):
             raise UserError(

@@ -24,7 +24,7 @@ from scb.files import make_folder, plain
 from scb.measurement import MODE, SAMPLED, Place, as_random, check_seeds, measure
 from scb.rows import Rows, pivot
 from scb.runs import held
-from scb.statistics import DECIDING, Estimate, estimate, paired_difference
+from scb.statistics import Estimate, estimate, few_agents, paired_difference
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -178,10 +178,7 @@ class Comparison:
     @property
     def few(self) -> str:
         """That there are too few agents for an interval to tell anything; empty where there are enough."""
-        fewest = min(len(c.seeds) for c in self.curves)
-        if fewest >= DECIDING:
-            return ""
-        return f"With fewer than {DECIDING} agents no interval decides anything; here are {fewest}."
+        return few_agents(min(len(c.seeds) for c in self.curves))
 
     def as_dict(self) -> dict[str, Any]:
         return {

@@ -15,6 +15,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
+from lpo.alignment import correlation_text
 from lpo.inner_loop import MetaTrainingConfig
 from scb.environments.registry import environment_spec
 from scb.errors import UserError
@@ -264,15 +265,11 @@ def alignment_heatmap(report: Mapping[str, Any]) -> Figure:
         axes.tick_params(length=0)
         for i, of_row in enumerate(cells):
             for j, cell in enumerate(of_row):
-                interval = f"[{cell['low']:.2f}, {cell['high']:.2f}]"
-                # Where all earn the same there is nothing to rank.
-                text = "all alike"
-                if cell["spearman"] is not None:
-                    text = f"{cell['spearman']:.2f}\n{interval}".replace("-", "\u2212")
+                text = correlation_text(cell).replace(" [", "\n[").replace(": ", ":\n")
                 axes.text(
                     j,
                     i,
-                    text,
+                    text.replace("-", "\u2212"),
                     ha="center",
                     va="center",
                     fontsize=8,

@@ -201,8 +201,11 @@ def _evaluate(
     # A number apart, for torch.compile cannot follow a branch on an array.
     if isinstance(progress, int | float):
         inside = 0 <= progress <= 1
-    elif isinstance(progress, list | tuple | np.generic | np.ndarray):
-        inside = bool(np.all((np.asarray(progress) >= 0) & (np.asarray(progress) <= 1)))
+    elif isinstance(progress, str | bytes | complex | list | tuple | np.generic | np.ndarray):
+        fractions = np.asarray(progress)
+        inside = fractions.dtype.kind in "biuf" and bool(
+            np.all((fractions >= 0) & (fractions <= 1))
+        )
     if not inside:
         raise UserError(f"progress is {progress}: it is the fraction of training done, in [0, 1].")
     if np.shape(progress) not in ((), log_ratio.shape):

@@ -38,8 +38,9 @@ def show_command(
         raise UserError(f"--progress is {progress}: it is a fraction of training, from 0 to 1.")
     if html:
         interactive.plotly()  # before the work, not after it
-    objectives = load_apart([*(name for name in beside if name != objective), objective])
-    folder = Path("runs") / "show" / load_objective(objective).name if out is None else out
+    shown = load_objective(objective)
+    objectives = load_apart([*(name for name in beside if name != objective), shown])
+    folder = Path("runs") / "show" / shown.name if out is None else out
     make_folder(folder)
     found = [analyze(o, progress) for o in objectives]
     write_json(folder / "show.json", {"objectives": [analysis.as_dict() for analysis in found]})

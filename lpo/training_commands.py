@@ -31,7 +31,7 @@ from scb.files import write_json
 from scb.lists import read_settings, write_settings
 from scb.machine import package_versions
 from scb.measurement import Place, check_seeds
-from scb.statistics import estimate
+from scb.statistics import estimate, few_agents
 
 
 def _tell(line: str) -> None:
@@ -380,6 +380,8 @@ class Align(Measuring):
             cells = (row["alignment"][fitness] for fitness in LABELS)
             table.add_row(row["name"], *(correlation_text(cell) for cell in cells))
         printer.print(table)
+        if few := few_agents(len(seeds)):
+            printer.print(few)
         if folder is not None:
             plotting.save(figures.alignment_heatmap(report), folder / "alignment.png")
 

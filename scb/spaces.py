@@ -60,6 +60,8 @@ def clip_to_space(action: jax.Array, space: spaces.Box | spaces.Discrete) -> jax
     """A continuous action within the space's bounds and of its shape; a discrete one as it is."""
     if isinstance(space, spaces.Discrete):
         return action
+    # Gymnax's Pendulum takes only the default floating-point type, which jax_enable_x64 makes one of 64 bits.
+    action = jnp.asarray(action, float)
     return jnp.clip(jnp.reshape(action, space.shape), space.low, space.high)
 
 

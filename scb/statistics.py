@@ -201,6 +201,13 @@ def pooled_estimate(groups: ArrayLike) -> Estimate:
     return _bootstrapped(pooled, [runs.shape[1]] * len(runs), 0.95, num_resamples=5000)
 
 
+def few_agents(number: int) -> str:
+    """That there are too few agents for an interval to tell anything; empty where there are enough."""
+    if number >= DECIDING:
+        return ""
+    return f"With fewer than {DECIDING} agents no interval decides anything; here are {number}."
+
+
 def few_groups_difference(
     groups: ArrayLike,
     minus: ArrayLike,

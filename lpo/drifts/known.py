@@ -11,7 +11,7 @@ import numpy as np
 from lpo.drifts.bases import DPO_ALPHA, DPO_BETA, discovered_drift
 from lpo.drifts.contract import Array, Drift
 from scb.agents.drift import clipped_surrogate_drift
-from scb.errors import positive
+from scb.errors import UserError, positive
 from scb.keys import root_key
 
 
@@ -24,7 +24,7 @@ class ClipDrift(Drift):
     clip: float = 0.2
 
     def __post_init__(self) -> None:
-        positive(clip=+self.clip)  # + takes numbers alone
+        _check(clip=self.clip)
 
     def init(self, key: jax.Array, scale: float = 1.0) -> jax.Array:
         return jnp.float32(self.clip)
@@ -48,7 +48,7 @@ class DPODrift(Drift):
     beta: float = DPO_BETA
 
     def __post_init__(self) -> None:
-        positive(alpha=+self.alpha, beta=+self.beta)  # + takes numbers alone
+        _check(alpha=self.alpha, beta=self.beta)
 
     def init(self, key: jax.Array, scale: float = 1.0) -> dict[str, jax.Array]:
         return {"alpha": jnp.float32(self.alpha), "beta": jnp.float32(self.beta)}
@@ -83,6 +83,18 @@ class NoDrift(Drift):
         chex.assert_equal_shape([log_ratio, advantage, progress])
         # Not zeros_like, which PyTorch refuses to differentiate.
         return log_ratio - log_ratio
+
+
+def _check(**constants: float) -> None:
+    """Raises a UserError for what is not positive, or would be 0 or infinite as the 32 bits of a parameter."""
+    positive(**{name: +x for name, x in constants.items()})  # + takes numbers alone
+    single = np.finfo(np.float32)
+    for name, x in constants.items():
+        if not float(single.tiny) <= x <= float(single.max):
+            raise UserError(
+                f"{name} is {x:g}, and parameters have 32 bits: give a number from {single.tiny:.2g} to "
+                f"{single.max:.2g}."
+            )
 
 
 def _shortest(number: Any) -> float:

@@ -274,16 +274,19 @@ class Agent(ABC):
           env: where the episodes are; None for the agent's environment. In another, the agent's actions are
             scaled to the bounds of its own environment with its default parameters.
           env_params: None for the environment's default parameters.
+          horizon: steps after which an episode is cut; None for the environment's own limit.
 
         Returns:
           Episodes of shape [num_episodes], with returns of NaN where the agent diverged.
 
         Raises:
-          UserError: the other environment has other observations or actions.
+          UserError: the other environment has other observations or actions, or a horizon is shorter than a step.
         """
         env = self.env if env is None else env
         _check_environment(env)
         count_at_least(1, num_episodes=num_episodes)
+        if not isinstance(horizon, jax.Array):  # which may be traced
+            at_least(1, horizon=horizon)
         env_params = env.default_params if env_params is None else env_params
         _check_params(env, env_params)
         own_params = env_params

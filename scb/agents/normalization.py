@@ -49,9 +49,10 @@ def _merged(
 def normalize(
     statistics: RunningStatistics, observation: jax.Array, power: float = 1.0
 ) -> jax.Array:
-    """[..., O] -> [..., O] with mean 0 and variance 1, clipped to ten deviations; as it is before any observation.
+    """[..., O] -> [..., O] with mean 0 and variance 1, clipped at ten deviations either way.
 
-    Divided by deviation**power: a power of 1 standardises, one of 0 only centres; clipped at ten deviations either way.
+    Divided by deviation**power: a power of 1 standardises, one of 0 only centres. Before any observation the mean
+    counts as 0 and the deviation as 1.
     """
     variance = jnp.where(
         statistics.count > 0, statistics.squares / jnp.maximum(statistics.count, 1.0), 1.0

@@ -1,6 +1,6 @@
 """Which bandit regime ranks objectives as an environment does: the measure, and what it is measured on."""
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 from types import SimpleNamespace
 
 import jax
@@ -77,6 +77,14 @@ def test_a_fitness_that_tells_nothing_apart_has_no_correlation():
     result = alignment(flat, outcome)
     assert result.spearman is None
     assert correlation_text({"spearman": None, "low": 0.0, "high": 0.0}) == "none: all alike"
+
+
+def test_of_single_agents_a_correlation_has_no_interval():
+    single = {name: np.array([x]) for name, x in (("a", 1.0), ("b", 2.0), ("c", 3.0))}
+    for fitness, outcome in ((single, returns(a=1, b=2, c=3)), (returns(a=1, b=2, c=3), single)):
+        found = alignment(fitness, outcome)
+        assert (found.spearman, found.low, found.high) == (1.0, None, None)
+        assert correlation_text(asdict(found)) == "1.00, one agent: no interval"
 
 
 @pytest.mark.parametrize(

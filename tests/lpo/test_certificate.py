@@ -154,6 +154,14 @@ def test_parameters_of_another_drift_are_told():
             certify(drift, parameters, **GRID)
 
 
+@pytest.mark.parametrize("points", ["num_ratios", "num_advantages"])
+@pytest.mark.parametrize("number", [1, 0, -3, 2.5])
+def test_a_grid_has_at_least_three_points(points, number, one_sentence):
+    with pytest.raises(lpo.UserError, match=f"{points} is {number}: it must be") as error:
+        certify(load_objective("ppo"), **{points: number})
+    one_sentence(str(error.value))
+
+
 def test_a_certificate_says_on_which_grid():
     # 61 log-ratios in [-3, 3] and 61 // 4 = 15 in [-20, 20], which share 0: 75.
     found = certificate(quadratic)

@@ -107,6 +107,16 @@ def test_constants_are_positive(name, wrong):
         load_objective(name)
 
 
+@pytest.mark.parametrize(
+    ("name", "wrong"),
+    [("ppo-1e-50", "clip"), ("dpo-1e-50-0.6", "alpha"), (f"dpo-2-1{'0' * 50}", "beta")],
+)
+def test_constants_are_numbers_of_32_bits(name, wrong, one_sentence):
+    with pytest.raises(UserError, match=f"{wrong} is 1e.50, and parameters have 32 bits") as error:
+        load_objective(name)
+    one_sentence(str(error.value))
+
+
 @pytest.mark.parametrize("name", ["ppo", "ppo-0.3", "dpo", "dpo-4-1.2", "none"])
 def test_an_objective_bears_the_name_that_it_was_loaded_by(name):
     assert load_objective(name).name == name

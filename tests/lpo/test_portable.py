@@ -147,7 +147,10 @@ def test_a_progress_in_per_cent_is_told():
         numpy_drift("ta-lpo")([0.1], [1.0], 50)
 
 
-@pytest.mark.parametrize("progress", [50.0, np.float32(50), np.array(-0.1), [0.5, 0.5, np.nan]])
+@pytest.mark.parametrize(
+    "progress",
+    [50.0, np.float32(50), np.array(-0.1), [0.5, 0.5, np.nan], "0.5", ["0.5"] * 3, 0.5j],
+)
 @pytest.mark.parametrize("make", [numpy_drift, drift_function, loss_function])
 def test_no_progress_outside_of_0_and_1_is_taken(make, progress, one_sentence):
     with pytest.raises(UserError, match=r"the fraction of training done, in \[0, 1\]") as error:

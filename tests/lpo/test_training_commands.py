@@ -204,6 +204,7 @@ def test_align_measures_every_combination_and_stores_it(monkeypatch, working_fol
     assert [(r.reward_noise, r.contexts) for r in asked] == [(0, 50), (0, 200), (5, 50), (5, 200)]
     output = capsys.readouterr().out
     assert "0.50 [0.25," in output and "contexts 50" in output
+    assert "With fewer than 10 agents no interval decides anything; here are 2." in output
     stored = json.loads((working_folder / "aligned" / "alignment.json").read_text())
     assert len(stored["regimes"]) == 4
     assert (working_folder / "aligned" / "alignment.png").stat().st_size > 5000

@@ -21,6 +21,7 @@ from scb.agents.tables import Setting, Tables
 from scb.agents.td3 import TD3, TD3Config, TD3Hyperparameters
 from scb.cli import main
 from scb.discovery import BanditDiscovery, DiscoveryConfig
+from scb.environments.registry import make
 from scb.environments.returns import random_return
 from scb.environments.synthetic import BanditConfig
 from scb.errors import UserError
@@ -173,6 +174,8 @@ def test_an_agent_says_what_it_takes():
         agent.evaluate(state, jax.random.key(0), 5, "CartPole-v1")
     with pytest.raises(UserError, match="num_episodes is -1: it must be at least 1"):
         agent.evaluate(state, jax.random.key(0), -1)
+    with pytest.raises(UserError, match="horizon is 0: it must be at least 1"):
+        agent.evaluate(state, jax.random.key(0), 5, horizon=0)
 
 
 @pytest.mark.parametrize(
@@ -190,11 +193,19 @@ def test_a_drift_of_ones_own_that_fails_says_why(drift, message):
         agent.init(jax.random.key(0), PPOHyperparameters(), CorridorParams())
 
 
-@pytest.mark.parametrize("name", ["ppo", "sac", "dqn"])
-def test_agents_train_where_numbers_have_64_bits(name):
-    env = Corridor()
+@pytest.mark.parametrize(
+    ("name", "env"),
+    [
+        ("ppo", Corridor()),
+        ("sac", Corridor()),
+        ("dqn", Corridor()),
+        ("sac", make("Pendulum-v1")[0]),
+        ("td3", make("Pendulum-v1")[0]),
+    ],
+)
+def test_agents_train_where_numbers_have_64_bits(name, env):
     with small_agents():
-        spec = environment_agent(name, "CartPole-v1")
+        spec = environment_agent(name, "Pendulum-v1" if name == "td3" else "CartPole-v1")
     with jax.enable_x64(True):
         agent = spec.agent(env)
         trained = jax.jit(agent.train)(jax.random.key(0), spec.hyperparameters, env.default_params)
