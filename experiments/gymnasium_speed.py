@@ -123,7 +123,7 @@ def facts(report: Report) -> dict[str, Any]:
 
 EXPERIMENT = Experiment(
     "gymnasium_speed",
-    "How fast do bandits step for Gymnasium?",
+    "Bandits for Gymnasium",
     measure,
     facts=facts,
     options=Options,

@@ -95,8 +95,7 @@ def told(judged: Sequence[Judged]) -> str:
     words = {HOLDS: ("holds", "hold"), FAILS: ("does not hold", "do not hold")}
     found = []
     for outcome in OUTCOMES[::-1]:
-        texts = [x.claim.text for x in judged if x.outcome == outcome]
-        if texts:
+        if texts := that(judged, outcome):
             word = words.get(outcome, (f"is {outcome}", f"are {outcome}"))[len(texts) > 1]
             which = f": {'; '.join(texts)}" if outcome in words else ""
             found.append(f"{len(texts)} {word}{which}")
@@ -106,6 +105,21 @@ def told(judged: Sequence[Judged]) -> str:
 def computer(machine: Mapping[str, Any]) -> str:
     """Such as "2 cores, AMD EPYC", of what a report says of the machine that measured."""
     return f"{machine['cores']} core{'s' * (machine['cores'] != 1)}, {machine['processor']}"
+
+
+def versions(packages: Mapping[str, str]) -> str:
+    """Such as "jax 0.11.2, numpy 2.4.0."."""
+    return f"{', '.join(f'{name} {version}' for name, version in packages.items())}."
+
+
+def rule(columns: int) -> str:
+    """Of a table, under its heads."""
+    return f"|{' --- |' * columns}"
+
+
+def that(judged: Sequence[Judged], outcome: str) -> list[str]:
+    """The parts of a claim with this outcome."""
+    return [x.claim.text for x in judged if x.outcome == outcome]
 
 
 def on(machines: Iterable[Mapping[str, Any]]) -> str:
@@ -146,8 +160,11 @@ ENVIRONMENT.filters |= {
     "spaced": lambda x: f"{x:,}".replace(",", " "),
     "span": span,
     "text": text,
+    "that": that,
     "told": told,
+    "versions": versions,
 }
+ENVIRONMENT.globals["rule"] = rule
 
 
 def has_template(name: str) -> bool:

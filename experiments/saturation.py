@@ -228,7 +228,7 @@ def draw(report: Mapping[str, Any]) -> Figure:
 
 EXPERIMENT = Experiment(
     "saturation",
-    "How do PPO's agents act that learned from a bandit?",
+    "How do PPO's agents err that learned from a bandit of Brax?",
     measure,
     draw,
     facts=facts,
