@@ -200,7 +200,6 @@ def facts(report: Report) -> dict[str, Any]:
     return {
         "rows": rows,
         "own": [float(iqm(x["own"])) for x in report["experts"].values()],
-        "ways": WITH,
     }
 
 

@@ -162,7 +162,7 @@ def swept(entry: Report) -> dict[str, float]:
     numbers = {len(found.get(clip, ())) for clip in CLIPS}
     if len(numbers) > 1 or numbers == {0}:
         return {}
-    curves = as_comparison("", {**entry, "agents": {clip: found[clip] for clip in CLIPS}}).curves
+    curves = as_comparison("", entry, {clip: found[clip] for clip in CLIPS}).curves
     return {curve.objective: float(iqm(curve.late)) for curve in curves}
 
 
@@ -177,7 +177,7 @@ def at_rates(environment: str, entry: Report) -> dict[float, dict[str, tuple[flo
     return {
         rate: {
             curve.objective: (float(iqm(curve.area)), float(iqm(curve.late)), len(curve.seeds))
-            for curve in as_comparison(environment, {**entry, "agents": found[rate]}).curves
+            for curve in as_comparison(environment, entry, found[rate]).curves
         }
         for rate in sorted(found)
     }

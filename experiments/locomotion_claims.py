@@ -51,7 +51,7 @@ def claims(report: Report) -> list[Claim]:
     """Of every objective but the reference, by each of `ASKED`."""
     found = []
     for environment, entry in looked_at(report).items():
-        curves = _by_name(environment, entry)
+        curves = as_comparison(environment, entry).by_name
         reference = curves.pop(REFERENCE)
         for of_it in curves.values():
             found += [_claim(environment, of_it, reference, of) for of in ASKED]
@@ -63,7 +63,7 @@ def texts(report: Report) -> dict[tuple[str, str], dict[str, str]]:
     return {
         (entry, objective): {of: _text(entry, objective, of) for of in ASKED}
         for entry, found in looked_at(report).items()
-        for objective in _by_name(entry, found)
+        for objective in as_comparison(entry, found).by_name
         if objective != REFERENCE
     }
 
@@ -77,7 +77,7 @@ def confirmed(report: Report) -> list[tuple[Confirmation, int, Judged | None]]:
             entry = report["environments"][asked.environment]
             names = (asked.reference, asked.objective)
             fresh = {name: {s: entry["agents"][name][s] for s in seeds} for name in names}
-            curves = _by_name(asked.environment, {**entry, "agents": fresh})
+            curves = as_comparison(asked.environment, entry, fresh).by_name
             both = curves[asked.objective], curves[asked.reference]
             (judged,) = judge([_claim(asked.environment, *both, asked.of)])
         found.append((asked, len(seeds), judged))
@@ -99,7 +99,7 @@ def since(report: Report, asked: Confirmation) -> tuple[list[int], Estimate] | N
     shared = sorted(set.intersection(*map(set, later.values())), key=int)
     if len(shared) < DECIDING:
         return None
-    curves = _by_name(asked.environment, {**entry, "agents": later})
+    curves = as_comparison(asked.environment, entry, later).by_name
     found = paired(curves[asked.objective], curves[asked.reference], asked.of)
     assert callable(found)
     return [int(seed) for seed in shared], found()
@@ -126,10 +126,6 @@ def leading(curves: Sequence[LearningCurves]) -> tuple[int, dict[str, dict[str, 
                 side = found["ahead" if apart.low > 0 else "behind"]
                 side.setdefault(curve.objective, []).append(int(steps))
     return number, found
-
-
-def _by_name(environment: str, entry: Report) -> dict[str, LearningCurves]:
-    return {curve.objective: curve for curve in as_comparison(environment, entry).curves}
 
 
 def _text(entry: str, objective: str, of: str, reference: str = REFERENCE) -> str:

@@ -27,7 +27,6 @@ from experiments.rendering import digits
 from experiments.zoo_table_page import (
     ACTIONS,
     BANDITS,
-    TARGETS,
     facts,
     figures,
     pairs,
@@ -237,7 +236,7 @@ def measure(options: Options, report: dict[str, Any], save: Save) -> None:
     names = tuple(Path(name).name for name in options.bandits)
     command = command_of("zoo_table", replace(options, published=published, bandits=names))
     commands = dict.fromkeys([*report.get("commands", []), command])
-    report |= {"commands": list(commands), "targets": TARGETS}
+    report["commands"] = list(commands)
     found = candidates(options.bandits or None, options.published, options.skip_brax)
     measure_bandits(found, options, report, save)
 

@@ -142,6 +142,11 @@ class Comparison:
 
     curves: list[LearningCurves]
 
+    @property
+    def by_name(self) -> dict[str, LearningCurves]:
+        """{objective: its curves}, in their order."""
+        return {curves.objective: curves for curves in self.curves}
+
     def differences(self, of: str = "final") -> dict[str, Estimate]:
         """{objective: difference of IQM to the reference}, of the seeds of both; positive where it is better.
 

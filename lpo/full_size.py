@@ -74,10 +74,8 @@ def full_size(environment: str) -> Comparison | None:
 def validated(environment: str) -> dict[str, LearningCurves]:
     """{objective: curves of agents that report nothing}, at the same number of steps; {} where there are none."""
     entry = _kept()["environments"].get(environment, {})
-    if not entry.get("sweep"):
-        return {}
-    curves = as_comparison(environment, {**entry, "agents": entry["sweep"]}).curves
-    return {curve.objective: curve for curve in curves}
+    agents = entry.get("sweep")
+    return as_comparison(environment, entry, agents).by_name if agents else {}
 
 
 def with_pairs(report: Mapping[str, Any]) -> Iterator[tuple[Confirmation, list[str]]]:
@@ -120,21 +118,26 @@ def _kept() -> dict[str, Any]:
     return dict(json.loads(PATH.read_text()))
 
 
-def as_comparison(environment: str, found: Mapping[str, Any]) -> Comparison:
+def as_comparison(
+    environment: str, found: Mapping[str, Any], agents: Mapping[str, Any] | None = None
+) -> Comparison:
     """The curves of one entry of a report, {"agents": {objective: {seed: {"returns": "0.5 0.7", ...}}}, ...}.
+
+    Of other agents than those where they are given, of its "sweep" for instance.
 
     An entry bears the environment's name, but where it says "environment" and the "hyperparameters" that differ there.
 
     PPO's clip comes first and agents by their seeds, in whatever order they ended. Objectives that have agents on the
     same seeds as the first are compared on these.
     """
+    agents = found["agents"] if agents is None else agents
     curves = []
-    for objective in sorted(found["agents"], key=lambda name: name != REFERENCE):
-        agents = dict(sorted(found["agents"][objective].items(), key=lambda of: int(of[0])))
-        returns = _lines("returns", agents, found["steps"])
+    for objective in sorted(agents, key=lambda name: name != REFERENCE):
+        of_it = dict(sorted(agents[objective].items(), key=lambda item: int(item[0])))
+        returns = _lines("returns", of_it, found["steps"])
         lengths, speeds = (
             # Of the end alone, and not known of every agent.
-            np.array([[np.nan if a[of] is None else a[of]] for a in agents.values()])
+            np.array([[np.nan if a[of] is None else a[of]] for a in of_it.values()])
             for of in ("length", "speed")
         )
         curves.append(
@@ -144,13 +147,13 @@ def as_comparison(environment: str, found: Mapping[str, Any]) -> Comparison:
                 objective,
                 np.asarray(found["steps"]),
                 returns,
-                [int(seed) for seed in agents],
+                [int(seed) for seed in of_it],
                 found["episodes"],
                 mode_actions=True,
                 hyperparameters=found.get("hyperparameters", {}),
                 lengths=lengths,
                 speeds=speeds,
-                diagnosis={name: _lines(name, agents, found["steps"]) for name in DIAGNOSIS},
+                diagnosis={name: _lines(name, of_it, found["steps"]) for name in DIAGNOSIS},
             )
         )
     return Comparison(curves)
