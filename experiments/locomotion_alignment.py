@@ -277,7 +277,7 @@ def facts(report: Report) -> dict[str, Any]:
             if pairs
         },
         "shown": {
-            environment: [name for name, x in pairs if x.low > 0.0]
+            environment: [name for name, x in pairs if x.shown]
             for environment, pairs in in_order.items()
         },
         "missing": {
@@ -302,7 +302,7 @@ def facts(report: Report) -> dict[str, Any]:
             environment: [
                 other
                 for other, of_it in elsewhere.get(environment, {}).items()
-                if of_it["area"].low > 0.0
+                if of_it["area"].shown
             ]
             for environment in found
         },

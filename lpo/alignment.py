@@ -232,6 +232,11 @@ class Alignment:
     low: float | None
     high: float | None
 
+    @property
+    def shown(self) -> bool:
+        """Whether the whole interval is above 0."""
+        return self.low is not None and self.low > 0
+
 
 def alignment(fitness: Mapping[str, np.ndarray], outcome: Mapping[str, np.ndarray]) -> Alignment:
     """How a fitness ranks objectives, against how their outcome does.

@@ -285,8 +285,8 @@ class Agent(ABC):
         env = self.env if env is None else env
         _check_environment(env)
         count_at_least(1, num_episodes=num_episodes)
-        if not isinstance(horizon, jax.Array):  # which may be traced
-            at_least(1, horizon=horizon)
+        if isinstance(horizon, int | np.integer):  # and no array, which may be traced
+            at_least(1, horizon=int(horizon))
         env_params = env.default_params if env_params is None else env_params
         _check_params(env, env_params)
         own_params = env_params
