@@ -138,13 +138,11 @@ def _curves(
     folder = plan.get("rows")
     kept = Rows(folder and folder / f"{train_in.name}, {spec.algorithm}.jsonl")
     rows = measurement.measure(spec, train_in, judge_in, agents, **size, rows=kept)
-    returns = pivot(rows, "agent", "step")
-    # What is no number counts as the agent before its training.
-    usable = np.isfinite(returns)
+    returns, failed = measurement.as_random(pivot(rows, "agent", "step"), judge_in)
     return {
         "steps": list(dict.fromkeys(row["step"] for row in rows)),
-        "returns": np.round(np.where(usable, returns, returns[:, :1]), 1).tolist(),
-        "failed": int((~usable).any(axis=1).sum()),
+        "returns": np.round(returns, 1).tolist(),
+        "failed": int(failed.any(axis=1).sum()),
     }
 
 

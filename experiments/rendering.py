@@ -123,13 +123,14 @@ def that(judged: Sequence[Judged], outcome: str) -> list[str]:
 
 
 def on(machines: Iterable[Mapping[str, Any]]) -> str:
-    """Machines in turn, each by its accelerator or its number of cores: "2 cores, H100"."""
-    return ", ".join(
+    """Kinds of machines, each once by its accelerator or its number of cores: "2 cores, H100"."""
+    names = (
         f"{x['cores']} core{'s' * (x['cores'] != 1)}"
         if x["accelerator"] == "none"
         else x["accelerator"].removeprefix("NVIDIA ").split()[0]
         for x in machines
     )
+    return ", ".join(dict.fromkeys(names))
 
 
 def algorithms(names: Sequence[str], otherwise: str = "all of the paper's algorithms") -> str:
