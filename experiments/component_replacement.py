@@ -14,7 +14,6 @@ import jax.numpy as jnp
 import numpy as np
 from matplotlib.figure import Figure
 
-import scb
 from experiments.claims import OF_THE_WAY, TENTH, Claim, of_searches
 from experiments.harness import Experiment, Report, Save, bandit_of, finite
 from scb import plotting
@@ -62,15 +61,16 @@ def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None
         for number in range(plan["experts"])
         if len(found.get(str(number), {}).get("returns", ())) < len(REPLACED)
     ]
-    env, env_params = scb.make(ENVIRONMENT)
+    place = Place.named(ENVIRONMENT)
+    env, env_params = place.env, place.params
     space = env.action_space(env_params)
     bandit, digest = bandit_of(ENVIRONMENT)
     spec = bandit_agent("ppo", ENVIRONMENT)
     key_random, key_experts = split_key(root_key(ILLUSTRATING.start))
 
     def counted(returns: Any) -> list[float]:
-        """Two digits of each; what is no number counts as a random policy's."""
-        values, failed = finite(returns, report["random"])
+        """Two digits of each; what is no number counts as random actions'."""
+        values, failed = finite(returns, place)
         report["failed"] = report.get("failed", 0) + failed
         return values
 
@@ -81,7 +81,7 @@ def measure(plan: Mapping[str, Any], report: dict[str, Any], save: Save) -> None
             spec,
             replaced,
             bandit.default_params.weights,
-            Place(ENVIRONMENT, env, env_params),
+            place,
             REPORTING.start,
             plan["agents"],
             plan["episodes"],

@@ -61,8 +61,7 @@ measure = InParts(parts)
 def _of_limit(environment: str, limit: str, plan: Mapping[str, Any]) -> dict[str, Any]:
     folder = f"{plan['runs']}/{environment}-{limit}"
     problem, outcome = discover(config_of(environment, limit, plan), folder)
-    place = environment_spec(environment)
-    entry: dict[str, Any] = {"limit": place.episode_limit}
+    entry: dict[str, Any] = {"limit": environment_spec(environment).episode_limit}
     space = problem.place.env.action_space(problem.place.params)
     returns: dict[str, list[float]] = {}
     failed = 0
@@ -70,7 +69,7 @@ def _of_limit(environment: str, limit: str, plan: Mapping[str, Any]) -> dict[str
         judged, lengths = returns_and_lengths(
             bandit_agent(algorithm, environment), problem, outcome.mean, plan
         )
-        returns[algorithm], number = finite(judged, place.random_return())
+        returns[algorithm], number = finite(judged, problem.place)
         failed += number
         if limit == OWN:
             entry.setdefault("lengths", {})[algorithm] = binned(lengths)

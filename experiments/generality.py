@@ -106,9 +106,8 @@ def _measured(
 ) -> dict[str, Any]:
     """What is said of a source, and {kind of agent: [N] returns}."""
     judge_in = Place.named(environment)
-    random = environment_spec(environment).random_return()
     train_in, said = _source(judge_in, source, plan)
-    found = {kind: finite(_returns(kind, train_in, judge_in, plan), random) for kind in kinds}
+    found = {kind: finite(_returns(kind, train_in, judge_in, plan), judge_in) for kind in kinds}
     failed = {kind: number for kind, (_, number) in found.items() if number}
     return {**said, "returns": {kind: x for kind, (x, _) in found.items()}, "failed": failed}
 

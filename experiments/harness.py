@@ -36,6 +36,7 @@ from scb.environments.zoo import bandit_metadata, load_bandit, zoo_names
 from scb.errors import UserError
 from scb.files import make_folder, write_json
 from scb.machine import machine_description, package_versions
+from scb.measurement import Place, as_random
 from scb.runs import held
 
 CLASSIC_CONTROL = tuple(sorted(families()["classic"].suite))
@@ -386,8 +387,7 @@ def unpacked(lines: Sequence[str]) -> NDArray[np.floating]:
     return np.array([[float(x) for x in line.split()] for line in lines])
 
 
-def finite(returns: Any, instead: float) -> tuple[list[float], int]:
-    """([N] returns to two digits, how many were no number): those count as `instead`, the return of random actions."""
-    values = np.asarray(returns, np.float64)
-    bad = ~np.isfinite(values)
-    return np.round(np.where(bad, instead, values), 2).tolist(), int(bad.sum())
+def finite(returns: Any, place: Place) -> tuple[list[float], int]:
+    """([N] returns to two digits, how many were no number): those count as random actions there."""
+    values, failed = as_random(np.asarray(returns, np.float64), place)
+    return np.round(values, 2).tolist(), int(failed.sum())

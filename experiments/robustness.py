@@ -167,8 +167,7 @@ def _trained(
     objectives = () if objective is None else (objective,)
     place = Place.named(environment)
     rows = measure(spec, place, agents=drawn, objectives=objectives, rows=kept)
-    random = environment_spec(environment).random_return()
-    earned, failed = finite([row["return"] for row in rows], random)
+    earned, failed = finite([row["return"] for row in rows], place)
     print(f"{environment}, {name}, {key}: {np.mean(earned):.4g}", flush=True)
     return {
         "returns": {name: {key: packed([earned])[0]}},

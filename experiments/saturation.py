@@ -30,7 +30,6 @@ from scb.agents.agent import Agent
 from scb.agents.spec import bandit_agent
 from scb.aggregation import Learners
 from scb.analysis.optimal_actions import optimal_policy
-from scb.environments.registry import environment_spec
 from scb.errors import at_least, one_of
 from scb.evaluation import evaluate
 from scb.importer import PUBLISHED_BANDITS
@@ -140,8 +139,7 @@ def measured(candidate: Candidate, options: Options) -> dict[str, Any]:
 
     low, high = np.asarray(space.low), np.asarray(space.high)
     shares = (np.asarray(means(learned["ppo"].states)) - (low + high) / 2) / ((high - low) / 2)
-    random = environment_spec(candidate.environment).random_return(BACKEND)
-    returns, _ = finite(learned["ppo"].returns, random)
+    returns, _ = finite(learned["ppo"].returns, place)
     acting = jax.tree.map(lambda x: x[~learned["ppo"].failed], learned["ppo"].states)
     found = {
         **spread(shares),

@@ -15,6 +15,7 @@ from experiments.harness import Experiment
 from experiments.parts import Part
 from experiments.rendering import text
 from scb.environments.zoo import bandit_metadata
+from scb.measurement import Place
 from scb.statistics import Estimate
 from tests.locking import is_locked
 
@@ -315,8 +316,11 @@ def test_a_report_goes_on_where_only_what_may_grow_has_grown(tmp_path, capsys):
     assert growing({"value": 1, "of": {"x": 2, "y": 2}}).main(flags) == 2
 
 
-def test_returns_that_are_no_number_count_as_a_random_policy():
-    assert harness.finite([1.234, float("nan"), float("inf")], -7.0) == ([1.23, -7.0, -7.0], 2)
+def test_returns_that_are_no_number_count_as_random_actions():
+    returns, failed = harness.finite(
+        [1.234, float("nan"), float("inf")], Place.named("MountainCar-v0")
+    )
+    assert (returns, failed) == ([1.23, -200.0, -200.0], 2)  # the limit of 200 steps at -1 each
     assert rendering.span([3, 3]) == "3" and rendering.span([30, 60, 30]) == "30 to 60"
 
 
