@@ -20,7 +20,7 @@ from experiments.harness import Experiment, Report, packed, settled, unpacked
 from experiments.parts import InParts, Part
 from lpo import figures
 from lpo.inner_loop import MetaTrainingConfig, TaskTraining
-from lpo.objectives import Objective, load_objective, zoo_names
+from lpo.objectives import load_objective, zoo_names
 from scb import plotting
 from scb.environments.zoo import bandit_metadata
 from scb.errors import UserError, at_least
@@ -62,12 +62,8 @@ def measured(name: str, options: Options) -> dict[str, Any]:
     for horizon in options.horizons:
         returns, _ = as_random(np.asarray(earned(objective.parameters, horizon)), place)
         found[f"{horizon:g}"] = packed([returns / scale])[0]
-    digests = {"sha256": bandit_metadata(TASK)["sha256"], "objective_sha256": _digest(objective)}
+    digests = {"sha256": bandit_metadata(TASK)["sha256"], "objective_sha256": objective.sha256}
     return {**digests, "returns": found}
-
-
-def _digest(objective: Objective) -> str:
-    return str(objective.metadata.get("sha256", ""))
 
 
 def parts(options: Options, report: dict[str, Any]) -> Iterator[Part]:
@@ -77,7 +73,7 @@ def parts(options: Options, report: dict[str, Any]) -> Iterator[Part]:
     # All of them before the first is measured.
     named = {name: load_objective(name) for name in (REFERENCE, *options.objectives)}
     for name, objective in named.items():
-        if name in entries and entries[name]["objective_sha256"] != _digest(objective):
+        if name in entries and entries[name]["objective_sha256"] != objective.sha256:
             del entries[name]  # of another of this name
         yield Part(("objectives", name), partial(measured, name, options))
 

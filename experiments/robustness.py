@@ -236,7 +236,7 @@ def claims(report: Report) -> list[Claim]:
 
 def check_stated(objective: Objective) -> None:
     """Raises a UserError where an objective of the stated name is not the one that was meant."""
-    if objective.metadata.get("sha256") != STATED["objective_sha256"]:
+    if objective.sha256 != STATED["objective_sha256"]:
         raise UserError(
             f"{objective.name} is not the objective that was stated: take the file whose checksum "
             "plans/robustness.toml has."

@@ -255,7 +255,7 @@ def _judged(
 def _earned(objective: Objective, environment: str, at: Evaluation, options: Options) -> np.ndarray:
     """[seeds] what agents earn at the end of their training: a score where there are other environments too."""
     # What was found by an earlier version is another objective, whose rows are its own.
-    digest = f"-{found[:8]}" if (found := objective.metadata.get("sha256")) else ""
+    digest = f"-{found[:8]}" if (found := objective.sha256) else ""
     (curves,) = compare(
         environment,
         [objective],
@@ -277,7 +277,7 @@ def _learned(name: str, seed: int, options: Options) -> tuple[Objective, dict[st
     entry = {
         "command": meta_training({**settings, "seed": 0}).command,
         "seconds": cost["seconds"],
-        "digests": {str(seed): objective.metadata["sha256"]},
+        "digests": {str(seed): objective.sha256},
     }
     return replace(objective, name=f"{name}-{seed}"), entry
 

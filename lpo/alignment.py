@@ -309,7 +309,7 @@ def measure_alignment(
         "first_seed": min(seeds),
         "seeds": seeds,
         # Of what files hold, for another may come to have its name.
-        "checksums": {o.name: o.metadata["sha256"] for o in objectives if "sha256" in o.metadata},
+        "checksums": {o.name: o.sha256 for o in objectives if o.sha256},
     }
     report: dict[str, Any] = dict(done or {})
     if not report:

@@ -156,7 +156,7 @@ def distill_command(
             "config": {
                 "distill": config,
                 "of": loaded.name,
-                "of_sha256": loaded.metadata.get("sha256"),
+                "of_sha256": loaded.sha256 or None,
                 "learned_on": loaded.learned_on,
                 "homes": loaded.homes,
             },

@@ -74,10 +74,15 @@ class Objective:
         return f"Objective({self.name!r}, {drift!r}, {sum(sizes)} parameters)"
 
     @property
+    def sha256(self) -> str:
+        """The checksum of the file that it was loaded from; empty where there is none."""
+        return str(self.metadata.get("sha256", ""))
+
+    @property
     def digests(self) -> dict[str, str]:
         """{name: SHA-256} of what its name does not tell: a file's contents, and code of somebody's own."""
         told = [*code_of(self.drift).values()]
-        told += [self.metadata["sha256"]] if "sha256" in self.metadata else []
+        told += [self.sha256] if self.sha256 else []
         return {self.name: " ".join(told)} if told else {}
 
     @property

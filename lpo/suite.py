@@ -23,6 +23,9 @@ from scb.statistics import Estimate, iqm, normalized_score
 # Resampling is over seeds within environments, on [objectives, environments, seeds].
 RESAMPLES = 2000
 TOGETHER = 100  # resamples at a time, which bounds memory
+# About so many evaluations along a training, of which only the last is scored: with episodes of a thousand steps
+# fifteen take longer than the training itself.
+POINTS = 5
 BEST_HERE = "the best objective here"
 
 
@@ -216,7 +219,6 @@ def run_suite(
     rows: Rows | None = None,
     steps: int | None = None,
     hyperparameters: Mapping[str, Any] = MappingProxyType({}),
-    points: int = 5,
     **arguments: Any,
 ) -> tuple[SuiteScores, dict[str, Comparison]]:
     """Trains PPO with every objective in every environment of a suite.
@@ -229,8 +231,6 @@ def run_suite(
       tell: takes a line when an environment is done.
       rows: where results are kept, and found; what is there is not measured again.
       steps, hyperparameters: of every training (`ppo_spec`); each environment's own setting where left out.
-      points: about how many evaluations along a training. Only the last one is scored, and with
-        episodes of a thousand steps fifteen take longer than the training itself.
       arguments: further ones of `compare`.
     """
     specs = suite_specs(name, steps, hyperparameters)
@@ -247,7 +247,7 @@ def run_suite(
             seeds,
             spec=specs[environment_name],
             backend=physics,
-            points=points,
+            points=POINTS,
             rows=rows,
             **arguments,
         )

@@ -367,13 +367,13 @@ class Align(Measuring):
             family,
             target,
             seeds,
-            config.steps,
-            config.backend,
-            config.policy_output_scale,
-            printer.print,
-            rows,
-            json.loads(stored.read_text()) if stored and stored.exists() else None,
-            partial(write_json, stored) if stored else lambda report: None,
+            steps=config.steps,
+            backend=config.backend,
+            policy_output_scale=config.policy_output_scale,
+            tell=printer.print,
+            rows=rows,
+            done=json.loads(stored.read_text()) if stored and stored.exists() else None,
+            keep=partial(write_json, stored) if stored else lambda report: None,
         )
         table = Table("regime", *LABELS, title=f"Spearman's correlation with {target} [95 %]")
         for row in report["regimes"]:

@@ -1,5 +1,6 @@
 """The transfer study's variations are commands that exist, and its page says what was measured."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -123,7 +124,7 @@ def test_objectives_of_one_name_have_rows_of_their_own(tmp_path, monkeypatch):
     monkeypatch.setattr(module, "compare", compared)
     at, options = module.EVALUATIONS[0], module.Options(runs=tmp_path)
     for digest in ("a" * 64, "b" * 64):
-        found = SimpleNamespace(name="default-0", metadata={"sha256": digest})
+        found = replace(load_objective("ppo"), name="default-0", metadata={"sha256": digest})
         module._earned(found, "Pendulum-v1", at, options)
     module._earned(load_objective("ppo"), "Pendulum-v1", at, options)
     assert kept == [

@@ -178,9 +178,10 @@ def test_align_measures_every_combination_and_stores_it(monkeypatch, working_fol
     asked, told = [], []
 
     def measure(
-        regimes, objectives, environment, seeds, steps, backend, scale, tell, rows, done, keep
+        regimes, objectives, environment, seeds, policy_output_scale, rows, done, keep, **_
     ):
-        assert scale == 0.01 and all(r.policy_output_scale == scale for r in regimes)
+        assert policy_output_scale == 0.01
+        assert all(r.policy_output_scale == policy_output_scale for r in regimes)
         asked.extend(regimes)
         assert {"ppo-0.2", "none", "lpo-pendulum"} <= {o.name for o in objectives}
         assert (environment, seeds) == ("Pendulum-v1", [500, 501])
