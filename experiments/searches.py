@@ -200,7 +200,14 @@ def difference(
     """
     above, below = last(one), last(other)
     if len(above) == len(one) and min(len(above), len(below)) >= ENOUGH:
-        return partial(stratified_estimate, [above], [below], statistic=statistic, paired=False)
+        return partial(
+            stratified_estimate,
+            [above],
+            [below],
+            statistic=statistic,
+            paired=False,
+            student=True,
+        )
     value = np.nan if not (above and below) else float(statistic(above) - statistic(below))
     return Estimate(value, None, None, len(one))
 

@@ -223,9 +223,11 @@ class Alignment:
 
     Attributes:
       spearman: None where the fitness tells no two objectives apart.
-      low, high: 95 % bootstrap interval over each objective's agents. The family is not resampled:
-        the interval says how well this family's correlation is known, not how another's would be.
-        None where an objective has a single agent, of which nothing tells what another would earn.
+      low, high: 95 % of bootstrap resamples of each objective's agents; the family is not resampled. What agents
+        scatter by counts twice in them, so that they lean downwards: a low end above 0 is evidence, and a high end
+        is no bound. With objectives that differ by as much as their agents scatter, the correlation without any scatter
+        was above the high end in a quarter of simulations. None where an objective has a single agent, of which
+        nothing tells what another would earn.
     """
 
     spearman: float | None

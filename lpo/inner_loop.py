@@ -25,6 +25,7 @@ from scb.keys import named_key, root_key, split_key
 from scb.lists import read_values, write_values
 from scb.measurement import Judge, spaced, train_and_judge
 from scb.own import code_of
+from scb.strategies import check_memory
 
 _OF_BANDITS = ("contexts", "reward_noise")
 POINTS = 5  # of the curve that the area is under
@@ -146,6 +147,9 @@ class MetaTrainingConfig:
             if not isinstance(horizon, int | float | np.number):
                 raise UserError(f"a horizon is {horizon!r}: it must be a number.")
             positive(horizon=horizon)
+        if len(set(self.horizons)) > 1:
+            because = "which is of trainings of other lengths where there are several horizons"
+            check_memory(self.evolution.strategy, because, "take one")
         check_lists(self.hyperparameters, PPOHyperparameters())
         for name in ("drift", "horizon"):
             if name in self.hyperparameters:

@@ -47,7 +47,7 @@ from scb.refinement import refined
 from scb.runs import Run, run_of
 from scb.seeds import VALIDATING
 from scb.spaces import check_bounded, kind_of_actions
-from scb.strategies import strategy_for
+from scb.strategies import check_memory, strategy_for
 from scb.warm_start import expert_agent, warm_start
 
 OPTIMAL_POLICY = "optimal policy"  # in logs, beside the algorithms
@@ -106,6 +106,9 @@ class BanditDiscovery:
         if config.curriculum is not None:
             limit = int(self.place.params.max_steps_in_episode)
             check_curriculum(config.curriculum, limit, config.environment)
+            if config.curriculum.initial != config.curriculum.final:
+                because = "which is of episodes of other lengths where there is a curriculum"
+                check_memory(config.evolution.strategy, because, "leave it out")
         self._lengths = EpisodeLengths(config.curriculum, self.place.params)
         self._starts: dict[str, Weights] = {}
         self.start_reports: dict[str, dict[str, float]] = {}

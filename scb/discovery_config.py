@@ -18,7 +18,7 @@ from scb.evolution import EvolutionConfig
 from scb.fitting import check_linear
 from scb.lists import read_configs, read_lists, write_lists
 from scb.refinement import RefinementConfig
-from scb.strategies import REMEMBERING
+from scb.strategies import check_memory
 from scb.warm_start import WarmStartConfig
 
 INITS = ("random", "expert")
@@ -201,12 +201,9 @@ class DiscoveryConfig:
             raise UserError(
                 "fixed hyperparameters are not drawn from lists: leave out the lists, or draw."
             )
-        strategy = self.evolution.strategy
-        if self.mode == "sequential" and strategy in REMEMBERING:
-            raise UserError(
-                f"{strategy} compares fitness with that of earlier generations, which is another algorithm's in the "
-                "mode sequential: use the mode all, or choose another strategy, such as SNES."
-            )
+        if self.mode == "sequential":
+            because = "which is another algorithm's in the mode sequential"
+            check_memory(self.evolution.strategy, because, "use the mode all")
         if not self.evolution.num_generations and not (self.fitted or self.refinement.rounds):
             raise UserError(
                 "there are 0 generations, and nothing is found before them: choose init expert or refinement rounds, "

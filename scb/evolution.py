@@ -30,9 +30,9 @@ from scb.statistics import iqm
 from scb.strategies import (
     DISTRIBUTIONS,
     GRADIENT_ESTIMATING,
-    REMEMBERING,
     SCHEDULED,
     STRATEGIES,
+    check_memory,
     strategy_for,
 )
 
@@ -89,11 +89,9 @@ class EvolutionConfig:
             raise UserError(
                 f"population_size is {self.population_size}: Open_ES samples antithetic pairs, so it must be even."
             )
-        if self.combine == "ranks" and self.strategy in REMEMBERING:
-            raise UserError(
-                f"{self.strategy} compares fitness with that of earlier generations, which ranks among candidates of "
-                "one do not allow: combine by mean, or choose another strategy, such as SNES."
-            )
+        if self.combine == "ranks":
+            because = "which ranks among candidates of one do not allow"
+            check_memory(self.strategy, because, "combine by mean")
         at_least(1, self, "averaging", "evaluate_mean_every", "checkpoint_every")
         agents_at_least(1, self, "mean_evaluations")
         if self.averaging > 1 and self.strategy not in DISTRIBUTIONS:

@@ -135,6 +135,7 @@ def stratified_estimate(
     statistic: Statistic = iqm,
     paired: bool = True,
     shared: bool = False,
+    student: bool = False,
 ) -> Estimate:
     """The mean over groups of their interquartile means, with an interval that resamples within every group.
 
@@ -149,6 +150,7 @@ def stratified_estimate(
       paired: whether `minus` has the same runs on the same seeds, which are then drawn together.
       shared: whether groups of as many draws have the same ones, as where every environment is given the same
         hyperparameters: they are then drawn together.
+      student: whether the interval is Student's t at every confidence, for few runs that are to decide something.
 
     Raises:
       UserError: no groups, or other sizes in `minus`.
@@ -175,7 +177,7 @@ def stratified_estimate(
         return found / len(first)
 
     sizes = [len(group) for group in (*first, *second)]
-    found = _bootstrapped(mean, sizes, confidence, num_resamples)
+    found = _bootstrapped(mean, sizes, confidence, num_resamples, student)
     return replace(found, n=sum(group.size for group in first))
 
 
@@ -221,7 +223,8 @@ def few_groups_difference(
     runs, for what runs of one seed share in all groups; the squares of their halves are added.
 
     Of five simulated groups of 20 runs (normal, or a fifth of them failing; groups that scatter by up to twice the
-    runs' deviation) it leaves the truth out no more often than it says at 95, 99 and 99.83 %. But where whole groups
+    runs' deviation) it leaves the truth out no more often than it says at 95, 99 and 99.83 %, and where both sides
+    are drawn less often: at 95 % in about 1 %. But where whole groups
     fail against a single one that never does: that five groups show no failure says little of how many do, and no
     interval knows.
 
@@ -351,14 +354,15 @@ def _bootstrapped(
     sizes: Sequence[int],
     confidence: float,
     num_resamples: int = 10_000,
+    student: bool = False,
 ) -> Estimate:
-    """A statistic with its interval: the percentile bootstrap's up to 95 %, beyond it Student's t.
+    """A statistic with its interval: the percentile bootstrap's up to 95 %, beyond it, or if asked for, Student's t.
 
     The percentile method and not BCa: the literature that reports IQMs uses it, it stays defined
     where BCa divides by zero (constant runs get an interval of width zero), and for the IQM of 5,
     10 or 20 normal, log-normal or bimodal runs it covered the true value at least as often
     (0.83 to 0.94 for a nominal 0.95; 600 simulations each). Both are too narrow for few runs: with
-    5 runs read "95 %" as about 90 %.
+    5 runs read "95 %" as about 90 %; for the difference of the means of 5 runs and 5 others it is 87 %.
 
     Of higher confidence, as many comparisons ask for, percentiles are no matter of taste: no resample lies beyond the
     worst of few runs. For a difference of two IQMs of 5 runs without any they left it out in 6 to 7 % where 0.17 %
@@ -381,7 +385,7 @@ def _bootstrapped(
         for done in range(0, num_resamples, batch)
     ]
     resampled = np.concatenate(found)
-    if confidence > PERCENTILES:
+    if student or confidence > PERCENTILES:
         fewest = min(sizes)
         deviation = resampled.std() * math.sqrt(fewest / (fewest - 1))
         half = float(deviation * scipy.stats.t.ppf((1.0 + confidence) / 2.0, fewest - 1))

@@ -63,6 +63,20 @@ REMEMBERING = {
 }
 
 
+def check_memory(strategy: str, because: str, instead: str) -> None:
+    """Raises a UserError where fitness does not mean the same in all generations, and a strategy remembers it.
+
+    Args:
+      because: why it does not, as a relative clause.
+      instead: what else to choose than another strategy.
+    """
+    if strategy in REMEMBERING:
+        raise UserError(
+            f"{strategy} compares fitness with that of earlier generations, {because}: {instead}, or choose another "
+            "strategy, such as SNES."
+        )
+
+
 class Strategy:
     """An evosax strategy behind one interface. Runs on one device; fitness comes and goes through the host."""
 

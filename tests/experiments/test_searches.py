@@ -102,6 +102,9 @@ def test_only_five_searches_or_more_are_told_apart():
     high, low = ending(*range(10, 15)), ending(*range(5))
     assert outcome(high, low) == "holds" and outcome(low, high) == "does not hold"
     assert outcome(high, ending(*range(9, 16))) == "undecided"
+    # 2.3 apart: beyond the percentiles of resamples, 1.7, and within Student's t of four degrees, 2.78.
+    assert outcome(ending(2.3, 3.3, 4.3, 5.3, 6.3), low) == "undecided"
+    assert outcome(ending(2.9, 3.9, 4.9, 5.9, 6.9), low) == "holds"
     assert outcome(ending(10, 11), ending(0, 1)) == "undecided"
     assert outcome(ending(10), ending(*range(5))) == "undecided"
     # A failure is worse than any return.

@@ -59,6 +59,37 @@ def test_closed_forms_are_drifts(drift: Drift):
     assert str(found).startswith("is a drift: min f 0, at ratio 1 |f| 0 and |df/dr| 0")
 
 
+def surrogate_of_kl(ratio, log_ratio, advantage):
+    return ratio * advantage - 0.5 * (ratio * log_ratio - (ratio - 1))
+
+
+def surrogate_of_reverse_kl(ratio, log_ratio, advantage):
+    return ratio * advantage - 2.0 * (ratio - 1 - log_ratio)
+
+
+@pytest.mark.parametrize(
+    "surrogate",
+    [surrogate_of_kl, surrogate_of_reverse_kl],
+    ids=lambda f: f.__name__,
+)
+def test_what_32_bits_leave_of_a_surrogates_difference_is_no_gradient(surrogate):
+    found = certify(load_objective(surrogate), num_ratios=101)
+    assert found.holds and not found.stalls
+    assert 0 < found.gradient_at_one < 1e-5 or found.minimum < 0  # which exact zeros would refuse
+
+
+@pytest.mark.parametrize("paid", [1e-4, 0.01])
+def test_a_surrogate_that_pays_or_slopes_by_more_than_that_is_no_drift(paid):
+    def pays(ratio, advantage):
+        return ratio * advantage - 0.5 * (ratio - 1) ** 2 + paid
+
+    def slopes(ratio, advantage):
+        return ratio * advantage - 0.5 * (ratio - 1) ** 2 - paid * (ratio - 1)
+
+    assert not certify(load_objective(pays), **GRID).holds
+    assert not certify(load_objective(slopes), **GRID).holds
+
+
 def test_a_bias_is_no_drift():
     found = certificate(lambda x, a, p: quadratic(x, a, p) + 0.25)
     assert not found.holds

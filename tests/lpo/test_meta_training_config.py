@@ -12,6 +12,7 @@ from lpo.inner_loop import MetaTrainingConfig
 from lpo.meta_training import MetaTraining, meta_train
 from scb.agents.ppo import PPOConfig
 from scb.errors import UserError
+from scb.evolution import EvolutionConfig
 
 
 @pytest.mark.parametrize(
@@ -46,6 +47,13 @@ from scb.errors import UserError
         (
             {"horizons": (0.5,), "fitness": "area"},
             "fitness 'area' needs trainings of one length: take no horizons",
+        ),
+        (
+            {
+                "horizons": (0.5, 1.0),
+                "evolution": EvolutionConfig(strategy="SimpleGA", combine="mean"),
+            },
+            "SimpleGA compares fitness with that of earlier generations, which is of trainings of other",
         ),
         ({"agents_per_candidate": 0}, "agents_per_candidate is 0: it must be at least 1."),
         ({"evaluation_episodes": -1}, "evaluation_episodes is -1: it must be at least 1."),

@@ -166,6 +166,10 @@ pytestmark = pytest.mark.usefixtures("small_agents")
             "discover --strategy HillClimbing --combine mean --mode sequential",
             "HillClimbing compares fitness with that of earlier generations, which is another",
         ),
+        (
+            "discover --strategy HillClimbing --combine mean --environment MountainCar-v0 --curriculum paper",
+            "HillClimbing compares fitness with that of earlier generations, which is of episodes of other lengths",
+        ),
         ("train --seed 4294967296 --out new", "a seed is 4294967296: each must be a whole number"),
         ("discover --judge-episodes 0", "judge_episodes is 0: it must be at least 1"),
         ("import-published nowhere", "nowhere does not exist: give the published"),
