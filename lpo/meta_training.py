@@ -9,6 +9,7 @@ elsewhere. Here the bandit's reward carries noise of several of its own standard
 makes it rank objectives almost as the environment does.
 """
 
+import warnings
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -127,9 +128,16 @@ def meta_train(
 
     Raises:
       UserError: the folder holds something else, or a run of another configuration.
+
+    Warns:
+      UserWarning: the drift's class is where no import finds it, so that `save_objective` would refuse it.
     """
     of_class(MetaTrainingConfig, config=config)
     problem = MetaTraining(config)  # a mistake must not leave a folder behind
+    try:
+        config.drift.family()
+    except UserError as error:
+        warnings.warn(f"What is learned here cannot be saved: {error}", stacklevel=2)
     with run_of(run, config, config.checksums(), GENERATIONS) as opened:
         return evolve(problem, config.evolution, opened, quiet)
 

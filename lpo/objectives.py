@@ -285,6 +285,7 @@ def save_objective(
         drift, parameters = told, told.init(root_key(0))
     held = artefacts.Artefact(drift.name, parameters, {"kind": KIND})
     artefacts.expect_shapes(held, drift.shapes())
+    artefacts.expect_numbers(path, parameters)
     certificate = certify(drift, parameters)
     config = {**metadata.get("config", {}), "drift": drift.to_config()}
     full = {**metadata, "kind": KIND, "config": config, "certificate": certificate.as_dict()}

@@ -62,11 +62,7 @@ def save(path: str | Path, arrays: Mapping[str, Any], metadata: Mapping[str, Any
       UserError: metadata is missing or not finite, or an array could not be loaded again.
     """
     npz_path, json_path = _paths(path)
-    flat = flatten(arrays)
-    for name, array in flat.items():
-        problem = _problem(array)
-        if problem:
-            raise UserError(f"{npz_path} was not written, since array {name!r} {problem}.")
+    flat = expect_numbers(path, arrays)
     data = _npz_bytes(flat)
 
     written = {
@@ -201,6 +197,19 @@ def described(path: str | Path, what: str, entry: str = "a config entry") -> Ite
         ) from error
 
 
+def expect_numbers(path: str | Path, arrays: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    """The arrays by their flat names, ready to be written to `path`.
+
+    Raises:
+      UserError: one could not be loaded again, or has numbers that are not finite.
+    """
+    flat = flatten(arrays)
+    for name, array in flat.items():
+        if problem := _problem(array):
+            raise UserError(f"{_paths(path)[0]} was not written, since array {name!r} {problem}.")
+    return flat
+
+
 def expect_shapes(artefact: Artefact, shapes: Mapping[str, Sequence[int]]) -> None:
     """Checks that the artefact holds exactly these arrays.
 
@@ -282,8 +291,10 @@ def _read(path: Path) -> bytes:
     try:
         return path.read_bytes()
     except FileNotFoundError as error:
+        # A run that names files is perhaps continued from elsewhere.
+        here = "" if path.is_absolute() else f", seen from {Path.cwd()}"
         raise UserError(
-            f"{path} does not exist: an artefact is a .npz file with a .json file of the same name "
+            f"{path} does not exist{here}: an artefact is a .npz file with a .json file of the same name "
             "beside it."
         ) from error
     except (OSError, ValueError) as error:

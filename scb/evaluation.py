@@ -10,6 +10,7 @@ from jax.typing import ArrayLike
 
 from scb.agents.normalization import RunningStatistics, merge_statistics
 from scb.keys import key_at, split_key
+from scb.spaces import check_action
 
 Policy = Callable[
     [jax.Array, jax.Array], jax.Array
@@ -48,9 +49,13 @@ def evaluate(
 
     Returns:
       Episodes of shape [E].
+
+    Raises:
+      UserError: the policy's actions are of another kind or size than the environment's.
     """
     limit = env_params.max_steps_in_episode if horizon is None else horizon
     velocity = getattr(env, "forward_velocity", None)
+    space = env.action_space(env_params)
     key_reset, key_loop = split_key(key)
     observation, state = jax.vmap(env.reset_env, in_axes=(0, None))(
         split_key(key_reset, num_episodes), env_params
@@ -63,6 +68,7 @@ def evaluate(
             seen = merge_statistics(seen, RunningStatistics(active, flat, jnp.zeros_like(flat)))
         key_act, key_step = split_key(key_at(key_loop, time))
         action = jax.vmap(policy)(observation, split_key(key_act, num_episodes))
+        check_action(action[0], space)
         # step_env, not step: a finished episode needs no reset, and its later rewards are masked.
         observation, state, reward, terminated, _ = jax.vmap(env.step_env, in_axes=(0, 0, 0, None))(
             split_key(key_step, num_episodes), state, action, env_params

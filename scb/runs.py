@@ -63,7 +63,8 @@ class Run:
           folder: where; must not exist or be empty, unless `resume`.
           config: JSON-serialisable; decides the run together with the code's version. An entry
             "command", by which people and resumptions start it, is stored and not compared. An entry
-            "inputs", {name: digest} of files, is compared where the folder has one.
+            "inputs", {name: digest} of files and code, may hold more than the folder's, and none of these in another
+            state.
           resume: continue the run that is there. Its config must equal `config`, but for `growing`.
           wandb_project: also log to this Weights & Biases project (extra `wandb`).
           growing: entries, such as "config.seeds", that may be more than they were (`grown`); of a search's
@@ -84,11 +85,12 @@ class Run:
             if settings is not None and "config" in stored:
                 stored["config"] = with_defaults(stored["config"], settings)
             inputs, now = (x.pop("inputs", None) or {} for x in (stored, asked))
-            for name in inputs.keys() & now.keys():
-                if inputs[name] != now[name]:
+            for name, digest in inputs.items():
+                # Under another name it is the same: code that was moved to another module, for one.
+                if now.get(name) != digest and (name in now or digest not in now.values()):
+                    is_not = "what it was when the run was started" if name in now else "part of it"
                     raise UserError(
-                        f"cannot resume {folder}: {name} is not what it was when the run was started; put that back, "
-                        "or start a new folder."
+                        f"cannot resume {folder}: {name} is not {is_not}; put that back, or start a new folder."
                     )
             stored_as_if = as_if_shorter(folder, stored, asked, growing)
             if difference := first_difference(stored_as_if, asked, growing):

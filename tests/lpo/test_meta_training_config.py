@@ -1,8 +1,9 @@
 """Meta-trainings that cannot be, the defaults, and the folder of one that Python starts."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -114,6 +115,25 @@ def test_a_folder_keeps_a_meta_training_from_python(config, tmp_path):
     jax.tree.map(np.testing.assert_array_equal, grown.mean, whole.mean)
     with pytest.raises(UserError, match=r"its config differs at config\.agents_per_candidate"):
         meta_train(replace(longer, agents_per_candidate=2), folder, quiet=True)
+
+
+def test_a_drift_that_no_import_finds_is_told_before_it_learns(config, tmp_path):
+    @dataclass(frozen=True)
+    class Here(LearnedDrift):
+        pass
+
+    @dataclass(frozen=True)
+    class Other(LearnedDrift):
+        def __call__(self, parameters, log_ratio, advantage, progress, xp=jnp):
+            return 2 * super().__call__(parameters, log_ratio, advantage, progress, xp)
+
+    drift = Here(hidden_size=4)
+    with pytest.warns(UserWarning, match="learned here cannot be saved: the drift .*Here is def"):
+        meta_train(replace(config, drift=drift), tmp_path / "run", quiet=True)
+    # Nor does its run go on with another class of the same fields.
+    other = replace(config, drift=Other(hidden_size=4))
+    with pytest.raises(UserError, match="Here is not part of it; put that back"), pytest.warns():
+        meta_train(other, tmp_path / "run", quiet=True)
 
 
 def test_a_mistake_leaves_no_folder_of_a_meta_training(config, tmp_path):

@@ -176,6 +176,16 @@ def test_parameters_of_another_drift_are_not_saved(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+def test_weights_that_are_no_numbers_are_not_saved(tmp_path, recwarn):
+    drift = LearnedDrift()
+    parameters = jax.tree.map(lambda x: x * jnp.nan, drift.init(jax.random.key(0)))
+    with pytest.raises(
+        UserError, match=r"mine\.npz was not written, since array 'hidden' has 1024"
+    ):
+        save_objective(tmp_path / "mine.npz", drift, parameters)
+    assert not list(tmp_path.iterdir()) and not recwarn.list
+
+
 def test_dpo_is_saved_with_the_parameters_it_has(tmp_path):
     trained = {"alpha": jnp.float32(4.0), "beta": jnp.float32(1.5)}
     path, _ = save_objective(tmp_path / "mine.npz", DPODrift(), trained, METADATA)

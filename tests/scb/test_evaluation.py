@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from gymnax.environments.classic_control.pendulum import Pendulum
 
+from scb.errors import UserError
 from scb.evaluation import evaluate
 from tests.scb.probes import Corridor, CorridorParams
 
@@ -130,3 +131,24 @@ def test_an_episodes_speed_is_the_mean_over_its_own_steps():
     # From cell 0 into 1, 2 and the next round's 0; what follows the end is not counted.
     assert pairs == {(3, 1.0), (2, 1.0), (1, 0.0)}
     assert evaluate(Corridor(), PAYING, right, jax.random.key(0), 2).speeds is None
+
+
+@pytest.mark.parametrize(
+    ("env", "action", "message"),
+    [
+        (
+            Corridor(),
+            jnp.float32(0.7),
+            r"shape \(\) and type float32: it must be a whole number bel",
+        ),
+        (
+            Corridor(),
+            jnp.array([1]),
+            r"shape \(1,\) and type int32: it must be a whole number below",
+        ),
+        (Pendulum(), jnp.zeros(2), r"shape \(2,\) and type float32: it must be of shape \(\)"),
+    ],
+)
+def test_actions_of_another_kind_or_size_are_refused(env, action, message):
+    with pytest.raises(UserError, match=message):
+        evaluate(env, env.default_params, lambda o, k: action, jax.random.key(0), 3)

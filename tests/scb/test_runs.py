@@ -164,7 +164,13 @@ def test_a_bandit_that_was_replaced_cannot_go_on_with_a_run(tmp_path, growing):
         UserError, match="zoo is not what it was when the run was started; put that"
     ):
         Run.open(tmp_path, replaced, resume=True, growing=growing)
+    # Nor with another in its place under another name; the same may be called something else.
+    other = {**began, "inputs": {"mine.npz": "a", "other": "c"}}
+    with pytest.raises(UserError, match="zoo is not part of it; put that back"):
+        Run.open(tmp_path, other, resume=True, growing=growing)
     assert read_config(tmp_path)["inputs"] == began["inputs"]
+    moved = {**began, "inputs": {"mine.npz": "a", "elsewhere": "b"}}
+    Run.open(tmp_path, moved, resume=True, growing=growing).close()
 
 
 @dataclass(frozen=True)
