@@ -146,7 +146,7 @@ def test_an_episodes_speed_is_the_mean_over_its_own_steps():
             jnp.array([1]),
             r"shape \(1,\) and type int32: it must be a whole number below",
         ),
-        (Pendulum(), jnp.zeros(2), r"shape \(2,\) and type float32: it must be of shape \(\)"),
+        (Pendulum(), jnp.zeros(2), r"shape \(2,\) and type float32: it must be of shape \(1,\)"),
     ],
 )
 def test_actions_of_another_kind_or_size_are_refused(env, action, message):
