@@ -35,7 +35,7 @@ from scb.errors import at_least, unused
 from scb.files import plain
 from scb.rows import Rows
 from scb.seeds import reporting, validation
-from scb.statistics import DECIDING, iqm
+from scb.statistics import DECIDING, Estimate, iqm, paired_difference
 
 BACKEND = "generalized"
 
@@ -183,6 +183,25 @@ def at_rates(environment: str, entry: Report) -> dict[float, dict[str, tuple[flo
     }
 
 
+def leads_at_rates(
+    environment: str, entry: Report
+) -> list[tuple[str, str, int, Estimate, Estimate]]:
+    """Of objectives with enough agents at another rate: (rate, name, pairs, more than PPO over the training, late)."""
+    found = []
+    for rate, agents in entry.get("rates", {}).items():
+        if REFERENCE not in agents:
+            continue
+        curves = as_comparison(environment, entry, agents).by_name
+        reference = curves.pop(REFERENCE)
+        for name, of_it in curves.items():
+            pairs = len(of_it.paired(reference)[0])
+            if pairs >= DECIDING:
+                area, late = (of_it.paired(reference, of) for of in ("area", "late"))
+                leads = paired_difference(*area), paired_difference(*late)
+                found.append((rate, name, pairs, *leads))
+    return found
+
+
 def tuned(sweep: Mapping[str, float]) -> str | None:
     """The clip that earns most; None where not all have been measured."""
     return max(sweep, key=lambda clip: sweep[clip]) if sweep else None
@@ -271,6 +290,11 @@ def facts(report: Report) -> dict[str, Any]:
             name: rates
             for name, entry in report["environments"].items()
             if (rates := at_rates(name, entry))
+        },
+        "leads_at_rates": {
+            name: leads
+            for name, entry in report["environments"].items()
+            if (leads := leads_at_rates(name, entry))
         },
         "led": {
             name: leading(curves)

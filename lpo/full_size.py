@@ -62,6 +62,8 @@ CONFIRMATIONS = (
     # Suggested by four pairs that report nothing, 58 to 168 more than the clip and 150 to 316 more than DPO.
     Confirmation("hopper", "lpo-cartpole-ee", reporting(60), "area", known=REFERENCE),
     Confirmation("hopper", "lpo-cartpole-ee", reporting(60), "area", "dpo", known="dpo"),
+    # Suggested by twelve pairs that report nothing, 348 [107, 604].
+    Confirmation("hopper at 0.001", "ta-lpo", reporting(60), "late lead"),
 )
 
 

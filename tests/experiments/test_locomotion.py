@@ -15,7 +15,7 @@ from lpo.objectives import CLIPS
 from scb.agents.ppo import DIAGNOSIS
 from scb.errors import UserError
 from scb.seeds import REPORTING, VALIDATING
-from scb.statistics import iqm
+from scb.statistics import iqm, paired_difference
 
 STEPS = [0, 50, 100]
 
@@ -319,6 +319,21 @@ def test_objectives_are_trained_at_other_rates_by_agents_that_report_nothing(
     before = len(asked)
     assert module.EXPERIMENT.main(flags) == 0 and len(asked) == before
     assert module.EXPERIMENT.main([*flags, "--rates", "0.002", "-1"]) == 2 and len(asked) == before
+
+
+def test_enough_pairs_at_another_rate_are_told_with_their_intervals():
+    made = report(10)
+    entry = made["environments"]["hopper"]
+    entry["sweep"] = {name: entry["agents"][name] for name in CLIPS if name in entry["agents"]}
+    few = {name: dict(list(of_it.items())[:9]) for name, of_it in entry["agents"].items()}
+    entry["rates"] = {"0.001": entry["agents"], "0.002": few}
+    ((rate, name, pairs, area, late), (_, other, *_)) = module.leads_at_rates("hopper", entry)
+    assert (rate, name, pairs, other) == ("0.001", "dpo", 10, "lpo-pendulum")
+    ours, theirs = (full_size.as_comparison("hopper", entry).by_name[x] for x in ("dpo", "ppo"))
+    assert area == paired_difference(ours.area, theirs.area)
+    assert late == paired_difference(ours.late, theirs.late)
+    page = module.EXPERIMENT.page(made)
+    assert "| dpo at 0.001 | 10 | " in page and "dpo at 0.002" not in page
 
 
 def test_agents_that_report_at_another_rate_stand_apart(tmp_path, trained_at):
