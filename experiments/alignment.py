@@ -24,7 +24,6 @@ from experiments.harness import Experiment, Save, command_of
 from lpo import figures
 from lpo.alignment import (
     Regime,
-    correlation_text,
     forget_programs,
     known_drifts,
     measure_alignment,
@@ -34,6 +33,7 @@ from lpo.fitness import LABELS
 from lpo.objectives import Objective, load_objective, same_drift
 from scb.environments.registry import environment_spec
 from scb.errors import UserError
+from scb.statistics import correlation_text
 
 PENDULUM = "Synthetic-Pendulum-v1"
 # One thing changed at a time.

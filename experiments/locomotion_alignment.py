@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from experiments.alignment import CONFIRMATION_SEED
 from experiments.harness import Experiment, Report, forget_other, packed, settled, unpacked
 from experiments.parts import InParts, Keys, Part, lacking
-from lpo.alignment import Alignment, Regime, alignment, correlation_text, regime_fitness
+from lpo.alignment import Alignment, Regime, alignment, regime_fitness
 from lpo.comparison import LearningCurves, compare
 from lpo.fitness import FITNESSES, LABELS
 from lpo.full_size import full_size, validated
@@ -32,7 +32,7 @@ from scb import plotting
 from scb.environments.registry import environment_spec
 from scb.environments.zoo import bandit_metadata
 from scb.errors import UserError, at_least
-from scb.statistics import halves_agree, iqm
+from scb.statistics import correlation_text, halves_agree, iqm
 
 BACKEND = "generalized"
 PENDULUM, CARTPOLE = "Pendulum-v1", "CartPole-v1"

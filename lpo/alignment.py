@@ -32,7 +32,7 @@ from scb.objectives import families
 from scb.population import map_population, rank_failed_last
 from scb.rows import Rows
 from scb.runs import Stopwatch
-from scb.statistics import iqm, places_apart, rank_correlations, spearman
+from scb.statistics import correlation_text, iqm, rank_correlations, spearman
 
 RESAMPLES = 1000
 
@@ -373,14 +373,3 @@ def measure_alignment(
             + "; ".join(f"{name} {correlation_text(c)}" for name, c in correlations.items())
         )
     return report
-
-
-def correlation_text(correlation: Mapping[str, float | None]) -> str:
-    """Such as "0.93 [0.81, 0.98]"; where all earn the same there is nothing to rank."""
-    value, low, high = (correlation[name] for name in ("spearman", "low", "high"))
-    if value is None:
-        return "none: all alike"
-    if low is None or high is None:
-        return f"{value:.2f}, one agent: no interval"
-    places = places_apart(2, low, high)
-    return f"{value:.{places}f} [{low:.{places}f}, {high:.{places}f}]"

@@ -7,7 +7,6 @@ their weights are: of those the slope beside ratio 1 is what is judged.
 """
 
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -93,7 +92,7 @@ class Certificate:
 
 
 def certify(
-    drift: Drift | Objective | str | Path,
+    drift: Drift | Objective,
     parameters: Any = None,
     num_ratios: int = 2001,
     num_advantages: int = 401,
@@ -101,7 +100,7 @@ def certify(
     """Evaluates a drift on a grid of ratios and advantages, and its slope around ratio 1.
 
     Args:
-      drift: any member of the contract, or an objective, which has its parameters, or its name or file.
+      drift: any member of the contract, or an objective, which has its parameters.
       parameters: of a drift; what it starts with where they are left out.
       num_ratios: points of log-ratio, in [-3, 3] and, a quarter as many, out to the bound that
         training clips at; at least 3, and one more where they are even.
@@ -111,10 +110,6 @@ def certify(
       UserError: it is no drift, or cannot take the parameters, or there are fewer points.
     """
     count_at_least(3, num_ratios=num_ratios, num_advantages=num_advantages)
-    if isinstance(drift, str | Path):
-        from lpo.objectives import load_objective  # which certifies what it saves
-
-        return certify(load_objective(drift), parameters, num_ratios, num_advantages)
     if not isinstance(drift, Drift):
         if not isinstance(getattr(drift, "drift", None), Drift):
             raise UserError(

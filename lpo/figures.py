@@ -15,7 +15,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
-from lpo.alignment import correlation_text
 from lpo.inner_loop import MetaTrainingConfig
 from scb.environments.registry import environment_spec
 from scb.errors import UserError
@@ -37,7 +36,7 @@ from scb.plotting import (
     legend_below,
     panels,
 )
-from scb.statistics import estimate, paired_difference
+from scb.statistics import correlation_text, estimate, paired_difference
 
 if TYPE_CHECKING:
     from lpo.comparison import LearningCurves

@@ -14,7 +14,7 @@ import tyro
 from rich.table import Table
 
 from lpo import figures
-from lpo.alignment import Regime, correlation_text, known_drifts, measure_alignment
+from lpo.alignment import Regime, known_drifts, measure_alignment
 from lpo.comparison import Comparison, LearningCurves, compare, ppo_spec
 from lpo.fitness import LABELS
 from lpo.objectives import Objective, learned_in, load_apart, load_objective, same_drift
@@ -31,7 +31,7 @@ from scb.files import write_json
 from scb.lists import read_settings, write_settings
 from scb.machine import package_versions
 from scb.measurement import Place, check_seeds
-from scb.statistics import estimate, few_agents
+from scb.statistics import correlation_text, estimate, few_agents
 
 
 def _tell(line: str) -> None:

@@ -5,7 +5,7 @@ rest: it is as robust as the median against a lucky or a failed seed, and wastes
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cache, partial
 
@@ -315,6 +315,17 @@ def rank_correlations(a: NDArray[np.floating], b: NDArray[np.floating]) -> NDArr
     spread = np.sqrt(np.sum(first**2, axis=1) * np.sum(second**2, axis=1))
     products = np.sum(first * second, axis=1)
     return np.divide(products, spread, out=np.zeros_like(products), where=spread > 0)
+
+
+def correlation_text(correlation: Mapping[str, float | None]) -> str:
+    """Such as "0.93 [0.81, 0.98]"; where all earn the same there is nothing to rank."""
+    value, low, high = (correlation[name] for name in ("spearman", "low", "high"))
+    if value is None:
+        return "none: all alike"
+    if low is None or high is None:
+        return f"{value:.2f}, one agent: no interval"
+    places = places_apart(2, low, high)
+    return f"{value:.{places}f} [{low:.{places}f}, {high:.{places}f}]"
 
 
 def halves_agree(x: ArrayLike, splits: int = 1000) -> float:

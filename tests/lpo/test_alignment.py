@@ -13,7 +13,6 @@ from lpo import figures
 from lpo.alignment import (
     Regime,
     alignment,
-    correlation_text,
     known_drifts,
     measure_alignment,
     other_drifts,
@@ -30,6 +29,7 @@ from scb.environments.zoo import save_bandit
 from scb.errors import UserError
 from scb.keys import root_key
 from scb.population import map_population
+from scb.statistics import correlation_text
 
 TINY = Regime(reward_noise=0.0, contexts=10, iterations=4, epochs=1, minibatches=1)
 
