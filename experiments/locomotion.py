@@ -35,7 +35,7 @@ from scb.errors import at_least, unused
 from scb.files import plain
 from scb.rows import Rows
 from scb.seeds import reporting, validation
-from scb.statistics import DECIDING, Estimate, iqm, paired_difference
+from scb.statistics import DECIDING, Estimate, iqm
 
 BACKEND = "generalized"
 
@@ -189,16 +189,11 @@ def leads_at_rates(
     """Of objectives with enough agents at another rate: (rate, name, pairs, more than PPO over the training, late)."""
     found = []
     for rate, agents in entry.get("rates", {}).items():
-        if REFERENCE not in agents:
-            continue
-        curves = as_comparison(environment, entry, agents).by_name
-        reference = curves.pop(REFERENCE)
-        for name, of_it in curves.items():
-            pairs = len(of_it.paired(reference)[0])
-            if pairs >= DECIDING:
-                area, late = (of_it.paired(reference, of) for of in ("area", "late"))
-                leads = paired_difference(*area), paired_difference(*late)
-                found.append((rate, name, pairs, *leads))
+        if REFERENCE in agents:
+            comparison = as_comparison(environment, entry, agents)
+            area, late = (comparison.differences(of) for of in ("area", "late"))
+            enough = {name: x.n for name, x in area.items() if x.n >= DECIDING}
+            found += [(rate, name, n, area[name], late[name]) for name, n in enough.items()]
     return found
 
 

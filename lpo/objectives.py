@@ -81,9 +81,8 @@ class Objective:
     @property
     def digests(self) -> dict[str, str]:
         """{name: SHA-256} of what its name does not tell: a file's contents, and code of somebody's own."""
-        told = [*code_of(self.drift).values()]
-        told += [self.sha256] if self.sha256 else []
-        return {self.name: " ".join(told)} if told else {}
+        told = " ".join(filter(None, (*code_of(self.drift).values(), self.sha256)))
+        return {self.name: told} if told else {}
 
     @property
     def learned_on(self) -> tuple[str, ...]:
