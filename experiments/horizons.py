@@ -20,7 +20,7 @@ from experiments.harness import Experiment, Report, packed, settled, unpacked
 from experiments.parts import InParts, Part
 from lpo import figures
 from lpo.inner_loop import MetaTrainingConfig, TaskTraining
-from lpo.objectives import load_objective, zoo_names
+from lpo.objectives import REFERENCE, load_objective, zoo_names
 from scb import plotting
 from scb.environments.zoo import bandit_metadata
 from scb.errors import UserError, at_least
@@ -29,7 +29,6 @@ from scb.measurement import Place, as_random
 from scb.statistics import Estimate, estimate
 
 TASK = "Synthetic-Pendulum-v1"
-REFERENCE = "ppo"
 SEED = 1  # nothing is chosen by it
 
 

@@ -23,7 +23,7 @@ from experiments.parts import InParts, Part, file_name
 from experiments.robustness import learned_for, named
 from lpo.comparison import compare, ppo_spec
 from lpo.figures import looks
-from lpo.objectives import check_names, learned_in, load_objective
+from lpo.objectives import REFERENCE, check_names, learned_in, load_objective
 from lpo.suite import suite
 from scb import plotting
 from scb.agents.spec import AgentSpec
@@ -33,7 +33,6 @@ from scb.rows import Rows
 from scb.seeds import reporting, validation
 from scb.statistics import Estimate, stratified_estimate
 
-REFERENCE = "ppo"
 REFERENCES = (REFERENCE, "dpo")
 OFFSET = 15_000  # of the first seed, among those that report
 LARGE, SMALL = 0.003, 0.0003  # a rate of at least, and of at most, so much

@@ -34,7 +34,6 @@ from scb.seeds import REPORTING
 from scb.statistics import pooled_estimate
 from scb.warm_start import WarmStartConfig, find_expert
 
-BACKEND = "generalized"
 LONGER = {"expert_errors": 0.45, "expert_error_warmup": 100, "expert_generations": 300}
 EXPERTS: dict[str, dict[str, Any]] = {
     "no errors": {},
@@ -90,7 +89,7 @@ def parts(options: Options, report: dict[str, Any]) -> Iterator[Part]:
 
 @cache
 def _bandit(environment: str) -> tuple[Place, SyntheticBandit]:
-    place = Place.named(environment, BACKEND)
+    place = Place.named(environment)
     return place, bandit_for(place.env, place.params, BanditConfig(form="linear"), environment)
 
 
@@ -163,7 +162,7 @@ def facts(report: Report) -> dict[str, Any]:
     tables: dict[str, Any] = {}
     for environment, entry in report["environments"].items():
         tables[environment] = {
-            "standing": environment_spec(environment).standing_still(BACKEND),
+            "standing": environment_spec(environment).standing_still(),
             "rows": [
                 {
                     "expert": expert,
@@ -189,7 +188,7 @@ def draw(report: Mapping[str, Any]) -> Figure:
     figure = Figure(figsize=(9, 3.8 * number + 0.4))
     panels: Any = figure.subplots(number, 2, squeeze=False, sharey="row")
     for row, (environment, entry) in zip(panels, report["environments"].items(), strict=True):
-        standing = environment_spec(environment).standing_still(BACKEND)
+        standing = environment_spec(environment).standing_still()
         for axes, algorithm in zip(row, ALGORITHMS, strict=True):
             for i, expert in enumerate(_searched_for(entry)):
                 for j, contexts in enumerate(CONTEXTS):

@@ -27,8 +27,8 @@ from experiments.locomotion_claims import ASKED, STATED, claims, confirmed, lead
 from experiments.parts import InParts, Keys, Part, file_name, lacking
 from lpo import figures
 from lpo.comparison import Comparison, LearningCurves, changed, compare, ppo_spec
-from lpo.full_size import REFERENCE, as_comparison, looked_at
-from lpo.objectives import CLIPS, learned_in, load_objective, zoo_names
+from lpo.full_size import as_comparison, looked_at
+from lpo.objectives import CLIPS, REFERENCE, learned_in, load_objective, zoo_names
 from scb.agents.spec import AgentSpec
 from scb.agents.values import check_value
 from scb.errors import at_least, unused
@@ -36,8 +36,6 @@ from scb.files import plain
 from scb.rows import Rows
 from scb.seeds import reporting, validation
 from scb.statistics import DECIDING, Estimate, iqm
-
-BACKEND = "generalized"
 
 
 @dataclass(frozen=True)
@@ -218,7 +216,6 @@ def _trained(
         [load_objective(objective)],
         seeds,
         spec,
-        BACKEND,
         diagnose=True,
         rows=rows,
         tell=print,
@@ -229,7 +226,7 @@ def _trained(
     other = {"environment": environment, "hyperparameters": changed(spec, environment)}
     return {
         **(other if entry != environment else {}),
-        "backend": BACKEND,
+        "backend": found.backend,
         "steps": found.steps.tolist(),
         "episodes": found.episodes,
         **agents,

@@ -34,7 +34,6 @@ from scb.environments.zoo import bandit_metadata
 from scb.errors import UserError, at_least
 from scb.statistics import correlation_text, halves_agree, iqm
 
-BACKEND = "generalized"
 PENDULUM, CARTPOLE = "Pendulum-v1", "CartPole-v1"
 FIRST_SEED = CONFIRMATION_SEED  # on which no regime was chosen
 # One thing changed at a time; what is not said is the default's of a search for an objective.
@@ -134,7 +133,7 @@ def _trained_in(environment: str, names: list[str], options: Options) -> dict[st
 
 def _trained(of_it: Regime, digest: str, names: list[str], options: Options) -> dict[str, Any]:
     seeds = list(range(FIRST_SEED, FIRST_SEED + options.agents))
-    found = regime_fitness(of_it, [load_objective(name) for name in names], seeds, BACKEND)
+    found = regime_fitness(of_it, [load_objective(name) for name in names], seeds)
     return {
         "sha256": digest,
         "fitness": {

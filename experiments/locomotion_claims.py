@@ -9,7 +9,8 @@ import numpy as np
 from experiments.claims import Claim, Judged, corrected, judge, of_agents
 from experiments.harness import Report
 from lpo.comparison import LearningCurves
-from lpo.full_size import REFERENCE, Confirmation, as_comparison, looked_at, with_pairs
+from lpo.full_size import Confirmation, as_comparison, looked_at, with_pairs
+from lpo.objectives import REFERENCE
 from scb.statistics import DECIDING, Estimate, paired_difference
 
 MARGIN = 0.05  # of what the reference earns: what is not worse by more is as good

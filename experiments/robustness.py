@@ -32,7 +32,7 @@ from experiments.harness import (
 )
 from experiments.parts import InParts, Keys, Part
 from lpo.comparison import ppo_spec
-from lpo.objectives import Objective, check_names, learned_in, load_objective
+from lpo.objectives import REFERENCE, Objective, check_names, learned_in, load_objective
 from lpo.suite import suite
 from scb.agents.spec import AgentSpec
 from scb.environments.registry import environment_spec
@@ -45,7 +45,6 @@ from scb.statistics import Estimate, Statistic, normalized_score, stratified_est
 
 _PLAN = plan_of("robustness")
 STATED = _PLAN["confirmation"]
-REFERENCE = "ppo"
 DRAWN = "ppo-drawn"
 REFERENCES = (REFERENCE, DRAWN, "dpo")
 FIRST_SEED = REPORTING[12_000]

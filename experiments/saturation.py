@@ -37,7 +37,6 @@ from scb.keys import named_key, root_key
 from scb.measurement import Place
 from scb.statistics import Estimate, estimate
 
-BACKEND = "generalized"
 SEED = 1  # nothing is chosen by it
 STATES = 2048
 EPISODES = 24  # of all agents as one, and of the bandit's best action
@@ -121,7 +120,7 @@ def earned_together(
 
 def measured(candidate: Candidate, options: Options) -> dict[str, Any]:
     """What agents earn, and how they act in states that they visit."""
-    bandit, place = candidate.bandit, Place.named(candidate.environment, BACKEND)
+    bandit, place = candidate.bandit, Place.named(candidate.environment)
     specs = {"ppo": bandit_agent("ppo", candidate.environment)}
     learners = Learners(bandit, specs, place, options.agents, options.episodes)
     weights, key = bandit.default_params.weights, named_key(root_key(SEED), "saturation")

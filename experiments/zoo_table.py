@@ -78,7 +78,7 @@ class Options:
     """of each agent in classic control"""
     brax_episodes: int = BRAX_EPISODES
     """of each agent in Brax"""
-    backend: str = "generalized"
+    backend: str | None = None
     """Brax's physics"""
     skip_brax: bool = False
 

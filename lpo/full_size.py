@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 
 from lpo.comparison import Comparison, LearningCurves
+from lpo.objectives import REFERENCE
 from scb.agents.ppo import DIAGNOSIS
 from scb.seeds import reporting
 
 PATH = Path(__file__).with_name("measured") / "locomotion.json"
-REFERENCE = "ppo"
 
 
 @dataclass(frozen=True)

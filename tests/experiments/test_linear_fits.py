@@ -99,7 +99,6 @@ def test_the_figure_has_an_interval_for_every_expert_and_contexts():
 @pytest.mark.slow
 def test_experts_are_found_and_agents_of_their_fits_judged(monkeypatch, small_agents):
     # Pendulum stands in for Brax, whose physics compile for long.
-    monkeypatch.setattr(module, "BACKEND", None)
     monkeypatch.setattr(module, "EXPERTS", {"errors": module.EXPERTS["errors"]})
     options = module.Options(("Pendulum-v1",), seeds=1, generations=1, ppo=2, td3=1, episodes=1)
     found = {}

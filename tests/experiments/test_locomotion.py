@@ -38,7 +38,7 @@ def compared(monkeypatch):
     """Trainings that were asked for; each earns what its objective's name says, and they stop after `limit`."""
     asked = []
 
-    def compare(environment, objectives, seeds, spec, backend, diagnose, rows, tell):
+    def compare(environment, objectives, seeds, spec, diagnose, rows, tell):
         if len(asked) == compared_limit[0]:
             raise ConnectionError
         (objective,) = objectives

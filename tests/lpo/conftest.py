@@ -16,9 +16,6 @@ from scb.agents.ppo import PPOConfig
 from scb.agents.spec import AgentSpec
 from scb.evolution import EvolutionConfig
 
-# What an artefact must say beside its weights.
-METADATA = {"config": {}, "seeds": {}, "results": {}, "cost": {}, "command": "a test"}
-
 
 @pytest.fixture(scope="session")
 def tiny_agent() -> PPOConfig:
@@ -66,7 +63,7 @@ def objective_file(tmp_path_factory: pytest.TempPathFactory, tiny_drift: Learned
     """tiny.npz and tiny.json: a learned objective of random weights. Not to be changed."""
     parameters = tiny_drift.init(jax.random.key(3))
     path, _ = save_objective(
-        tmp_path_factory.mktemp("objective") / "tiny.npz", tiny_drift, parameters, METADATA
+        tmp_path_factory.mktemp("objective") / "tiny.npz", tiny_drift, parameters
     )
     return path
 

@@ -122,9 +122,7 @@ def test_a_regime_on_a_synthetic_mdp_has_no_reward_noise(one_sentence, tmp_path)
     path = tmp_path / "mdp.npz"
     env, params = make("Pendulum-v1")
     mdp = synthetic_for(env, params, "T", BanditConfig(hidden_size=2), "mdp", None)
-    told = {"config": {"evaluation_environment": "Pendulum-v1"}, "command": "none"}
-    told |= {"seeds": {}, "results": {}, "cost": {}}
-    save_bandit(path, mdp, mdp.init_weights(root_key(0)), told)
+    save_bandit(path, mdp, mdp.init_weights(root_key(0)))
     with pytest.raises(UserError) as error:
         Regime(bandit=str(path))
     message = f"reward_noise is 5, and '{path}' is a synthetic MDP, whose reward has none: take 0."

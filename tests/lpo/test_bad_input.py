@@ -146,9 +146,8 @@ def test_what_does_not_go_together_is_refused(refused, arguments, message):
 @pytest.fixture
 def cartpole_bandit(working_folder) -> Path:
     bandit = SyntheticBandit(4, spaces.Discrete(2), BanditConfig(hidden_size=2))
-    metadata = {"config": {}, "seeds": {}, "results": {}, "cost": {}, "command": "a test"}
     weights = bandit.init_weights(jax.random.key(0))
-    return save_bandit(working_folder / "Synthetic-CartPole-v1.npz", bandit, weights, metadata)
+    return save_bandit(working_folder / "Synthetic-CartPole-v1.npz", bandit, weights)
 
 
 def test_a_bandit_of_another_environment_is_refused(refused, cartpole_bandit):

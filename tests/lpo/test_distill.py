@@ -23,7 +23,6 @@ from scb.environments.registry import make
 from scb.errors import UserError
 
 GRID = {"num_ratios": 61, "num_advantages": 11}
-METADATA = {"config": {}, "seeds": {}, "results": {}, "cost": {}, "command": "a test"}
 # Small enough for a second or two.
 QUICK = DistillConfig(
     samples=300, population_size=100, generations=4, candidates=4, grown=1, numbers=5
@@ -154,9 +153,7 @@ def test_a_formula_is_temporal_where_it_names_the_progress():
 
 def test_a_saved_formula_charges_the_same_bit_for_bit(tmp_path):
     drift = ClosedFormDrift("0.3*A*d - 1.25e-3*tanh(2*log_r)", base="ppo", clip=0.1, xi=1e-4)
-    path, certificate = save_objective(
-        tmp_path / "mine.npz", drift, drift.init(jax.random.key(0)), METADATA
-    )
+    path, certificate = save_objective(tmp_path / "mine.npz", drift, drift.init(jax.random.key(0)))
     loaded = load_objective(path)
     assert (loaded.name, loaded.drift) == ("mine", drift)
     assert certificate.holds
@@ -170,14 +167,14 @@ def test_a_saved_formula_charges_the_same_bit_for_bit(tmp_path):
 
 def test_a_formula_without_numbers_is_kept(tmp_path):
     drift = ClosedFormDrift("A*d - log_r*A")
-    path, _ = save_objective(tmp_path / "mine", drift, drift.init(jax.random.key(0)), METADATA)
+    path, _ = save_objective(tmp_path / "mine", drift, drift.init(jax.random.key(0)))
     assert load_objective(path).drift == drift
 
 
 def test_numbers_that_were_trained_on_come_back_in_the_text(tmp_path):
     drift = ClosedFormDrift("0.5*A*d - 2 * tanh(3e-1*log_r)")
     trained = {"constants": jnp.float32([0.1, -7.25, 1e-9])}
-    path, _ = save_objective(tmp_path / "mine.npz", drift, trained, METADATA)
+    path, _ = save_objective(tmp_path / "mine.npz", drift, trained)
     loaded = load_objective(path)
     assert loaded.drift.expression == "0.1*A*d - -7.25 * tanh(1e-09*log_r)"
     x = jnp.linspace(-2.0, 2.0, 101)
@@ -201,7 +198,7 @@ def test_numbers_that_were_trained_on_come_back_in_the_text(tmp_path):
 )
 def test_a_tampered_formula_is_refused(tmp_path, entries, message, one_sentence):
     drift = ClosedFormDrift("0.5*A*d")
-    path, _ = save_objective(tmp_path / "mine.npz", drift, drift.init(jax.random.key(0)), METADATA)
+    path, _ = save_objective(tmp_path / "mine.npz", drift, drift.init(jax.random.key(0)))
     metadata = json.loads(path.with_suffix(".json").read_text())
     metadata["config"]["drift"].update(entries)
     path.with_suffix(".json").write_text(json.dumps(metadata))

@@ -11,7 +11,6 @@ from lpo.drifts.mirror import MirrorDrift
 from lpo.objectives import load_objective, save_objective
 from scb.errors import UserError
 
-METADATA = {"config": {}, "seeds": {}, "results": {}, "cost": {}, "command": "a test"}
 DRIFT = MirrorDrift(hidden_size=4, strength=3.0)
 
 
@@ -55,7 +54,7 @@ def test_it_is_a_drift_whatever_its_weights(scale):
 
 def test_a_saved_one_charges_the_same(tmp_path):
     weights = DRIFT.init(jax.random.key(3))
-    path, _ = save_objective(tmp_path / "mine.npz", DRIFT, weights, METADATA)
+    path, _ = save_objective(tmp_path / "mine.npz", DRIFT, weights)
     loaded = load_objective(path)
     assert loaded.drift == DRIFT
     jax.tree.map(np.testing.assert_array_equal, loaded.parameters, weights)

@@ -29,8 +29,6 @@ from scb.environments.synthetic import BanditConfig, SyntheticBandit
 from scb.environments.zoo import save_bandit
 from scb.errors import UserError
 
-METADATA = {"config": {}, "seeds": {}, "results": {}, "cost": {}, "command": "a test"}
-
 
 @pytest.fixture
 def file(tmp_path: Path, objective_file: Path) -> Path:
@@ -147,7 +145,7 @@ def test_an_unknown_name_is_told_what_is_known(name, message, one_sentence):
 def test_a_saved_objective_charges_the_same_bit_for_bit(tmp_path, base):
     drift = LearnedDrift(base=base, hidden_size=3, clip=0.1, xi=1e-4, gate=0.25)
     parameters = drift.init(jax.random.key(5))
-    path, certificate = save_objective(tmp_path / "mine.npz", drift, parameters, METADATA)
+    path, certificate = save_objective(tmp_path / "mine.npz", drift, parameters)
     loaded = load_objective(path)
     assert (loaded.name, loaded.drift) == ("mine", drift)
     assert loaded.metadata["certificate"] == certificate.as_dict()
@@ -163,7 +161,7 @@ def test_a_saved_objective_charges_the_same_bit_for_bit(tmp_path, base):
 def test_a_closed_form_without_parameters_by_name_is_not_saved(tmp_path):
     drift = ClipDrift(0.3)
     with pytest.raises(UserError, match=r"family clip is its settings.* such as ppo-0\.3"):
-        save_objective(tmp_path / "mine.npz", drift, drift.init(jax.random.key(0)), METADATA)
+        save_objective(tmp_path / "mine.npz", drift, drift.init(jax.random.key(0)))
     assert not list(tmp_path.iterdir())
 
 
@@ -188,12 +186,12 @@ def test_weights_that_are_no_numbers_are_not_saved(tmp_path, recwarn):
 
 def test_dpo_is_saved_with_the_parameters_it_has(tmp_path):
     trained = {"alpha": jnp.float32(4.0), "beta": jnp.float32(1.5)}
-    path, _ = save_objective(tmp_path / "mine.npz", DPODrift(), trained, METADATA)
+    path, _ = save_objective(tmp_path / "mine.npz", DPODrift(), trained)
     loaded = load_objective(path)
     assert loaded.drift == DPODrift() and loaded.parameters == trained
-    again, _ = save_objective(tmp_path / "again.npz", loaded.drift, loaded.parameters, METADATA)
+    again, _ = save_objective(tmp_path / "again.npz", loaded.drift, loaded.parameters)
     assert load_objective(again).metadata["config"]["drift"]["alpha"] == 4.0
-    path, _ = save_objective(tmp_path / "own.npz", DPODrift(), DPODrift().init(None), METADATA)
+    path, _ = save_objective(tmp_path / "own.npz", DPODrift(), DPODrift().init(None))
     assert load_objective(path).drift == DPODrift()
 
 
@@ -232,7 +230,7 @@ def test_what_a_run_learned_has_its_name_whatever_it_is_compared_with(file, tmp_
 
 
 def test_metadata_of_the_meta_training_is_kept(tmp_path, tiny_drift):
-    given = {**METADATA, "config": {"meta_training": {"fitness": "transfer"}}, "seeds": {"a": 7}}
+    given = {"config": {"meta_training": {"fitness": "transfer"}}, "seeds": {"a": 7}}
     parameters = tiny_drift.init(jax.random.key(0))
     path, _ = save_objective(tmp_path / "mine.npz", tiny_drift, parameters, given)
     metadata = load_objective(path).metadata
@@ -245,7 +243,7 @@ def test_metadata_of_the_meta_training_is_kept(tmp_path, tiny_drift):
 def test_a_bandit_is_no_objective(tmp_path, one_sentence):
     bandit = SyntheticBandit(2, spaces.Discrete(2), BanditConfig(hidden_size=2))
     weights = bandit.init_weights(jax.random.key(0))
-    path = save_bandit(tmp_path / "bandit.npz", bandit, weights, METADATA)
+    path = save_bandit(tmp_path / "bandit.npz", bandit, weights)
     assert "is a bandit: give a drift here." in one_sentence(refusal(path))
 
 
@@ -379,7 +377,7 @@ def test_an_objective_of_the_zoo_says_how_it_was_made(name):
 def test_a_temporal_objective_comes_back_as_one(tmp_path):
     drift = LearnedDrift(hidden_size=4, temporal=True)
     parameters = drift.init(jax.random.key(0))
-    path, certificate = save_objective(tmp_path / "late.npz", drift, parameters, METADATA)
+    path, certificate = save_objective(tmp_path / "late.npz", drift, parameters)
     loaded = load_objective(path)
     assert loaded.drift == drift
     assert certificate.holds

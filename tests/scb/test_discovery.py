@@ -41,7 +41,6 @@ from scb.statistics import iqm
 from scb.warm_start import WarmStartConfig
 from tests.scb.probes import Corridor, CorridorParams
 
-METADATA = {"seeds": {}, "results": {}, "cost": {}, "command": "scb discover", "config": {}}
 TINY = PPOConfig(
     num_envs=2, num_steps=8, num_epochs=1, num_minibatches=1, total_steps=20, hidden_sizes=(4,)
 )
@@ -167,7 +166,7 @@ def test_a_discovery_ends_with_weights_of_its_bandit(discovered):
 
 def test_a_discovered_bandit_is_saved_and_loaded(discovered, tmp_path):
     problem, outcome = discovered
-    path = save_bandit(tmp_path / "Synthetic-CartPole-v1", problem.bandit, outcome.mean, METADATA)
+    path = save_bandit(tmp_path / "Synthetic-CartPole-v1", problem.bandit, outcome.mean)
     bandit = load_bandit(path)
     np.testing.assert_array_equal(flat(bandit.default_params.weights), flat(outcome.mean))
     check_fits(bandit, problem.place.env, problem.place.params, "CartPole-v1")
@@ -531,7 +530,7 @@ def test_a_synthetic_mdp_is_discovered_and_opens_as_an_environment(parameterizat
     )
     assert [line["failed"] for line in outcome.metrics] == [0, 0]
     assert shapes(outcome.mean) == problem.bandit.weight_shapes()
-    metadata = {**METADATA, "config": {"evaluation_environment": "CartPole-v1"}}
+    metadata = {"config": {"evaluation_environment": "CartPole-v1"}}
     path = save_bandit(tmp_path / "mdp.npz", problem.bandit, outcome.mean, metadata)
     env, env_params = make(str(path))
     assert env.config.parameterization == parameterization
@@ -589,7 +588,7 @@ def test_an_expert_start_is_fitted_once_and_from_the_seed_alone(monkeypatch):
 def saved(folder, environment, **config):
     bandit = bandit_for(*make(environment), BanditConfig(**config), f"Synthetic-{environment}")
     weights = bandit.init_weights(jax.random.key(1))
-    return save_bandit(folder / f"Synthetic-{environment}", bandit, weights, METADATA), weights
+    return save_bandit(folder / f"Synthetic-{environment}", bandit, weights), weights
 
 
 def test_a_discovery_starts_from_a_bandit_in_a_file(discovered, tmp_path):

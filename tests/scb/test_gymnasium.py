@@ -46,9 +46,7 @@ def mdp(parameterization, environment="Pendulum-v1", max_steps=3):
 def file(request, tmp_path_factory):
     made = mdp(request.param)
     path = tmp_path_factory.mktemp("mdp") / "made.npz"
-    about = {"config": {"evaluation_environment": "Pendulum-v1"}, "seeds": [0]}
-    about |= {"results": {}, "cost": {}, "command": "a test"}
-    return str(scb.save_bandit(path, made, made._weights, about))
+    return str(scb.save_bandit(path, made, made._weights))
 
 
 def actions_of(space, number, seed=0):

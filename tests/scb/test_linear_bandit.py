@@ -100,9 +100,8 @@ def test_units_are_what_moves_a_context_or_the_policy_by_as_much(bandit):
 
 
 def test_a_file_gives_back_the_same_bandit(bandit, tmp_path):
-    metadata = {"config": {}, "seeds": {}, "results": {}, "cost": {}, "command": "made here"}
     path = tmp_path / "Synthetic-Pair.npz"
-    save_bandit(path, bandit, bandit.default_params.weights, metadata)
+    save_bandit(path, bandit, bandit.default_params.weights)
     loaded = load_bandit(path)
     assert loaded.config == BanditConfig(form="linear", latent_size=2)
     context, action = jnp.array([1.0, 0.1]), jnp.array([0.5, 3.0])

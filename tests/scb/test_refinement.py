@@ -221,8 +221,7 @@ def test_only_a_linear_bandit_is_refined():
 def test_a_search_goes_on_from_a_bandit_that_it_refined_once(bandit, tmp_path, monkeypatch):
     path = tmp_path / "start.npz"
     weights = bandit.init_weights(jax.random.key(3))
-    metadata = {"config": {}, "seeds": {}, "results": {}, "cost": {}, "command": "none"}
-    save_bandit(path, bandit, weights, metadata)
+    save_bandit(path, bandit, weights)
     config = DiscoveryConfig(
         start=str(path),
         bandit=LINEAR,

@@ -28,7 +28,6 @@ from tests.scb.probes import Corridor
 
 BOX = spaces.Box(-1.0, 2.0, (1,), jnp.float32)
 SPACES = {"box": BOX, "discrete": spaces.Discrete(3)}
-METADATA = {"seeds": {"discovery": 3}, "results": {}, "cost": {}, "command": "scb discover"}
 SMALL = {"hidden_size": 4, "activation": "relu", "latent": "softmax_categorical", "latent_size": 2}
 
 
@@ -473,13 +472,13 @@ def test_an_mdp_without_weights_asks_for_params():
 # --------------------------------------------------------------------------------------------
 
 
-def saved(folder, parameterization="TI", name="Pendulum-v1", max_steps=7, metadata=METADATA):
+def saved(folder, parameterization="TI", name="Pendulum-v1", max_steps=7, **about):
     env, env_params = make(name)
     mdp = synthetic_for(
         env, env_params, parameterization, BanditConfig(**SMALL), "x", max_steps=max_steps
     )
     weights = jax.jit(mdp.init_weights)(jax.random.key(1))
-    return save_bandit(folder / "Synthetic-Test.npz", mdp, weights, metadata), mdp, weights
+    return save_bandit(folder / "Synthetic-Test.npz", mdp, weights, about), mdp, weights
 
 
 def edit(path, change):
@@ -512,7 +511,7 @@ def test_a_saved_t_starts_in_the_same_physics_of_brax(tmp_path):
     config = MDPConfig(**SMALL, parameterization="T", max_steps=7)
     mdp = SyntheticMDP(4, env.action_space(), config, env=env)
     weights = mdp.init_weights(jax.random.key(1))
-    loaded = load_synthetic(save_bandit(tmp_path / "a.npz", mdp, weights, METADATA))
+    loaded = load_synthetic(save_bandit(tmp_path / "a.npz", mdp, weights))
     assert isinstance(loaded, SyntheticMDP) and loaded.env == env
 
 
@@ -521,8 +520,7 @@ def test_a_t_is_made_again_by_the_name_that_the_metadata_gives(tmp_path):
     name = "DiscountingChain-bsuite"
     with pytest.raises(UserError, match="unknown environment 'DiscountingChain-v0'"):
         saved(tmp_path, "T", name)
-    metadata = {**METADATA, "config": {"evaluation_environment": name}}
-    path, original, _ = saved(tmp_path, "T", name, metadata=metadata)
+    path, original, _ = saved(tmp_path, "T", name, config={"evaluation_environment": name})
     assert isinstance(load_synthetic(path).env, type(original.env))
 
 
@@ -532,13 +530,13 @@ def test_a_t_whose_evaluation_environment_would_not_come_back_is_not_written(tmp
     mdp = synthetic_for(env, changed, "T", BanditConfig(**SMALL), "x")
     weights = mdp.init_weights(jax.random.key(0))
     with pytest.raises(UserError, match=r"a\.npz was not written, since 'Pendulum-v1' by its name"):
-        save_bandit(tmp_path / "a.npz", mdp, weights, METADATA)
+        save_bandit(tmp_path / "a.npz", mdp, weights)
     assert not list(tmp_path.iterdir())
 
 
 def test_a_bandits_file_opens_as_a_bandit_and_an_mdps_does_not(tmp_path):
     bandit = SyntheticBandit(3, BOX, BanditConfig(**SMALL))
-    path = save_bandit(tmp_path / "b.npz", bandit, bandit.init_weights(jax.random.key(0)), METADATA)
+    path = save_bandit(tmp_path / "b.npz", bandit, bandit.init_weights(jax.random.key(0)))
     assert isinstance(load_synthetic(path), SyntheticBandit)
     assert isinstance(make(str(path))[0], SyntheticBandit)
     with pytest.raises(UserError, match="is a synthetic_mdp: give a bandit here"):
@@ -546,7 +544,7 @@ def test_a_bandits_file_opens_as_a_bandit_and_an_mdps_does_not(tmp_path):
 
 
 def test_an_artefact_that_is_no_environment_is_refused(tmp_path):
-    metadata = {**METADATA, "kind": "drift", "config": {}}
+    metadata = {"kind": "drift", "config": {}}
     path = artefacts.save(tmp_path / "a.npz", {"x": np.zeros(2)}, metadata)
     with pytest.raises(UserError, match="is a drift: give a bandit or synthetic_mdp here"):
         load_synthetic(path)

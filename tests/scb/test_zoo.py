@@ -23,7 +23,6 @@ from scb.errors import UserError
 from scb.judgement import check_fits
 from tests.scb.probes import context_bandit
 
-METADATA = {"seeds": {"discovery": 3}, "results": {}, "cost": {}, "command": "scb discover"}
 CONFIG = BanditConfig(hidden_size=4, activation="relu", latent="softmax_categorical", latent_size=2)
 BANDITS = {
     "box": SyntheticBandit(3, spaces.Box(jnp.array([-2.0, 0.0]), 1.5, (2,), jnp.float32), CONFIG),
@@ -33,7 +32,8 @@ BANDITS = {
 
 def saved(folder, bandit, name="Synthetic-Test"):
     weights = bandit.init_weights(jax.random.key(1))
-    return save_bandit(folder / f"{name}.npz", bandit, weights, METADATA), weights
+    path = save_bandit(folder / f"{name}.npz", bandit, weights, {"command": "scb discover"})
+    return path, weights
 
 
 def edit(path, change):
@@ -73,7 +73,10 @@ def test_a_saved_bandit_comes_back_exactly(tmp_path, original):
 def test_the_metadata_is_kept_beside_what_the_bandit_needs(tmp_path):
     bandit, weights = context_bandit(), context_bandit().default_params.weights
     path = save_bandit(
-        tmp_path / "a.npz", bandit, weights, {**METADATA, "config": {"discovery": {"sigma": 0.1}}}
+        tmp_path / "a.npz",
+        bandit,
+        weights,
+        {"config": {"discovery": {"sigma": 0.1}}, "seeds": {"discovery": 3}},
     )
     metadata = artefacts.load(path, "bandit").metadata
     assert metadata["config"]["discovery"] == {"sigma": 0.1}
@@ -97,13 +100,13 @@ def test_what_could_not_be_loaded_is_not_saved(tmp_path):
     ):
         save_bandit(path, other, BANDITS["box"])
     with pytest.raises(UserError, match="the arrays are a ndarray: give a dictionary of them"):
-        artefacts.save(path, np.zeros(420), METADATA)
+        artefacts.save(path, np.zeros(420), {"kind": "bandit", "config": {}})
     assert not path.exists()
     with pytest.raises(UserError, match="cannot write to /proc/nowhere"):
         artefacts.save(
             "/proc/nowhere/bandit.npz",
             {"x": np.zeros(1)},
-            METADATA | {"kind": "bandit", "config": {}},
+            {"kind": "bandit", "config": {}},
         )
 
 
@@ -134,9 +137,7 @@ def test_a_description_that_is_no_bandits_is_refused(tmp_path, change):
 
 
 def test_an_artefact_of_another_kind_is_refused(tmp_path):
-    path = artefacts.save(
-        tmp_path / "a.npz", {"x": np.zeros(2)}, {**METADATA, "kind": "drift", "config": {}}
-    )
+    path = artefacts.save(tmp_path / "a.npz", {"x": np.zeros(2)}, {"kind": "drift", "config": {}})
     with pytest.raises(UserError, match="is a drift: give a bandit here"):
         load_bandit(path)
 
