@@ -17,10 +17,11 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from experiments import zoo_table, zoo_table_page
+from experiments import zoo_table
 from experiments.claims import Claim, of_agents
-from experiments.harness import Experiment, Preset, Report
+from experiments.harness import Experiment, Preset, Report, lost
 from experiments.parts import InParts, Part
+from experiments.zoo_table_page import BANDITS, PAPER, label, of_label, paper_return
 from lpo.full_size import full_size
 from scb import measurement, plotting
 from scb.agents.spec import AgentSpec, bandit_agent, environment_agent
@@ -29,14 +30,14 @@ from scb.rows import Rows, pivot
 from scb.seeds import REPORTING
 from scb.statistics import DECIDING, estimate, median
 
-OURS, PUBLISHED = "ours", "published"
+OURS, PUBLISHED = BANDITS
 LOOKS: dict[str, dict[str, Any]] = {
     OURS: {"color": plotting.BLUE, "linestyle": "-"},
     PUBLISHED: {"color": plotting.PURPLE, "linestyle": "-."},
     "environment": {"color": plotting.VERMILLION, "linestyle": "--"},
 }
 WORDS = {OURS: "our bandit", PUBLISHED: "the published bandit", "environment": "the environment"}
-PAPER = "the environment, in the paper (at the end)"
+_PAPER_LINE = "the environment, in the paper (at the end)"
 # Half of the hundred that two orders of magnitude are, for the paper says "roughly".
 LEAST_TIMES = 50
 
@@ -49,14 +50,9 @@ class Options(Preset):
     """folder with the published bandits' .npz files"""
 
 
-def place(environment: str, backend: str | None) -> str:
-    """The name of an environment in the report."""
-    return environment if backend is None else f"{environment} ({backend})"
-
-
 def task(kind: str, environment: str, backend: str | None) -> str:
     """The name of a bandit in the report."""
-    return f"{place(environment, backend)}, {kind}"
+    return f"{label(environment, backend)}, {kind}"
 
 
 def parts(plan: Mapping[str, Any], report: dict[str, Any]) -> Iterator[Part]:
@@ -84,7 +80,7 @@ def parts(plan: Mapping[str, Any], report: dict[str, Any]) -> Iterator[Part]:
     for environment, backend in dict.fromkeys((x[1], x[2]) for x in measured):
         for algorithm in plan["environment_steps"][environment]:
             curve = partial(_in_environment, environment, backend, plan, algorithm)
-            yield Part(("environments", place(environment, backend), algorithm), curve)
+            yield Part(("environments", label(environment, backend), algorithm), curve)
 
 
 measure = InParts(parts)
@@ -188,7 +184,7 @@ def matches(report: Mapping[str, Any]) -> list[dict[str, Any]]:
 
     rows = []
     for name, algorithms in report["bandits"].items():
-        environment, _, backend = _environment_of(name).partition(" (")
+        environment, backend = of_label(_environment_of(name))
         for algorithm, curves in report["environments"][_environment_of(name)].items():
             level = estimate(finals(algorithms[algorithm]))
             low = level.value if level.low is None else level.low
@@ -197,7 +193,7 @@ def matches(report: Mapping[str, Any]) -> list[dict[str, Any]]:
                 {
                     "bandit": name,
                     "environment": environment,
-                    "backend": backend.rstrip(")") or None,
+                    "backend": backend,
                     "algorithm": algorithm,
                     "finals": finals(algorithms[algorithm]),
                     "level": level,
@@ -240,23 +236,15 @@ def claims(report: Report) -> list[Claim]:
 
 def facts(report: Report) -> dict[str, Any]:
     """Final returns, ours and the paper's, and steps to match."""
-    rows, lost = [], 0
+    rows = []
     for name, algorithms in report["bandits"].items():
-        own, environment = report["environments"][_environment_of(name)], name.split(" ")[0]
+        own = report["environments"][_environment_of(name)]
+        environment, backend = of_label(_environment_of(name))
         for algorithm, curves in algorithms.items():
             both = [x and {**x, "final": finals(x)} for x in (curves, own.get(algorithm))]
-            stated = zoo_table_page.PAPER.get(environment, {}).get(algorithm)
-            rows.append(
-                (
-                    name,
-                    algorithm,
-                    *both,
-                    stated,
-                    zoo_table_page.paper_return(environment, algorithm),
-                )
-            )
-    for of_all in (report["bandits"], report["environments"]):
-        lost += sum(x.get("failed", 0) for by in of_all.values() for x in by.values())
+            stated = PAPER.get(environment, {}).get(algorithm)
+            expert = paper_return(environment, algorithm, backend)
+            rows.append((name, algorithm, *both, stated, expert))
     found = matches(report)
     told = [row for row in found if row["agents"] >= DECIDING]
     return {
@@ -267,7 +255,7 @@ def facts(report: Report) -> dict[str, Any]:
         "times": _times,
         "least_times": LEAST_TIMES,
         "short": sum(row["steps"][1] is None for row in found),
-        "lost": lost,
+        "lost": lost(report),
     }
 
 
@@ -291,6 +279,7 @@ def draw(report: Mapping[str, Any]) -> Figure:
         len(places), len(algorithms), squeeze=False, sharey="row", sharex="col"
     )
     for row, (environment, found) in zip(panels, places.items(), strict=True):
+        place_name, backend = of_label(environment)
         for axes, algorithm in zip(row, algorithms, strict=True):
             for place, look in LOOKS.items():
                 if (curve := found.get(place, {}).get(algorithm)) is None:
@@ -300,9 +289,8 @@ def draw(report: Mapping[str, Any]) -> Figure:
                 steps = np.asarray(curve["steps"])[shown]
                 estimates = [estimate(x) for x in np.transpose(curve["returns"])[shown]]
                 plotting.estimate_curve(axes, steps, estimates, **look)
-            paper = zoo_table_page.paper_return(environment.split(" ")[0], algorithm)
-            # The paper's physics.
-            if algorithm not in found["environment"] and paper and "(generalized)" in environment:
+            paper = paper_return(place_name, algorithm, backend)
+            if algorithm not in found["environment"] and paper:
                 axes.axhline(paper, color=plotting.GREY, linestyle=":")
             axes.set_xscale("log")
         row[0].set_ylabel(f"return on\n{environment}")
@@ -311,7 +299,7 @@ def draw(report: Mapping[str, Any]) -> Figure:
     for axes in panels[-1]:
         axes.set_xlabel("training steps")
     legend = {WORDS[place]: look for place, look in LOOKS.items()}
-    legend[PAPER] = {"color": plotting.GREY, "linestyle": ":"}
+    legend[_PAPER_LINE] = {"color": plotting.GREY, "linestyle": ":"}
     plotting.legend_of(figure, legend, 4)
     plotting.figure_title(figure, "Agents by where they trained: interquartile mean, 95 % interval")
     return figure

@@ -26,7 +26,7 @@ from matplotlib.ticker import EngFormatter
 from experiments.harness import Experiment, Save
 from experiments.rendering import plain
 from experiments.searches import each_once, machines, read_log
-from experiments.zoo_table_page import TARGETS, label, rank
+from experiments.zoo_table_page import TARGETS, label, of_label, rank
 from scb import listing, plotting
 from scb.environments.registry import environment_spec
 from scb.environments.zoo import bandit_metadata, zoo_names
@@ -111,7 +111,7 @@ def _run(folder: Path) -> dict[str, Any] | str:
     return {
         "name": folder.resolve().name,
         # Brax with its physics, without which its return says nothing.
-        "environment": label({"environment": environment, "backend": config["backend"]}),
+        "environment": label(environment, config["backend"]),
         "start": start,
         "seed": evolution["seed"],
         "settings": {**settings, "algorithms": ",".join(config["algorithms"])},
@@ -165,7 +165,7 @@ def _warm_start(folder: Path, environment: str) -> dict[str, Any]:
 
 
 def _place(run: Mapping[str, Any]) -> tuple[Any, ...]:
-    environment = rank(run["environment"].split(" (")[0])
+    environment = rank(of_label(run["environment"])[0])
     return (environment, list(STARTS).index(run["start"]), run["seed"], run["name"])
 
 

@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 
 from experiments import searches
 from experiments.claims import OF_THE_WAY, TENTH, Claim
-from experiments.harness import CLASSIC_CONTROL, Experiment, Report, finite
+from experiments.harness import CLASSIC_CONTROL, Experiment, Report, finite, lost
 from experiments.parts import InParts, Part
 from scb import plotting
 from scb.agents.spec import AgentSpec, algorithms_for, bandit_agent
@@ -174,7 +174,7 @@ def facts(report: Report) -> dict[str, Any]:
         },
         "searched": searched(report),
         "good": GOOD,
-        "lost": sum(sum(x["failed"].values()) for x in environments.values()),
+        "lost": lost(environments),
     }
 
 

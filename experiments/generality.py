@@ -20,8 +20,8 @@ from matplotlib.figure import Figure
 import scb
 from experiments import searches
 from experiments.claims import OF_THE_WAY, TENTH, Claim
-from experiments.harness import CLASSIC_CONTROL, Experiment, Report, bandit_of, finite
-from experiments.parts import InParts, Part, lacking
+from experiments.harness import CLASSIC_CONTROL, Experiment, Report, bandit_of, finite, lost
+from experiments.parts import InParts, Keys, Part
 from scb import measurement, plotting
 from scb.agents.spec import ALGORITHMS, algorithms_for, bandit_agent
 from scb.analysis.optimal_actions import optimal_policy
@@ -93,16 +93,16 @@ def parts(plan: Mapping[str, Any], report: dict[str, Any]) -> Iterator[Part]:
         for source in SOURCES:
             path = ("environments", environment, source)
             kinds = [x for x in agents_of(environment) if (x, source) != (OPTIMAL, ENVIRONMENT)]
-            left = lacking(report, path, {("returns", kind): kind for kind in kinds})
-            measured = partial(_measured, environment, source, list(left.values()), plan)
-            yield Part(path, measured, tuple(left))
+            places: dict[Keys, str] = {("returns", kind): kind for kind in kinds}
+            measured = partial(_measured, environment, source, plan)
+            yield Part.lacking(report, path, places, measured)
 
 
 measure = InParts(parts)
 
 
 def _measured(
-    environment: str, source: str, kinds: Sequence[str], plan: Mapping[str, Any]
+    environment: str, source: str, plan: Mapping[str, Any], kinds: Sequence[str]
 ) -> dict[str, Any]:
     """What is said of a source, and {kind of agent: [N] returns}."""
     judge_in = Place.named(environment)
@@ -261,12 +261,7 @@ def facts(report: Report) -> dict[str, Any]:
             for name, entry in report["environments"].items()
         },
         "names": {"together": TOGETHER, "wide": WIDE, "swish": SWISH},
-        "lost": sum(
-            number
-            for entry in report["environments"].values()
-            for of_source in entry.values()
-            for number in of_source["failed"].values()
-        ),
+        "lost": lost(report["environments"]),
     }
 
 

@@ -21,7 +21,6 @@ from typing import Any, Literal
 import numpy as np
 import tyro
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 from experiments import claims, rendering
 from experiments.claims import Claim, Judged
@@ -371,20 +370,17 @@ def forget_replaced(report: dict[str, Any]) -> None:
     forget(report)
 
 
-def forget_other(entries: dict[str, Any], name: str, digest: str) -> None:
-    """Takes out an entry that is of another bandit than the one with this checksum, so that it is measured again."""
-    if name in entries and entries[name].get("sha256") != digest:
+def forget_other(entries: dict[str, Any], name: str, digest: str, of: str = "sha256") -> None:
+    """Takes out an entry that is of another bandit, or objective, than the one with this checksum; `of` is its key."""
+    if name in entries and entries[name].get(of) != digest:
         del entries[name]
 
 
-def packed(rows: Any) -> list[str]:
-    """[N, M] numbers as a line of JSON a row; one number a line would make a report unreadable."""
-    return [" ".join(f"{x:.4g}" for x in row) for row in rows]
-
-
-def unpacked(lines: Sequence[str]) -> NDArray[np.floating]:
-    """What `packed` packed, to four digits."""
-    return np.array([[float(x) for x in line.split()] for line in lines])
+def lost(report: Any, of_them: bool = False) -> int:
+    """How many agents of a report, or of a part of it, earned no number: what is under "failed", at any depth."""
+    if isinstance(report, Mapping):
+        return sum(lost(x, of_them or name == "failed") for name, x in report.items())
+    return report if of_them else 0
 
 
 def finite(returns: Any, place: Place) -> tuple[list[float], int]:

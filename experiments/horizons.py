@@ -16,7 +16,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from experiments.claims import corrected
-from experiments.harness import Experiment, Report, packed, settled, unpacked
+from experiments.harness import Experiment, Report, forget_other, settled
 from experiments.parts import InParts, Part
 from lpo import figures
 from lpo.inner_loop import MetaTrainingConfig, TaskTraining
@@ -24,6 +24,7 @@ from lpo.objectives import REFERENCE, load_objective, zoo_names
 from scb import plotting
 from scb.environments.zoo import bandit_metadata
 from scb.errors import UserError, at_least
+from scb.files import packed_row, unpacked_row
 from scb.keys import named_key, root_key
 from scb.measurement import Place, as_random
 from scb.statistics import Estimate, estimate
@@ -60,7 +61,7 @@ def measured(name: str, options: Options) -> dict[str, Any]:
     found, place = {}, Place.named(TASK)
     for horizon in options.horizons:
         returns, _ = as_random(np.asarray(earned(objective.parameters, horizon)), place)
-        found[f"{horizon:g}"] = packed([returns / scale])[0]
+        found[f"{horizon:g}"] = packed_row(returns / scale)
     digests = {"sha256": bandit_metadata(TASK)["sha256"], "objective_sha256": objective.sha256}
     return {**digests, "returns": found}
 
@@ -71,9 +72,10 @@ def parts(options: Options, report: dict[str, Any]) -> Iterator[Part]:
     entries = report.setdefault("objectives", {})
     # All of them before the first is measured.
     named = {name: load_objective(name) for name in (REFERENCE, *options.objectives)}
+    bandit = bandit_metadata(TASK)["sha256"]
     for name, objective in named.items():
-        if name in entries and entries[name]["objective_sha256"] != objective.sha256:
-            del entries[name]  # of another of this name
+        forget_other(entries, name, bandit)
+        forget_other(entries, name, objective.sha256, "objective_sha256")
         yield Part(("objectives", name), partial(measured, name, options))
 
 
@@ -83,7 +85,7 @@ measure = InParts(parts)
 def leads(report: Report) -> dict[str, dict[str, Estimate]]:
     """{objective: {horizon: how much more its agents earn than with PPO's clip}}, corrected for all together."""
     returns = {
-        name: {h: unpacked([line])[0] for h, line in entry["returns"].items()}
+        name: {h: unpacked_row(line) for h, line in entry["returns"].items()}
         for name, entry in report["objectives"].items()
     }
     reference = returns.pop(REFERENCE)

@@ -15,14 +15,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from experiments.claims import Claim
-from experiments.harness import (
-    CLASSIC_CONTROL,
-    Experiment,
-    Report,
-    bandit_of,
-    packed,
-    unpacked,
-)
+from experiments.harness import CLASSIC_CONTROL, Experiment, Report, bandit_of
 from experiments.parts import InParts, Part
 from scb import plotting
 from scb.analysis import figures
@@ -30,6 +23,7 @@ from scb.analysis.explain import explain
 from scb.analysis.importance import reward_variance
 from scb.analysis.planes import Plane
 from scb.analysis.states import bandit_states
+from scb.files import packed, unpacked
 from scb.keys import root_key, split_key
 from scb.measurement import Place
 from scb.statistics import Estimate, estimate

@@ -18,22 +18,22 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from experiments.claims import FAILS, HOLDS, Claim, Judged, judge, of_agents
-from experiments.harness import Experiment, Report, packed, settled, unpacked
+from experiments.harness import Experiment, Report, lost, settled
 from experiments.parts import InParts, Part, file_name
 from experiments.robustness import learned_for, named
 from lpo.comparison import compare, ppo_spec
 from lpo.figures import looks
-from lpo.objectives import REFERENCE, check_names, learned_in, load_objective
+from lpo.objectives import REFERENCE, REFERENCES, check_names, learned_in, load_objective
 from lpo.suite import suite
 from scb import plotting
 from scb.agents.spec import AgentSpec
 from scb.environments.registry import environment_spec
 from scb.errors import UserError, at_least
+from scb.files import packed_row, unpacked_row
 from scb.rows import Rows
 from scb.seeds import reporting, validation
 from scb.statistics import Estimate, stratified_estimate
 
-REFERENCES = (REFERENCE, "dpo")
 OFFSET = 15_000  # of the first seed, among those that report
 LARGE, SMALL = 0.003, 0.0003  # a rate of at least, and of at most, so much
 CHOOSING, REPORTED = "choosing", "reported"
@@ -117,7 +117,7 @@ def _trained(
         "learned_on": {name: learned_in([objective])},
         "failed": {name: {str(rate): found.failed}},
         **{
-            role: {name: {str(rate): packed([[earned[seed] for seed in of_it]])[0]}}
+            role: {name: {str(rate): packed_row([earned[seed] for seed in of_it])}}
             for role, of_it in seeds.items()
         },
     }
@@ -128,7 +128,7 @@ def scores(report: Report, role: str = REPORTED) -> Scores:
     return {
         environment: {
             name: {
-                float(rate): environment_spec(environment).score(unpacked([of_it[rate]])[0])
+                float(rate): environment_spec(environment).score(unpacked_row(of_it[rate]))
                 for rate in sorted(of_it, key=float)
             }
             for name, of_it in entry[role].items()
@@ -269,12 +269,7 @@ def facts(report: Report) -> dict[str, Any]:
         "less": {where: names for where, names in _shown(pairs, FAILS).items() if names},
         "own": {place: entry["own"] for place, entry in entries.items()},
         "steps": {place: entry["steps"] for place, entry in entries.items()},
-        "failed": sum(
-            number
-            for entry in entries.values()
-            for of_it in entry["failed"].values()
-            for number in of_it.values()
-        ),
+        "failed": lost(entries),
         "seeds": (reporting(1, offset=OFFSET)[0], validation()[0]),
     }
 

@@ -18,7 +18,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from experiments.claims import ENOUGH, Claim, of_searches
-from experiments.harness import Experiment, Report, packed, settled, unpacked
+from experiments.harness import Experiment, Report, settled
 from experiments.parts import InParts, Part
 from scb import plotting
 from scb.agents.spec import bandit_agent
@@ -26,6 +26,7 @@ from scb.environments.registry import environment_spec
 from scb.environments.synthetic import BanditConfig, SyntheticBandit, bandit_for
 from scb.errors import at_least
 from scb.expert_data import expert_dataset
+from scb.files import packed_row, unpacked
 from scb.fitting import fit_bandit
 from scb.keys import root_key, split_key
 from scb.measurement import Agents, Place, as_random, measure
@@ -114,7 +115,7 @@ def _searched(environment: str, name: str, seed: int, options: Options) -> dict[
             agents = Agents.drawn_from(spec, REPORTING.start, number)
             size = {"episodes": options.episodes, "side_by_side": number}
             returns = pivot(measure(spec, trained_in, place, agents, **size), "agent")
-            found["returns"][contexts][algorithm] = packed([as_random(returns, place)[0]])[0]
+            found["returns"][contexts][algorithm] = packed_row(as_random(returns, place)[0])
     print(f"{environment}, {name}, seed {seed}: {found}", flush=True)
     return found
 

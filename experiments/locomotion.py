@@ -11,7 +11,7 @@ and stand apart as "hopper at 0.0005".
 """
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -22,9 +22,9 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from experiments.claims import HOLDS
-from experiments.harness import Experiment, Report, packed
+from experiments.harness import Experiment, Report
 from experiments.locomotion_claims import ASKED, STATED, claims, confirmed, leading, since, texts
-from experiments.parts import InParts, Keys, Part, file_name, lacking
+from experiments.parts import InParts, Keys, Part, file_name
 from lpo import figures
 from lpo.comparison import Comparison, LearningCurves, changed, compare, ppo_spec
 from lpo.full_size import as_comparison, looked_at
@@ -32,7 +32,7 @@ from lpo.objectives import CLIPS, REFERENCE, learned_in, load_objective, zoo_nam
 from scb.agents.spec import AgentSpec
 from scb.agents.values import check_value
 from scb.errors import at_least, unused
-from scb.files import plain
+from scb.files import packed, plain
 from scb.rows import Rows
 from scb.seeds import reporting, validation
 from scb.statistics import DECIDING, Estimate, iqm
@@ -144,11 +144,8 @@ def _of(
             few: dict[Keys, int] = {
                 (*place, name, str(s)): s for s in seeds[start : start + options.together]
             }
-            left = lacking(report, path, few)
-            trained = partial(
-                _trained, path[1], environment, name, list(left.values()), options.runs, place, spec
-            )
-            yield Part(path, trained, tuple(left))
+            trained = partial(_trained, path[1], environment, name, options.runs, place, spec)
+            yield Part.lacking(report, path, few, trained)
 
 
 measure = InParts(parts)
@@ -204,10 +201,10 @@ def _trained(
     entry: str,
     environment: str,
     objective: str,
-    seeds: list[int],
     runs: Path,
     place: Keys,
     spec: AgentSpec,
+    seeds: list[int],
 ) -> dict[str, Any]:
     name = file_name(objective, *place[1:], str(seeds[0]))
     rows = Rows(runs / file_name(entry) / f"{name}.rows.jsonl")
@@ -278,16 +275,8 @@ def facts(report: Report) -> dict[str, Any]:
             for name, entry in report["environments"].items()
             if (sweep := swept(entry))
         },
-        "at_rates": {
-            name: rates
-            for name, entry in report["environments"].items()
-            if (rates := at_rates(name, entry))
-        },
-        "leads_at_rates": {
-            name: leads
-            for name, entry in report["environments"].items()
-            if (leads := leads_at_rates(name, entry))
-        },
+        "at_rates": _told(at_rates, report),
+        "leads_at_rates": _told(leads_at_rates, report),
         "led": {
             name: leading(curves)
             for name, comparison in comparisons.items()
@@ -299,6 +288,11 @@ def facts(report: Report) -> dict[str, Any]:
             if (curves := _diagnosed(comparison))
         },
     }
+
+
+def _told(of: Callable[[str, Report], Any], report: Report) -> dict[str, Any]:
+    """What it says of each entry, where that is anything."""
+    return {name: x for name, entry in report["environments"].items() if (x := of(name, entry))}
 
 
 def draw(report: Mapping[str, Any]) -> dict[str, Figure]:

@@ -20,8 +20,8 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from experiments.alignment import CONFIRMATION_SEED
-from experiments.harness import Experiment, Report, forget_other, packed, settled, unpacked
-from experiments.parts import InParts, Keys, Part, lacking
+from experiments.harness import Experiment, Report, forget_other, settled
+from experiments.parts import InParts, Keys, Part
 from lpo.alignment import Alignment, Regime, alignment, regime_fitness
 from lpo.comparison import LearningCurves, compare
 from lpo.fitness import FITNESSES, LABELS
@@ -32,6 +32,7 @@ from scb import plotting
 from scb.environments.registry import environment_spec
 from scb.environments.zoo import bandit_metadata
 from scb.errors import UserError, at_least
+from scb.files import packed, unpacked_row
 from scb.statistics import correlation_text, halves_agree, iqm
 
 PENDULUM, CARTPOLE = "Pendulum-v1", "CartPole-v1"
@@ -108,20 +109,16 @@ def parts(options: Options, report: dict[str, Any]) -> Iterator[Part]:
             places: dict[Keys, str] = {
                 ("fitness", objective): objective for objective in objectives
             }
-            left = lacking(report, path, places)
-            yield Part(
-                path, partial(_trained, of_it, digest, list(left.values()), options), tuple(left)
-            )
+            yield Part.lacking(report, path, places, partial(_trained, of_it, digest, options))
 
     names = list(dict.fromkeys(n for e in options.environments for n in validated(e)))
     for other in options.others:
         at = ("others", other)
         those: dict[Keys, str] = {(name,): name for name in names}
-        left = lacking(report, at, those)
-        yield Part(at, partial(_trained_in, other, list(left.values()), options), tuple(left))
+        yield Part.lacking(report, at, those, partial(_trained_in, other, options))
 
 
-def _trained_in(environment: str, names: list[str], options: Options) -> dict[str, Any]:
+def _trained_in(environment: str, options: Options, names: list[str]) -> dict[str, Any]:
     seeds = range(FIRST_SEED, FIRST_SEED + options.agents)
     return {
         curve.objective: dict(
@@ -131,7 +128,7 @@ def _trained_in(environment: str, names: list[str], options: Options) -> dict[st
     }
 
 
-def _trained(of_it: Regime, digest: str, names: list[str], options: Options) -> dict[str, Any]:
+def _trained(of_it: Regime, digest: str, options: Options, names: list[str]) -> dict[str, Any]:
     seeds = list(range(FIRST_SEED, FIRST_SEED + options.agents))
     found = regime_fitness(of_it, [load_objective(name) for name in names], seeds)
     return {
@@ -147,7 +144,7 @@ def fitness(
     entry: Mapping[str, Any], label: str, names: Iterable[str]
 ) -> dict[str, NDArray[np.floating]]:
     """{objective: [S]} what agents of these earned in a regime."""
-    return {name: unpacked([entry["fitness"][name][label]])[0] for name in names}
+    return {name: unpacked_row(entry["fitness"][name][label]) for name in names}
 
 
 def ranked(environment: str, regimes: Mapping[str, Any]) -> dict[str, LearningCurves]:
@@ -190,9 +187,7 @@ def ranked_elsewhere(report: Report) -> dict[str, dict[str, dict[str, Alignment]
         if len(curves) < 3 or not (others := report.get("others")):
             continue
         earned: dict[str, Any] = {
-            other: {
-                of: {name: unpacked([of_it[name][of]])[0] for name in curves} for of in OUTCOMES
-            }
+            other: {of: {name: unpacked_row(of_it[name][of]) for name in curves} for of in OUTCOMES}
             for other, of_it in others.items()
         }
         earned[TOGETHER] = {
@@ -344,7 +339,7 @@ def draw(report: Mapping[str, Any]) -> dict[str, Figure]:
         shown |= {
             f"environment: {name}": (
                 "return over the training",
-                {objective: unpacked([of_it[objective]["area"]])[0] for objective in everywhere},
+                {objective: unpacked_row(of_it[objective]["area"]) for objective in everywhere},
             )
             for name, of_it in report.get("others", {}).items()
         }

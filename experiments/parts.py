@@ -15,6 +15,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
@@ -43,6 +44,18 @@ class Part:
     measured: Callable[[], Any]
     names: tuple[Keys, ...] = ((),)
 
+    @classmethod
+    def lacking(
+        cls,
+        report: Mapping[str, Any],
+        path: Keys,
+        places: Mapping[Keys, T],
+        measured: Callable[[list[T]], Any],
+    ) -> "Part":
+        """Of the places below a path where the report has nothing: what belongs there is measured together."""
+        left = {keys: x for keys, x in places.items() if not _has(report, (*path, *keys))}
+        return cls(path, partial(measured, list(left.values())), tuple(left))
+
     @property
     def name(self) -> str:
         """Of the part alone, with what tells it from others at its path."""
@@ -50,7 +63,7 @@ class Part:
 
     def there(self, report: Mapping[str, Any]) -> bool:
         """Whether the report has it; None holds the place of what is to be measured again."""
-        return not lacking(report, self.path, dict.fromkeys(self.names))
+        return all(_has(report, (*self.path, *keys)) for keys in self.names)
 
     def add(self, found: Any, report: dict[str, Any]) -> None:
         """Puts what was measured into the report."""
@@ -66,11 +79,6 @@ class Part:
 def file_name(*parts: str) -> str:
     """For what has these names, of which an objective's may be a path."""
     return re.sub(r"[^\w.-]", "_", "-".join(parts))
-
-
-def lacking(report: Mapping[str, Any], path: Keys, places: Mapping[Keys, T]) -> dict[Keys, T]:
-    """Those of some places below a path where the report has nothing, with what belongs there."""
-    return {keys: x for keys, x in places.items() if not _has(report, (*path, *keys))}
 
 
 def _has(tree: Any, keys: Keys) -> bool:

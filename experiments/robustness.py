@@ -21,15 +21,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from experiments.claims import TENTH, Claim, Judged, judge
-from experiments.harness import (
-    Experiment,
-    Report,
-    finite,
-    packed,
-    plan_of,
-    settled,
-    unpacked,
-)
+from experiments.harness import Experiment, Report, finite, plan_of, settled
 from experiments.parts import InParts, Keys, Part
 from lpo.comparison import ppo_spec
 from lpo.objectives import REFERENCE, Objective, check_names, learned_in, load_objective
@@ -37,6 +29,7 @@ from lpo.suite import suite
 from scb.agents.spec import AgentSpec
 from scb.environments.registry import environment_spec
 from scb.errors import UserError, at_least, unused
+from scb.files import packed_row, unpacked_row
 from scb.measurement import Agents, Place, measure
 from scb.plotting import BLUE, VERMILLION, estimate_row, figure_title
 from scb.rows import Rows
@@ -169,12 +162,10 @@ def _trained(
     earned, failed = finite([row["return"] for row in rows], place)
     print(f"{environment}, {name}, {key}: {np.mean(earned):.4g}", flush=True)
     return {
-        "returns": {name: {key: packed([earned])[0]}},
+        "returns": {name: {key: packed_row(earned)}},
         "failed": {name: {key: failed}},
         "draws": {
-            key: {
-                x: packed([np.asarray(getattr(drawn.hyperparameters, x))])[0] for x in drawn.drawn
-            }
+            key: {x: packed_row(np.asarray(getattr(drawn.hyperparameters, x))) for x in drawn.drawn}
         },
         "learned_on": {name: learned_in(objectives)},
     }
@@ -193,7 +184,7 @@ def scores(report: Report) -> Scores:
         # In the order of their seeds, whatever ended first: draws are the same in all environments by it.
         settings = in_order(environment, entry["returns"].get(REFERENCE, ()))
         returns = {
-            name: np.concatenate([unpacked([lines[key]])[0] for key in settings])
+            name: np.concatenate([unpacked_row(lines[key]) for key in settings])
             for name, lines in entry["returns"].items()
             if settings and all(key in lines for key in settings)
         }

@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from matplotlib.figure import Figure
 
-from experiments.harness import Experiment, Report, finite, forget_other, packed, settled, unpacked
+from experiments.harness import Experiment, Report, finite, forget_other, settled
 from experiments.parts import InParts, Part
 from experiments.zoo_table import Candidate, bandits
 from experiments.zoo_table_page import BANDITS
@@ -32,6 +32,7 @@ from scb.aggregation import Learners
 from scb.analysis.optimal_actions import optimal_policy
 from scb.errors import at_least, one_of
 from scb.evaluation import evaluate
+from scb.files import packed_row, unpacked_row
 from scb.importer import PUBLISHED_BANDITS
 from scb.keys import named_key, root_key
 from scb.measurement import Place
@@ -145,7 +146,7 @@ def measured(candidate: Candidate, options: Options) -> dict[str, Any]:
         **earned_together(agent, acting, candidate, place, key),
         "returns": returns,
     }
-    found |= {name: packed([found[name]])[0] for name in (*OF_AGENTS, *OF_EPISODES)}
+    found |= {name: packed_row(found[name]) for name in (*OF_AGENTS, *OF_EPISODES)}
     said = {"bandit": candidate.kind, "sha256": candidate.sha256, "actions": shares.shape[-1]}
     return {**said, **found}
 
@@ -188,7 +189,7 @@ def facts(report: Report) -> dict[str, Any]:
     for environment, entry in report["environments"].items():
         for kind in (kind for kind in BANDITS if kind in entry):
             measured = (*OF_AGENTS, *OF_EPISODES)
-            dots = {name: unpacked([entry[kind][name]])[0] for name in measured}
+            dots = {name: unpacked_row(entry[kind][name]) for name in measured}
             estimates = {name: estimate(values) for name, values in dots.items()}
             label = {"environment": environment, "kind": kind, "label": f"{environment}, {kind}"}
             come = way(*(estimates[name] for name in ACTING))

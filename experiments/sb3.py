@@ -23,12 +23,13 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
 from experiments.claims import Claim, judge, of_agents
-from experiments.harness import Experiment, Report, bandit_of, packed, settled, unpacked
+from experiments.harness import Experiment, Report, bandit_of, settled
 from experiments.parts import InParts, Part
 from scb import plotting
 from scb.environments.registry import environment_spec
 from scb.environments.zoo import bandit_metadata, load_bandit
 from scb.errors import UserError, at_least, one_of
+from scb.files import packed_row, unpacked
 from scb.gymnasium import NAMESPACE
 from scb.judgement import check_fits
 from scb.measurement import Place
@@ -124,7 +125,7 @@ measure = InParts(parts)
 def _trained(python: str, job: Mapping[str, Any]) -> dict[str, str]:
     found = _said(python, json.dumps(job))
     print(job["train_in"], job["algorithm"], job["seed"], found["returns"], flush=True)
-    return {x: packed([found[x]])[0] for x in ("returns", "seconds")}
+    return {x: packed_row(found[x]) for x in ("returns", "seconds")}
 
 
 def _said(python: str, words: str) -> dict[str, Any]:

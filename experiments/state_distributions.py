@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 
 from experiments import experts
 from experiments.claims import Claim
-from experiments.harness import Experiment, Report, bandit_of, packed, unpacked
+from experiments.harness import Experiment, Report, bandit_of
 from experiments.interpretability import action_bar, draw_actions
 from experiments.parts import InParts, Part
 from scb import plotting
@@ -25,6 +25,7 @@ from scb.analysis.optimal_actions import first_action, optimal_actions
 from scb.analysis.planes import plane_for
 from scb.analysis.states import bandit_states, follow
 from scb.environments.synthetic import SyntheticBandit
+from scb.files import packed, unpacked
 from scb.keys import root_key, split_key
 from scb.seeds import ILLUSTRATING
 from scb.spaces import flat_bounds

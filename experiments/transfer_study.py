@@ -22,7 +22,7 @@ from matplotlib.ticker import MaxNLocator
 
 from experiments.claims import ENOUGH, FAILS, HOLDS, Claim, confidence, judge, of_searches
 from experiments.harness import Experiment, Report, plan_of, settled
-from experiments.parts import InParts, Keys, Part, lacking
+from experiments.parts import InParts, Keys, Part
 from experiments.searches import meta_training, objective_of_run
 from lpo.comparison import compare, ppo_spec
 from lpo.objectives import Objective, load_objective
@@ -217,17 +217,15 @@ def parts(options: Options, report: dict[str, Any]) -> Iterator[Part]:
     ):
         path = ("objectives", name)
         places: dict[Keys, Evaluation] = {("returns", at.name, seed): at for at in EVALUATIONS}
-        left = lacking(report, path, places)
         digest = report.get("objectives", {}).get(name, {}).get("digests", {}).get(seed)
-        judged = partial(_judged, name, seed, list(left.values()), digest, options)
-        yield Part(path, judged, tuple(left))
+        yield Part.lacking(report, path, places, partial(_judged, name, seed, digest, options))
 
 
 measure = InParts(parts)
 
 
 def _judged(
-    name: str, seed: str, left: Sequence[Evaluation], digest: str | None, options: Options
+    name: str, seed: str, digest: str | None, options: Options, left: Sequence[Evaluation]
 ) -> dict[str, Any]:
     """What an objective earns, and of one that was learned what that took.
 

@@ -15,15 +15,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from experiments.claims import UNDECIDED, Claim, judge
-from experiments.harness import (
-    CLASSIC_CONTROL,
-    Experiment,
-    Report,
-    Save,
-    bandit_of,
-    packed,
-    unpacked,
-)
+from experiments.harness import CLASSIC_CONTROL, Experiment, Report, Save, bandit_of
 from scb import plotting
 from scb.agents.spec import bandit_agent
 from scb.analysis import animation
@@ -32,6 +24,7 @@ from scb.analysis.states import follow
 from scb.environments.registry import environment_spec
 from scb.errors import UserError
 from scb.experts import best_agent
+from scb.files import packed, unpacked
 from scb.keys import root_key, split_key
 from scb.measurement import Judge
 from scb.statistics import DECIDING, Estimate, estimate

@@ -30,14 +30,23 @@ def pairs(
     """{(label, algorithm): {"ours": entry, "published": entry}}, in the table's order."""
     found: dict[tuple[str, str], dict[str, Mapping[str, Any]]] = {}
     for entry in sorted(entries, key=place):
-        found.setdefault((label(entry), entry["algorithm"]), {})[entry["bandit"]] = entry
+        found.setdefault((_label(entry), entry["algorithm"]), {})[entry["bandit"]] = entry
     return found
 
 
-def label(entry: Mapping[str, Any]) -> str:
+def label(environment: str, backend: str | None) -> str:
     """The environment, and for Brax its physics: one bandit can be measured in several."""
-    physics = entry.get("backend")
-    return f"{entry['environment']} ({physics})" if physics else entry["environment"]
+    return environment if backend is None else f"{environment} ({backend})"
+
+
+def of_label(name: str) -> tuple[str, str | None]:
+    """(environment, backend) of a label."""
+    environment, _, backend = name.removesuffix(")").partition(" (")
+    return environment, backend or None
+
+
+def _label(entry: Mapping[str, Any]) -> str:
+    return label(entry["environment"], entry.get("backend"))
 
 
 def rank(name: str, known: Sequence[str] = ENVIRONMENTS) -> tuple[int, str]:
@@ -66,7 +75,7 @@ def facts(report: Mapping[str, Any]) -> dict[str, Any]:
         "paper": _paper,
         "target": _target,
         "failed": [
-            f"{x['algorithm'].upper()} on {label(x)} ({x['bandit']}, {text}): {x[actions]['failed']} of {x['agents']}"
+            f"{x['algorithm'].upper()} on {_label(x)} ({x['bandit']}, {text}): {x[actions]['failed']} of {x['agents']}"
             for x in entries
             for actions, text in ACTIONS.items()
             if x[actions]["failed"]
@@ -242,8 +251,8 @@ _EXPERT: dict[str, Any] = {"color": plotting.BLACK, "linewidth": 1.4, "linestyle
 
 def _paper_expert(name: str) -> float | None:
     """What the paper's SAC agents earn in the environment itself, by label."""
-    environment, _, physics = name.removesuffix(")").partition(" (")
-    return paper_return(environment, "sac", physics or None)
+    environment, backend = of_label(name)
+    return paper_return(environment, "sac", backend)
 
 
 def paper_return(environment: str, algorithm: str, backend: str | None = None) -> float | None:
@@ -253,7 +262,7 @@ def paper_return(environment: str, algorithm: str, backend: str | None = None) -
 
 
 def _panel_title(environment: str, entries: Sequence[Mapping[str, Any]]) -> str:
-    of_it = [entry for entry in entries if label(entry) == environment]
+    of_it = [entry for entry in entries if _label(entry) == environment]
     if of_it[0]["backend"] is None:
         return environment
     episodes = either(entry["episodes"] for entry in of_it)

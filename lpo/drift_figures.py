@@ -15,7 +15,8 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import NullLocator
 from numpy.typing import NDArray
 
-from lpo.update_regions import CLIP, REGIONS, analyze
+from lpo.update_regions import REGIONS, analyze
+from scb.agents.drift import USUAL_CLIP
 from scb.errors import UserError
 from scb.plotting import (
     GREEN,
@@ -91,7 +92,7 @@ def drift_and_gradient(
                 rasterized=True,
             )
             for axes in row:
-                for x, linestyle in ((1.0, "-"), (1.0 - CLIP, ":"), (1.0 + CLIP, ":")):
+                for x, linestyle in ((1.0, "-"), (1.0 - USUAL_CLIP, ":"), (1.0 + USUAL_CLIP, ":")):
                     axes.axvline(x, color=GREY, linewidth=0.9, linestyle=linestyle)
                 axes.axhline(0.0, color=GREY, linewidth=0.9)
                 axes.grid(visible=False)

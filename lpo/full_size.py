@@ -15,6 +15,7 @@ import numpy as np
 from lpo.comparison import Comparison, LearningCurves
 from lpo.objectives import REFERENCE
 from scb.agents.ppo import DIAGNOSIS
+from scb.files import unpacked
 from scb.seeds import reporting
 
 PATH = Path(__file__).with_name("measured") / "locomotion.json"
@@ -164,4 +165,4 @@ def as_comparison(
 def _lines(of: str, agents: Mapping[str, Any], steps: Sequence[int]) -> np.ndarray:
     """[S, P] numbers that are kept in one line an agent; NaN where an agent has none."""
     unknown = " ".join(["nan"] * len(steps))
-    return np.array([[float(x) for x in a.get(of, unknown).split()] for a in agents.values()])
+    return unpacked([agent.get(of, unknown) for agent in agents.values()])

@@ -8,7 +8,8 @@ import numpy as np
 
 from lpo.figures import looks
 from lpo.objectives import Objective
-from lpo.update_regions import ADVANTAGES, CLIP, RATIOS, REGIONS, analyze, midpoints
+from lpo.update_regions import ADVANTAGES, RATIOS, REGIONS, USUAL_CLIP, analyze, midpoints
+from scb.agents.drift import USUAL_CLIP
 from scb.interactive import plotly, save_page, slider
 
 STEPS = np.delete(np.linspace(*ADVANTAGES, 25), 12)  # advantages of the slider, without the 0
@@ -90,7 +91,7 @@ def _curves(log_ratios: Any, found: Sequence[Any]) -> Any:
     figure.update_xaxes(
         type="log", title="ratio", tickvals=[0.5, 0.8, 1.0, 1.2, 2.0], range=np.log10(RATIOS)
     )
-    for ratio in (1.0 - CLIP, 1.0, 1.0 + CLIP):
+    for ratio in (1.0 - USUAL_CLIP, 1.0, 1.0 + USUAL_CLIP):
         figure.add_vline(ratio, line={"color": "#999", "dash": "dot", "width": 1})
     for level in (0.0, 1.0):
         figure.add_hline(level, line={"color": "#bbb", "width": 1}, row=1, col=2)

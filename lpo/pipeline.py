@@ -23,7 +23,7 @@ from lpo.meta_training import (
     environment_problem,
     learn_objective,
 )
-from lpo.objectives import Objective, load_objective
+from lpo.objectives import REFERENCES, Objective, load_objective
 from scb import plotting
 from scb.command_line import LongRun, Output
 from scb.configurations import config_dict
@@ -36,8 +36,6 @@ from scb.machine import machine_description, package_versions
 from scb.rows import Rows
 from scb.runs import Run, Stopwatch
 from scb.seeds import reporting
-
-REFERENCES = ("ppo", "dpo")  # that every run is compared with
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from pathlib import Path
 import tyro
 
 from lpo.drift_figures import drift_and_gradient
-from lpo.objectives import load_apart, load_objective
+from lpo.objectives import REFERENCES, load_apart, load_objective
 from lpo.page import save_objective_page
 from lpo.update_regions import REGIONS, analyze
 from scb import interactive, plotting
@@ -13,12 +13,10 @@ from scb.console import console
 from scb.errors import UserError
 from scb.files import make_folder, write_json
 
-BESIDE = ("ppo", "dpo")
-
 
 def show_command(
     objective: tyro.conf.Positional[str],
-    beside: tuple[str, ...] = BESIDE,
+    beside: tuple[str, ...] = REFERENCES,
     progress: float = 0.5,
     out: Path | None = None,
     html: bool = False,

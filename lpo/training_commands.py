@@ -17,7 +17,7 @@ from lpo import figures
 from lpo.alignment import Regime, known_drifts, measure_alignment
 from lpo.comparison import Comparison, LearningCurves, compare, ppo_spec
 from lpo.fitness import LABELS
-from lpo.objectives import Objective, learned_in, load_apart, load_objective, same_drift
+from lpo.objectives import REFERENCES, Objective, learned_in, load_apart, load_objective, same_drift
 from lpo.suite import SuiteScores, run_suite, suite_specs
 from lpo.suite import suite as suite_environments
 from scb import plotting
@@ -115,7 +115,7 @@ class EvaluateConfig(JudgedConfig):
     seeds: int = 10
     seed: int = 1000
     suite: str | None = None
-    objectives: tuple[str, ...] = ("ppo", "dpo")
+    objectives: tuple[str, ...] = REFERENCES
 
     def __post_init__(self) -> None:
         if not self.objectives:

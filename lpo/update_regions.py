@@ -16,13 +16,12 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
+from scb.agents.drift import USUAL_CLIP
 from scb.errors import UserError
 
 if TYPE_CHECKING:
     from lpo.objectives import Objective
 
-# PPO's usual clip epsilon: what "inside" and "beyond" refer to, for every objective.
-CLIP = 0.2
 # A twentieth of the surrogate's gradient counts as none; as much more or less as no change.
 TOLERANCE = 0.05
 RATIOS = (0.5, 2.0)
@@ -114,7 +113,7 @@ def analyze(
     relative = gradient / (np.exp(x) * a[:, None])
     regions = classify(relative, x, a)
     weights = np.broadcast_to(np.exp(-0.5 * a**2)[:, None], regions.shape)
-    past = (x * a[:, None] > 0.0) & (np.abs(np.expm1(x)) > CLIP)
+    past = (x * a[:, None] > 0.0) & (np.abs(np.expm1(x)) > USUAL_CLIP)
     signs = {"positive": a > 0.0, "negative": a < 0.0}
     return Analysis(
         objective=objective.name,
@@ -139,7 +138,7 @@ def classify(
     """[A, R] relative gradients, [R], [A] -> [A, R] indices into `REGIONS`, whose texts define them."""
     names = list(REGIONS)
     forward = log_ratios * advantages[:, None] > 0.0
-    inside = np.broadcast_to(np.abs(np.expm1(log_ratios)) <= CLIP, relative.shape)
+    inside = np.broadcast_to(np.abs(np.expm1(log_ratios)) <= USUAL_CLIP, relative.shape)
     conditions = {
         "rolls back": forward & (relative < -TOLERANCE),
         "flat": forward & (np.abs(relative) <= TOLERANCE),

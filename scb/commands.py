@@ -13,6 +13,7 @@ from scb import experts, processes
 from scb.agents.spec import bandit_agent
 from scb.command_line import LongRun, Measuring, SharedOutput, flags
 from scb.console import console
+from scb.curriculum import paper_generations
 from scb.discovery import BanditDiscovery, DiscoveryConfig
 from scb.environments.registry import environment_spec
 from scb.environments.zoo import load_synthetic, save_bandit
@@ -44,16 +45,6 @@ def _quick(given: Mapping[str, str]) -> DiscoveryConfig:
 # columns Pendulum, Brax and classic control.
 _PAPER_OUTER_LOOP = {"Pendulum-v1": (64, 8, 50, "all"), "brax": (256, 1, 16, "sequential")}
 _PAPER_OUTER_LOOP_ELSEWHERE = (128, 1, 50, "all")
-# Table "Number of generations for each environment"; 300 elsewhere.
-_PAPER_GENERATIONS = {
-    "MountainCar-v0": 1000,
-    "Pendulum-v1": 1000,
-    "reacher": 30,
-    "pusher": 100,
-    **dict.fromkeys(
-        ("hopper", "walker2d", "swimmer", "halfcheetah", "ant", "humanoidstandup"), 2000
-    ),
-}
 
 
 def _paper(given: Mapping[str, str]) -> DiscoveryConfig:
@@ -72,7 +63,7 @@ def _paper(given: Mapping[str, str]) -> DiscoveryConfig:
         init="random",
         evolution=EvolutionConfig(
             population_size=population,
-            num_generations=_PAPER_GENERATIONS.get(name, 300),
+            num_generations=paper_generations(name),
             combine="mean",
         ),
     )

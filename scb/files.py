@@ -4,11 +4,12 @@ import contextlib
 import errno
 import json
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NoReturn
 
 import numpy as np
+from numpy.typing import NDArray
 
 from scb.errors import UserError
 
@@ -69,6 +70,26 @@ def plain(number: Any) -> float | int | None:
     if not np.isfinite(number):
         return None
     return int(number) if isinstance(number, int | np.integer) else float(number)
+
+
+def packed_row(row: Iterable[float]) -> str:
+    """[M] numbers in one string, to four digits: one number a line would make a file of JSON unreadable."""
+    return " ".join(f"{x:.4g}" for x in row)
+
+
+def unpacked_row(line: str) -> NDArray[np.floating]:
+    """What `packed_row` packed."""
+    return np.array([float(x) for x in line.split()])
+
+
+def packed(rows: Iterable[Iterable[float]]) -> list[str]:
+    """[N, M] numbers, a string a row."""
+    return [packed_row(row) for row in rows]
+
+
+def unpacked(lines: Iterable[str]) -> NDArray[np.floating]:
+    """What `packed` packed."""
+    return np.array([unpacked_row(line) for line in lines])
 
 
 def write_together(contents: Mapping[Path, bytes]) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 
 from lpo.drifts.bases import BASES
 from scb import own
-from scb.agents.drift import relu
+from scb.agents.drift import USUAL_CLIP, relu
 from scb.errors import UserError, at_least, one_of, positive
 from scb.keys import root_key
 
@@ -132,7 +132,7 @@ class CorrectedDrift(Drift):
     always_holds: ClassVar[bool] = True
 
     base: str = "ppo"
-    clip: float = 0.2
+    clip: float = USUAL_CLIP
     xi: float = 1e-6
     gate: float = 0.1
 

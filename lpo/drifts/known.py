@@ -10,7 +10,7 @@ import numpy as np
 
 from lpo.drifts.bases import DPO_ALPHA, DPO_BETA, discovered_drift
 from lpo.drifts.contract import Array, Drift
-from scb.agents.drift import clipped_surrogate_drift
+from scb.agents.drift import USUAL_CLIP, clipped_surrogate_drift
 from scb.errors import UserError, positive
 from scb.keys import root_key
 
@@ -21,7 +21,7 @@ class ClipDrift(Drift):
 
     name: ClassVar[str] = "clip"
 
-    clip: float = 0.2
+    clip: float = USUAL_CLIP
 
     def __post_init__(self) -> None:
         _check(clip=self.clip)

@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 
 from experiments import horizons as module
-from experiments.harness import packed
 from scb.environments.registry import environment_spec
 from scb.errors import UserError
+from scb.files import packed_row
 
 NOISE = np.random.default_rng(0).normal(size=(2, 40)) / 10
 
 
 def entry(*means):
-    returns = {h: packed([m + NOISE[0]])[0] for h, m in zip(("1", "8"), means, strict=True)}
+    returns = {h: packed_row(m + NOISE[0]) for h, m in zip(("1", "8"), means, strict=True)}
     return {"sha256": "", "objective_sha256": "", "returns": returns}
 
 
@@ -29,7 +29,7 @@ def test_leads_are_of_the_same_agents(report):
     # The noise is the same with either, to the four digits that are kept.
     assert found["dpo"]["8"].value == pytest.approx(0.5, abs=1e-3)
     assert found["ta-lpo"]["8"].low == pytest.approx(-1.0, abs=2e-2)
-    shuffled = packed([5.5 + NOISE[1]])[0]
+    shuffled = packed_row(5.5 + NOISE[1])
     report["objectives"]["dpo"]["returns"]["8"] = shuffled
     assert module.leads(report)["dpo"]["8"].low < 0.49
 
@@ -69,11 +69,12 @@ def test_agents_are_trained_for_as_long_as_is_asked(monkeypatch, tmp_path):
     assert others == ["1", "2", "3", "4", "5", "6", "7", "8", "9"]
     assert list(report["objectives"]) == ["ppo", "dpo"] and set(lengths) == {10}
     assert json.loads(json.dumps(report))["horizons"] == [0.5, 2.0]
-    # What is there is not measured again, but for an objective that has become another.
-    report["objectives"]["dpo"]["objective_sha256"] = "of another"
-    lengths.clear()
-    module.measure(out, report, lambda: None)
-    assert len(lengths) == 1  # traced once for all lengths
+    # What is there is not measured again, but for an objective or a bandit that has become another.
+    for digest in ("objective_sha256", "sha256"):
+        report["objectives"]["dpo"][digest] = "of another"
+        lengths.clear()
+        module.measure(out, report, lambda: None)
+        assert len(lengths) == 1  # traced once for all lengths
     for wrong in ({"horizons": ()}, {"horizons": (0.0,)}, {"agents": 3}):
         with pytest.raises(UserError):
             module.Options(**wrong)

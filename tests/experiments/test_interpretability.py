@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from experiments import interpretability
-from experiments.harness import CLASSIC_CONTROL, unpacked
+from experiments.harness import CLASSIC_CONTROL
+from scb.files import unpacked
 
 COMMITTED = Path(__file__).parents[2] / "docs" / "data" / "interpretability.json"
 

@@ -7,9 +7,9 @@ import pytest
 
 from experiments import claims
 from experiments import learning_rates as module
-from experiments.harness import packed
 from lpo.comparison import Comparison, LearningCurves
 from scb.environments.registry import environment_spec
+from scb.files import packed_row
 from scb.seeds import REPORTING, VALIDATING
 
 RATES = (0.0003, 0.003, 0.01)
@@ -25,7 +25,7 @@ def packed_scores(environment, scores, number, seed):
     own -= own.mean(axis=1, keepdims=True)
     return {
         name: {
-            str(rate): packed([random + (best - random) * (x + scatter + little)])[0]
+            str(rate): packed_row(random + (best - random) * (x + scatter + little))
             for rate, x in zip(RATES, of_it, strict=True)
         }
         for (name, of_it), little in zip(scores.items(), own, strict=True)

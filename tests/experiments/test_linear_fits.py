@@ -5,8 +5,8 @@ import pytest
 
 from experiments import linear_fits as module
 from experiments.claims import FAILS, HOLDS, UNDECIDED, UNTESTED
-from experiments.harness import packed
 from scb.errors import UserError
+from scb.files import packed_row
 
 FIVE = range(20, 25)
 
@@ -21,8 +21,8 @@ def entry(seeds, ppo):
             "steps": 9,
             "returns": {
                 contexts: {
-                    "ppo": packed([level * share + little])[0],
-                    "td3": packed([2500 + little[:4]])[0],
+                    "ppo": packed_row(level * share + little),
+                    "td3": packed_row(2500 + little[:4]),
                 }
                 for contexts, share in zip(module.CONTEXTS, (0.5, 0.5, 1.0), strict=True)
             },
@@ -58,7 +58,7 @@ def test_searches_are_paired_by_seed_in_whatever_order_they_ended():
     for level, seed in enumerate(FIVE):
         for kind in entry.values():
             arms = kind[str(seed)]["returns"]
-            arms["stretched and jittered"]["ppo"] = packed([np.full(12, 100.0 * level)])[0]
+            arms["stretched and jittered"]["ppo"] = packed_row(np.full(12, 100.0 * level))
     before = [x.estimate for x in module.EXPERIMENT.judged(found)]
     entry["errors"] = dict(reversed(entry["errors"].items()))
     assert [x.estimate for x in module.EXPERIMENT.judged(found)] == before

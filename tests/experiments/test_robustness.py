@@ -11,11 +11,11 @@ import pytest
 import lpo
 from experiments import robustness as module
 from experiments.claims import FAILS, HOLDS
-from experiments.harness import packed
 from lpo.comparison import ppo_spec
 from lpo.objectives import load_objective
 from scb.environments.registry import environment_spec
 from scb.errors import UserError
+from scb.files import packed_row
 from scb.measurement import Agents
 from scb.seeds import REPORTING, VALIDATING
 
@@ -29,7 +29,7 @@ def entry(environment, learned_on=(), **scores):
     little = np.linspace(-0.01, 0.01, 20)
     return {
         "returns": {
-            name.replace("_", "-"): {KEY: packed([random + (best - random) * (x + little)])[0]}
+            name.replace("_", "-"): {KEY: packed_row(random + (best - random) * (x + little))}
             for name, x in scores.items()
         },
         "failed": {name.replace("_", "-"): {KEY: 0} for name in scores},
@@ -95,7 +95,7 @@ def test_an_objective_with_fewer_draws_is_left_out_until_it_has_them(report):
 
 
 def test_without_a_published_expert_the_best_agents_are_the_scale(report):
-    games = {"returns": {"ppo": {KEY: packed([np.arange(101)])[0]}}}
+    games = {"returns": {"ppo": {KEY: packed_row(np.arange(101))}}}
     report["environments"] = {"Asterix-MinAtar": games}
     found = module.scores(report)["Asterix-MinAtar"]["ppo"]
     random = environment_spec("Asterix-MinAtar").random_return()
@@ -131,7 +131,7 @@ def test_all_objectives_meet_the_same_draws(tmp_path, monkeypatch):
     key = "2 of num_epochs 4, num_minibatches 4"
     # What ends in NaN counts as random actions.
     random = environment_spec("CartPole-v1").random_return()
-    assert found["returns"]["ppo"][key] == packed([[random, 9.0]])[0]
+    assert found["returns"]["ppo"][key] == packed_row([random, 9.0])
     assert found["failed"]["ppo"][key] == 1
     assert load_objective("lpo-multi").name in found["returns"]
 

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from experiments import state_distributions as experiment
-from experiments.harness import packed, unpacked
+from scb.files import packed, unpacked
 
 LIMITS = [[0.0, 1.0], [0.0, 1.0]]
 
