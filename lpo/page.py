@@ -8,7 +8,7 @@ import numpy as np
 
 from lpo.figures import looks
 from lpo.objectives import Objective
-from lpo.update_regions import ADVANTAGES, RATIOS, REGIONS, USUAL_CLIP, analyze, midpoints
+from lpo.update_regions import ADVANTAGES, RATIOS, REGIONS, analyze, midpoints
 from scb.agents.drift import USUAL_CLIP
 from scb.interactive import plotly, save_page, slider
 
