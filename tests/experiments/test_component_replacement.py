@@ -1,6 +1,3 @@
-import json
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -19,12 +16,10 @@ from experiments.component_replacement import (
 )
 from scb.statistics import iqm
 
-COMMITTED = Path(__file__).parents[2] / "docs" / "data" / "component_replacement.json"
-
 
 @pytest.fixture
-def report():
-    return json.loads(COMMITTED.read_text())
+def report(committed):
+    return committed("component_replacement")
 
 
 def with_returns(bandit, *experts):

@@ -1,18 +1,12 @@
-import copy
-import json
-from pathlib import Path
-
 import pytest
 
 from experiments import experts
 from experiments.harness import CLASSIC_CONTROL
 
-COMMITTED = Path(__file__).parents[2] / "docs" / "data" / "experts.json"
-
 
 @pytest.fixture
-def report():
-    return json.loads(COMMITTED.read_text())
+def report(committed):
+    return committed("experts")
 
 
 def test_an_expert_is_trained_and_judged_on_as_many_episodes_as_asked(small_agents):
@@ -42,18 +36,17 @@ def test_the_committed_experts_are_near_optimal(report):
 
 
 def test_an_expert_is_next_to_the_papers_by_its_whole_interval(report):
-    changed = copy.deepcopy(report)
-    for name, entry in changed["environments"].items():
+    for name, entry in report["environments"].items():
         entry["returns"] = [experts.paper(name).value] * 10
-    assert {x.outcome for x in experts.EXPERIMENT.judged(changed)} == {"holds"}
-    said = experts.EXPERIMENT.block("verdict", changed)
+    assert {x.outcome for x in experts.EXPERIMENT.judged(report)} == {"holds"}
+    said = experts.EXPERIMENT.block("verdict", report)
     assert "every expert is next to the paper's or above it." in said
     # Reaching the paper's level with the better end of a wide interval decides nothing.
-    changed["environments"]["Acrobot-v1"]["returns"] = [-76.7] * 5 + [-500.0] * 5
-    changed["environments"]["Pendulum-v1"]["returns"] = [-300.0] * 10
-    said = experts.EXPERIMENT.block("verdict", changed)
+    report["environments"]["Acrobot-v1"]["returns"] = [-76.7] * 5 + [-500.0] * 5
+    report["environments"]["Pendulum-v1"]["returns"] = [-300.0] * 10
+    said = experts.EXPERIMENT.block("verdict", report)
     assert "not shown to be next to the paper's in Acrobot-v1 and Pendulum-v1." in said
-    found = [x.outcome for x in experts.EXPERIMENT.judged(changed)]
+    found = [x.outcome for x in experts.EXPERIMENT.judged(report)]
     assert found == ["undecided"] + ["holds"] * 3 + ["does not hold"]
 
 

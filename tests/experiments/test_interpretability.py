@@ -1,15 +1,9 @@
-import copy
-import json
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 from experiments import interpretability
 from experiments.harness import CLASSIC_CONTROL
 from scb.files import unpacked
-
-COMMITTED = Path(__file__).parents[2] / "docs" / "data" / "interpretability.json"
 
 
 def test_one_environment_is_examined(monkeypatch):
@@ -34,27 +28,26 @@ def test_one_environment_is_examined(monkeypatch):
 
 
 @pytest.fixture
-def report():
-    return json.loads(COMMITTED.read_text())
+def report(committed):
+    return committed("interpretability")
 
 
 def test_claims_follow_the_figures(report):
-    changed = copy.deepcopy(report)
 
     def share(value):
         return {"value": value, "low": value - 0.01, "high": value + 0.01, "n": 20}
 
-    for name, x in changed["environments"]["Acrobot-v1"]["importance"].items():
+    for name, x in report["environments"]["Acrobot-v1"]["importance"].items():
         x |= share(0.5 if "velocity" in name else 0.01)
     for name in ("position (m)", "angle (rad)"):
-        changed["environments"]["CartPole-v1"]["importance"][name] |= share(0.02)
-    said = interpretability.EXPERIMENT.block("verdict", changed)
+        report["environments"]["CartPole-v1"]["importance"][name] |= share(0.02)
+    said = interpretability.EXPERIMENT.block("verdict", report)
     assert "causes 50%, its other angular velocity 50%, and no angle more than 1%." in said
-    found = [x.outcome for x in interpretability.EXPERIMENT.judged(changed)]
+    found = [x.outcome for x in interpretability.EXPERIMENT.judged(report)]
     assert found == ["holds"] * 4 + ["does not hold"]
     # A share whose interval reaches over the tenth is undecided, wherever its point is.
-    changed["environments"]["CartPole-v1"]["importance"]["angle (rad)"] |= share(0.095)
-    assert interpretability.EXPERIMENT.judged(changed)[2].outcome == "undecided"
+    report["environments"]["CartPole-v1"]["importance"]["angle (rad)"] |= share(0.095)
+    assert interpretability.EXPERIMENT.judged(report)[2].outcome == "undecided"
 
 
 def test_the_figure_has_a_map_and_bars_of_each_environment(report):

@@ -1,4 +1,3 @@
-import json
 from pathlib import Path
 
 import numpy as np
@@ -8,12 +7,10 @@ from PIL import Image
 from experiments import visualize
 from experiments.harness import CLASSIC_CONTROL
 
-COMMITTED = Path(__file__).parents[2] / "docs" / "data" / "visualize.json"
-
 
 @pytest.fixture
-def report():
-    return json.loads(COMMITTED.read_text())
+def report(committed):
+    return committed("visualize")
 
 
 def test_the_strip_shows_an_episode_from_its_start_to_its_end(report):
@@ -35,7 +32,7 @@ def test_gifs_are_made_from_the_report(report, tmp_path):
 def test_an_agent_is_trained_in_its_bandit_and_shown(monkeypatch):
     monkeypatch.setattr(visualize, "CLASSIC_CONTROL", ("CartPole-v1",))
     # As if the run had been interrupted with Hopper done, whose page is there.
-    monkeypatch.setattr(visualize, "VIEWER", COMMITTED)
+    monkeypatch.setattr(visualize, "VIEWER", Path(__file__))
     found, saved = {"environments": {visualize.HOPPER: {}}}, []
     plan = {"agents": 2, "episodes": 2, "seed": 1, "every": 50}
     visualize.measure(plan, found, lambda: saved.append(1))

@@ -48,9 +48,7 @@ def test_a_bandit_enters_with_its_weights_unchanged(tmp_path, capsys):
 
 
 @pytest.mark.parametrize("name", zoo_names())
-def test_the_zoo_holds_what_the_committed_table_says(name):
-    with open("docs/data/zoo_table.json") as file:
-        table = json.load(file)
+def test_the_zoo_holds_what_the_committed_table_says(committed, name):
     metadata = bandit_metadata(name)
-    measured = zoo_bandit.results_of(table, metadata["sha256"])
+    measured = zoo_bandit.results_of(committed("zoo_table"), metadata["sha256"])
     assert not measured or metadata["results"] == measured

@@ -2,7 +2,6 @@
 
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -344,9 +343,8 @@ def test_a_bandit_stands_in_the_table_once_for_every_physics():
     ]
 
 
-def test_the_committed_measurements_are_of_todays_inner_loops():
+def test_the_committed_measurements_are_of_todays_inner_loops(committed):
     # So that the command goes on from them instead of measuring all of it again.
-    stored = json.loads(Path("docs/data/zoo_table.json").read_text())["entries"]
-    for found in stored:
+    for found in committed("zoo_table")["entries"]:
         spec = bandit_agent(found["algorithm"], found["environment"])
         assert found["inner_loop"] == zoo_table.inner_loop(spec)
