@@ -24,7 +24,6 @@ project deals its population out to them, rejax leaves that to XLA.
 
 import json
 import os
-import subprocess
 import sys
 import tempfile
 import time
@@ -36,11 +35,11 @@ import jax
 import numpy as np
 
 import scb
-from experiments.harness import Experiment, Save, bandit_of, settled
+from experiments.harness import Experiment, Save, bandit_of, last_line, settled
 from scb.agents.spec import bandit_agent
 from scb.artefacts import flatten
 from scb.environments.zoo import space_description
-from scb.errors import UserError, one_of
+from scb.errors import UserError, at_least, one_of
 from scb.keys import named_key, root_key, split_key
 from scb.population import map_population
 from scb.statistics import Estimate, estimate
@@ -254,26 +253,26 @@ class Options:
     def __post_init__(self) -> None:
         if self.rejax_python is not None and not os.access(self.rejax_python, os.X_OK):
             raise UserError(f"{self.rejax_python} is no program: give another --rejax-python.")
+        at_least(1, self, "steps")
+        for name in self.algorithms.split(","):
+            one_of("algorithm", name, TASKS)
 
 
 def measure(options: Options, report: dict[str, Any], save: Save) -> None:
     """An algorithm at a time, here and there."""
-    names = options.algorithms.split(",")
-    for name in names:
-        one_of("algorithm", name, TASKS)
     print(f"Training for {options.steps} steps in the bandit; median seconds an agent.")
     print(f"Return in the real environment: IQM [95 %] of agents, {EPISODES} episodes each.\n")
     print(line("algorithm", THIS, PEER, "ratio", f"return, {THIS}", f"return, {PEER}"), flush=True)
     settled(report, steps=options.steps, episodes=EPISODES)
     results = report.setdefault("algorithms", {})
-    for name in names:
+    for name in options.algorithms.split(","):
         own = f"from experiments import benchmark; benchmark.print_measured({name!r}, {options.steps})"
-        measured = {THIS: _json_of([sys.executable, "-c", own])}
+        measured = {THIS: last_line([sys.executable, "-c", own])}
         if options.rejax_python is not None:
             with tempfile.TemporaryDirectory() as folder:
                 job = write_rejax_job(Path(folder), TASKS[name], options.steps)
                 peer = [str(options.rejax_python), str(PEER_SCRIPT), str(job)]
-                measured[PEER] = _json_of(peer)
+                measured[PEER] = last_line(peer)
         results[name] = summary(TASKS[name], measured)
         print(row(name, results[name]), flush=True)
         save()
@@ -284,11 +283,6 @@ def measure(options: Options, report: dict[str, Any], save: Save) -> None:
 def print_measured(name: str, steps: int) -> None:
     """What a process of its own does."""
     print(json.dumps(measure_this_project(TASKS[name], steps)))
-
-
-def _json_of(command: list[str]) -> dict[str, list[float]]:
-    completed = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)
-    return dict(json.loads(completed.stdout.strip().splitlines()[-1]))
 
 
 EXPERIMENT = Experiment(

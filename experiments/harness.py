@@ -10,6 +10,7 @@ import importlib
 import json
 import shlex
 import shutil
+import subprocess
 import time
 import tomllib
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -293,6 +294,18 @@ def plan_of(name: str) -> dict[str, Any]:
 def exit_status(name: str, command: Callable[[], int]) -> int:
     """What a command returns, or what it is where it fails for a reason that a user can see to, with a sentence."""
     return exit_code(name, command, AGAIN)
+
+
+def last_line(command: Sequence[str]) -> dict[str, Any]:
+    """What a process prints at its end, as JSON.
+
+    Raises:
+      UserError: it failed; what it said of that is on stderr.
+    """
+    done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=False)
+    if done.returncode:
+        raise UserError(f"an agent could not be trained: {shlex.join(command)} says why.")
+    return dict(json.loads(done.stdout.strip().splitlines()[-1]))
 
 
 def complete(report: Report) -> bool:

@@ -10,7 +10,6 @@ it), in which every agent is a process. What --out holds already is not trained 
 """
 
 import json
-import subprocess
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -23,7 +22,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
 from experiments.claims import Claim, judge, of_agents
-from experiments.harness import Experiment, Report, bandit_of, settled
+from experiments.harness import Experiment, Report, bandit_of, last_line, settled
 from experiments.parts import InParts, Part
 from scb import plotting
 from scb.environments.registry import environment_spec
@@ -103,7 +102,7 @@ def parts(options: Options, report: dict[str, Any]) -> Iterator[Part]:
         sums = {name: bandit_of(name)[1] for name in options.environments}
         settled(report.setdefault("bandits", {}), **sums)  # of the zoo, by checksum
     python = str(options.python)
-    yield Part(("peer_versions",), partial(_said, python, "versions"))
+    yield Part(("peer_versions",), partial(last_line, [python, str(PEER_SCRIPT), "versions"]))
     for seed in reporting(options.seeds):
         for name, algorithm, place in cells(options):
             job = {
@@ -123,18 +122,9 @@ measure = InParts(parts)
 
 
 def _trained(python: str, job: Mapping[str, Any]) -> dict[str, str]:
-    found = _said(python, json.dumps(job))
+    found = last_line([python, str(PEER_SCRIPT), json.dumps(job)])
     print(job["train_in"], job["algorithm"], job["seed"], found["returns"], flush=True)
     return {x: packed_row(found[x]) for x in ("returns", "seconds")}
-
-
-def _said(python: str, words: str) -> dict[str, Any]:
-    """What the peer prints at its end, as JSON."""
-    command = [python, str(PEER_SCRIPT), words]
-    done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=False)
-    if done.returncode:
-        raise UserError(f"an agent could not be trained: {' '.join(command)} says why.")
-    return dict(json.loads(done.stdout.strip().splitlines()[-1]))
 
 
 def cells(options: Options) -> Iterator[tuple[str, str, str]]:

@@ -79,10 +79,13 @@ class Options:
     agents: int = 16
     episodes: int = 20
 
+    def __post_init__(self) -> None:
+        at_least(2, self, "agents")  # a single one has no interval
+        at_least(1, self, "episodes")
+
 
 def measure(options: Options, report: dict[str, Any], save: Save) -> None:
     """An environment at a time."""
-    at_least(2, options, "agents")  # a single one has no interval
     settled(report, seed=SEED, agents=options.agents, episodes=options.episodes)
     report.setdefault("environments", {})
     for name in options.environment:

@@ -82,6 +82,9 @@ class Options:
     """Brax's physics"""
     skip_brax: bool = False
 
+    def __post_init__(self) -> None:
+        at_least(1, self, "agents", "episodes", "brax_episodes")
+
 
 def candidates(
     names: Sequence[str] | None, published: Path | None, skip_brax: bool = False
@@ -230,7 +233,6 @@ def differences(entries: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
 
 def measure(options: Options, report: dict[str, Any], save: Save) -> None:
     """All bandits. Entries that are there already stay, so several commands may have made them."""
-    at_least(1, options, "agents", "episodes", "brax_episodes")
     # No path of this machine is in it.
     published = options.published and Path("DIRECTORY")
     names = tuple(Path(name).name for name in options.bandits)
