@@ -334,9 +334,11 @@ def compare(
 @contextmanager
 def _kept(rows: str | Path | Rows | None) -> Iterator[Rows | None]:
     """Within it a file of rows is this process's: two would each drop what the other has added."""
-    if not isinstance(rows, str | Path):
+    if rows is None or isinstance(rows, Rows):
         yield rows
         return
+    if not isinstance(rows, str | Path):
+        raise UserError(f"rows are {rows!r}: give the path of a .jsonl file, or None.")
     file = Path(rows)
     if not file.exists():
         Rows(file)  # refuses a name before a folder is made

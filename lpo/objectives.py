@@ -201,6 +201,12 @@ def load_apart(names: Iterable[Named] | Mapping[str, Named]) -> list[Objective]:
             "the objectives are a set, which has no order: give a list, with whose first the others are compared."
         )
     if isinstance(names, Mapping):
+        for name in names:
+            if not isinstance(name, str):
+                raise UserError(
+                    f"an objective is named {name!r}, which is no text: give a dict of texts, such as "
+                    f"{{{str(name)!r}: ...}}."
+                )
         return [replace(load_objective(of), name=name) for name, of in names.items()]
     names = list(names)
     loaded = [load_objective(name) for name in names]
@@ -274,12 +280,12 @@ def save_objective(
             f"something of the class {type(drift).__name__} is no drift: give that of the search's configuration, or "
             "an objective's objective.drift with its objective.parameters."
         )
+    if not isinstance(drift.init(root_key(0)), Mapping):
+        raise UserError(
+            f"a drift of the family {drift.name} is its settings, and its parameters are no dict to be saved: name "
+            "the objective, such as ppo-0.3."
+        )
     if not isinstance(parameters, Mapping):
-        if not isinstance(drift.init(root_key(0)), Mapping):
-            raise UserError(
-                f"a drift of the family {drift.name} is its settings, and its parameters are no dict to be saved: name "
-                "the objective, such as ppo-0.3."
-            )
         raise UserError(
             f"the parameters of a drift of the family {drift.name} are a dict of arrays, and not of the class "
             f"{type(parameters).__name__}: of a search give outcome.mean."

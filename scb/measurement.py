@@ -307,6 +307,8 @@ def measure(
         )
         for name, objective in named.items()
     }
+    if any(set(agents.names) - cell.done.keys() for cell in cells.values()):
+        rows.expect_writable()
     # Physics take a minute to compile, however short the training.
     for drift, parameters in programs_for(objectives, shared=train_in.backend is not None):
         agent = spec.agent(train_in.env, drift)

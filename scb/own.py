@@ -1,10 +1,12 @@
 """Somebody's own code by name, `package.module:attribute`, of a module that Python finds from the working directory."""
 
 import contextlib
+import copyreg
 import dis
 import hashlib
 import importlib
 import json
+import logging
 import re
 import sys
 import sysconfig
@@ -105,10 +107,10 @@ class _Reading:
       own: names of somebody's own functions and classes that were met.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, around: Iterable[int] = ()) -> None:
         self.own: list[str] = []
         self._met: dict[int, Any] = {}  # held, so that nothing else comes to be where one was
-        self._around: set[int] = set()  # containers that are being read
+        self._around = set(around)  # what is being read: containers, and objects
 
     def of(self, value: Any) -> Any:
         match value:
@@ -122,7 +124,15 @@ class _Reading:
                 return value.__name__
         if id(value) in self._met:
             return "as before"
+        if id(value) in self._around:
+            return "around"
         self._met[id(value)] = value
+        self._around.add(id(value))
+        said = self._object(value)
+        self._around.discard(id(value))
+        return said
+
+    def _object(self, value: Any) -> Any:
         match value:
             case FunctionType():
                 return self._function(value)
@@ -147,12 +157,13 @@ class _Reading:
                     str(array.shape),
                     hashlib.sha256(array.tobytes()).hexdigest(),
                 ]
+            case logging.Logger():  # computes nothing, and holds what the process has opened
+                return _called(type(value))
+            case jax.custom_vjp() | jax.custom_jvp() if _is_somebodys(value):
+                return ["derivative", self.of(_without_names(vars(value)))]
         if hasattr(value, "__wrapped__"):  # by a decorator such as jax.jit
             return ["wrapped", self.of(value.__wrapped__)]
-        held = getattr(value, "__dict__", {})
-        if is_dataclass(value):
-            held = {f.name: getattr(value, f.name) for f in fields(value)}
-        return [self.of(type(value)), self.of(held)]
+        return [self.of(type(value)), self.of(_held(value))]
 
     def _container(self, value: Any) -> Any:
         if id(value) in self._around:
@@ -171,7 +182,7 @@ class _Reading:
 
     def _apart(self, value: Any) -> str:
         """What a value says by itself, whatever was met before it: the order of sets is another in every process."""
-        reading = _Reading()
+        reading = _Reading(self._around)
         said = json.dumps(reading.of(value))
         self.own += reading.own
         return said
@@ -215,7 +226,28 @@ _ABOUT_CLASSES = (
     "__qualname__",
     "__firstlineno__",
     "__static_attributes__",
+    "__slotnames__",  # noted when the first object is copied
 )
+
+
+def _without_names(held: Mapping[str, Any]) -> dict[str, Any]:
+    """What a function holds but for what is said about it, such as its name."""
+    return {name: x for name, x in held.items() if not name.startswith("__")}
+
+
+def _held(value: Any) -> Any:
+    """What an object holds: its attributes; of one without any what it would be copied from, or its name."""
+    if is_dataclass(value):
+        return {f.name: getattr(value, f.name) for f in fields(value)}
+    if hasattr(value, "__dict__"):
+        return vars(value)
+    try:
+        known = copyreg.dispatch_table.get(type(value))
+        made = known(value) if known else value.__reduce_ex__(2)
+    # Whatever cannot be copied says so as it likes: a lock, a generator.
+    except Exception:
+        return getattr(value, "__name__", {})
+    return made if isinstance(made, str) else made[1:3]
 
 
 def _names(code: CodeType) -> set[str]:

@@ -4,6 +4,8 @@ A number that was searched or chosen with is no measurement. So each purpose has
 and nothing that searches can be given another's.
 """
 
+from numbers import Integral
+
 from scb.errors import UserError
 
 # Evolution, meta-training and every choice among settings.
@@ -22,6 +24,8 @@ def searching(seed: int) -> int:
     Raises:
       UserError: it is not.
     """
+    if not isinstance(seed, Integral):
+        raise UserError(f"seed is {seed!r}: it must be a whole number.")
     if seed not in SEARCHING:
         raise UserError(
             f"seed is {seed}: it must be 0 or larger, and below {SEARCHING.stop}, for those above judge what was found."

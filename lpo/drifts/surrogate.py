@@ -71,6 +71,10 @@ class SurrogateDrift(Drift):
         advice = ""
         if isinstance(error, _TRACED) or "truth value" in said:
             advice = ": use xp.where in place of if, and xp in place of numpy"
+        elif xp.__name__ != "torch" and isinstance(error, AttributeError):
+            advice = (
+                ": let it take xp, and call xp.clip and the like in place of what tensors can do"
+            )
         elif xp.__name__ == "torch" and "xp" in self._takes:
             advice = "; its minimum and maximum take tensors alone, and xp.clip takes numbers"
         elif xp.__name__ == "torch":
@@ -123,11 +127,16 @@ class SurrogateDrift(Drift):
         given = dict(zip(ARGUMENTS, values, strict=True))
         try:
             surrogate = self.function(**{name: given[name] for name in self._takes})
-        except (TypeError, ValueError, RuntimeError) as error:
+        # Whatever a function does that is not ours.
+        except Exception as error:
             raise self._refused(error, xp) from error
         if getattr(surrogate, "shape", None) != log_ratio.shape:
             raise UserError(
                 f"the surrogate {self.called} returns the shape {getattr(surrogate, 'shape', surrogate)} for "
                 f"{tuple(log_ratio.shape)} ratios: return a number for each, of which PPO takes the mean."
+            )
+        if "complex" in str(surrogate.dtype):
+            raise UserError(
+                f"the surrogate {self.called} returns complex numbers: return their real part, which PPO maximises."
             )
         return ratio * advantage - surrogate

@@ -1,6 +1,7 @@
 """Comparing objectives: the same seeds for all, and numbers that can be redone by hand."""
 
 import json
+import os
 import subprocess
 import sys
 from dataclasses import replace
@@ -264,6 +265,27 @@ def test_a_comparison_keeps_its_rows_in_a_file(tmp_path, tiny_agent):
     assert file.read_bytes() == kept
     with pytest.raises(UserError, match=r"are kept in a \.jsonl file"):
         compare("Synthetic-Pendulum-v1", ["ppo"], [0], spec, rows=tmp_path / "rows.json")
+    with pytest.raises(UserError, match=r"rows are 3: give the path of a \.jsonl file, or None"):
+        compare("Synthetic-Pendulum-v1", ["ppo"], [0], spec, rows=3)
+
+
+def test_a_file_that_may_only_be_read_gives_what_it_holds_and_trains_nobody(
+    tmp_path, tiny_agent, monkeypatch
+):
+    spec = AgentSpec("ppo", tiny_agent, PPOHyperparameters())
+    file = tmp_path / "rows.jsonl"
+    first = compare("Synthetic-Pendulum-v1", ["ppo"], [0], spec, points=1, rows=file)
+    may = os.access
+    monkeypatch.setattr(os, "access", lambda path, mode: mode != os.W_OK and may(path, mode))
+    again = compare("Synthetic-Pendulum-v1", ["ppo"], [0], spec, points=1, rows=file)
+    np.testing.assert_array_equal(first.curves[0].returns, again.curves[0].returns)
+
+    def trained(*arguments):
+        raise AssertionError
+
+    monkeypatch.setattr(AgentSpec, "agent", trained)
+    with pytest.raises(UserError, match=r"cannot write to .*: choose another place"):
+        compare("Synthetic-Pendulum-v1", ["ppo"], [0, 1], spec, points=1, rows=file)
 
 
 def test_a_file_of_rows_is_one_process_es(tmp_path, tiny_agent):

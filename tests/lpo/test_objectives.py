@@ -162,6 +162,8 @@ def test_a_closed_form_without_parameters_by_name_is_not_saved(tmp_path):
     drift = ClipDrift(0.3)
     with pytest.raises(UserError, match=r"family clip is its settings.* such as ppo-0\.3"):
         save_objective(tmp_path / "mine.npz", drift, drift.init(jax.random.key(0)))
+    with pytest.raises(UserError, match=r"family clip is its settings.* such as ppo-0\.3"):
+        save_objective(tmp_path / "mine.npz", drift, {})
     assert not list(tmp_path.iterdir())
 
 

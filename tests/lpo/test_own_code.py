@@ -1,7 +1,9 @@
 """What is told of the code of an objective of one's own, so that rows of another are not taken for its own."""
 
 import json
+import logging
 from dataclasses import dataclass
+from fractions import Fraction
 from functools import cached_property, partial, wraps
 
 import jax
@@ -88,7 +90,7 @@ class Called:
 
 
 def of_a_global(strength):
-    return typed("def f(ratio, advantage): return LIMIT * ratio * advantage", LIMIT=strength)
+    return typed("def f(ratio, advantage): return float(LIMIT) * ratio * advantage", LIMIT=strength)
 
 
 def of_a_table(strength):
@@ -99,6 +101,46 @@ def of_a_table(strength):
 def of_a_helper(strength):
     helper = typed(f"def f(x): return {strength} * x")
     return typed("def f(ratio, advantage): return helper(ratio) * advantage", helper=helper)
+
+
+def of_a_fraction(strength):
+    return of_a_global(Fraction(strength))
+
+
+class Slotted:
+    __slots__ = ("strength",)
+
+    def __init__(self, strength):
+        self.strength = strength
+
+    def __call__(self, ratio, advantage):
+        return self.strength * ratio * advantage
+
+
+def of_a_slope(strength):
+    @jax.custom_vjp
+    def through(x):
+        return x
+
+    through.defvjp(lambda x: (x, None), lambda _, slope: (strength * slope,))
+    return lambda ratio, advantage: through(ratio) * advantage
+
+
+def of_a_knot(strength):
+    """A mapping whose key leads back to it, as the parts of a logger do."""
+    knot = Called(strength)
+    knot.table = {knot: 1.0}
+    return lambda ratio, advantage: knot(ratio, advantage)
+
+
+def of_a_logger(strength):
+    log = logging.getLogger(__name__)
+
+    def told(ratio, advantage):
+        log.debug("traced")
+        return strength * ratio * advantage
+
+    return told
 
 
 def squared(strength):
@@ -121,6 +163,11 @@ def power(ratio, advantage, strength=1.0):
         of_a_global,
         of_a_table,
         of_a_helper,
+        of_a_fraction,
+        Slotted,
+        of_a_slope,
+        of_a_knot,
+        of_a_logger,
         lambda x: partial(power, strength=x),
         lambda x: jax.jit(partial(power, strength=x)),
         lambda x: scaled(x)(power),
@@ -175,6 +222,8 @@ def test_several_of_one_function_have_names_by_a_dict():
     assert [o.name for o in load_apart(strengths)] == ["square 0.5", "square 1.0"]
     with pytest.raises(UserError, match=r"is there twice: .* by a dict {name: objective}"):
         load_apart(strengths.values())
+    with pytest.raises(UserError, match=r"named 0.5, which is no text: .* such as {'0.5': ...}"):
+        load_apart({x: partial(power, strength=x) for x in (0.5, 1.0)})
 
 
 def test_rows_of_before_code_was_told_go_on(tiny_spec, tmp_path):

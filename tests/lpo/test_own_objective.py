@@ -176,6 +176,12 @@ def branching(ratio, advantage, progress, xp):
             lambda ratio, advantage: np.minimum(ratio, 1.2) * advantage,
             r"does not compute in JAX \(.*[^.]\): use xp.where in place of if, and xp in place of",
         ),
+        (
+            lambda ratio, advantage: ratio.clamp(0.8, 1.2) * advantage,
+            r"does not compute in JAX \(.* clamp\): let it take xp, and call xp.clip and the like",
+        ),
+        (lambda ratio, advantage: ratio * advantage / (1 // 0), r"in JAX \(.*division.*\)\."),
+        (lambda ratio, advantage: ratio * advantage * 1j, "returns complex numbers: return their"),
     ],
 )
 def test_what_jax_cannot_trace_is_told_of_the_function(function, message):

@@ -22,6 +22,8 @@ def test_no_seed_has_two_purposes():
 def test_a_search_refuses_a_seed_that_judges(seed):
     with pytest.raises(UserError, match=f"seed is {seed}: it must be 0 or larger, and below 10000"):
         EvolutionConfig(seed=seed)
+    with pytest.raises(UserError, match=r"seed is 1\.5: it must be a whole number"):
+        EvolutionConfig(seed=1.5)
     assert EvolutionConfig(seed=9_999).seed == seeds.searching(9_999) == 9_999
 
 
