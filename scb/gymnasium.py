@@ -37,6 +37,10 @@ def register() -> None:
 
 def _opened(file: str) -> tuple[InNumpy, spaces.Box, spaces.Space[Any]]:
     """(its functions, observation space, action space) of a bandit of the zoo or a file."""
+    if not file:
+        raise UserError(
+            f"no bandit is named: give file='path/to/bandit.npz', or make {NAMESPACE}/{zoo_names()[0]} and the like."
+        )
     synthetic = load_synthetic(str(file))
     observations = spaces.Box(-np.inf, np.inf, (synthetic.observation_size,), np.float32)
     described = space_description(synthetic.action_space())
@@ -76,7 +80,7 @@ class SyntheticEnv(gymnasium.Env[np.ndarray, Any]):
       UserError: the file cannot be read, or is none of them; another render mode, which is a TypeError too.
     """
 
-    def __init__(self, file: str, render_mode: None = None) -> None:
+    def __init__(self, file: str = "", render_mode: None = None) -> None:
         _check_shown(render_mode)
         self._functions, self.observation_space, self.action_space = _opened(file)
         self._observation: np.ndarray | None = None
@@ -156,7 +160,7 @@ class SyntheticVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
     def __init__(
         self,
-        file: str,
+        file: str = "",
         num_envs: int = 1,
         autoreset_mode: str | AutoresetMode = AutoresetMode.SAME_STEP,
         render_mode: None = None,
@@ -211,6 +215,9 @@ class SyntheticVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         actions = np.asarray(actions)
         if (number := len(actions) if actions.ndim else 0) != self.num_envs:
             raise UserError(f"there are {number} actions for {self.num_envs} environments.")
+        if waiting.any():  # what they are given is not looked at, and loops give what they like
+            actions = actions.copy()
+            actions[waiting] = 0
         after, rewards, terminated = self._functions.step(self._observations, actions)
         if np.isnan(rewards).any():
             _check_finite(actions)

@@ -24,8 +24,9 @@ def searching(seed: int) -> int:
     Raises:
       UserError: it is not.
     """
-    if not isinstance(seed, Integral):
-        raise UserError(f"seed is {seed!r}: it must be a whole number.")
+    given: object = seed
+    if not isinstance(given, Integral):
+        raise UserError(f"seed is {given!r}: it must be a whole number.")
     if seed not in SEARCHING:
         raise UserError(
             f"seed is {seed}: it must be 0 or larger, and below {SEARCHING.stop}, for those above judge what was found."

@@ -58,17 +58,21 @@ def check_bounded(space: spaces.Box | spaces.Discrete) -> None:
 
 def check_action(action: jax.Array, space: spaces.Box | spaces.Discrete) -> None:
     """Raises a UserError for an action of another kind or size; which of discrete ones it is may be traced."""
-    discrete = isinstance(space, spaces.Discrete)
-    if discrete:
-        fits = action.shape == () and jnp.issubdtype(action.dtype, jnp.integer)
-        allowed = f"a whole number below {space.n}, of shape ()"
+    if isinstance(space, spaces.Discrete):
+        fits = action.shape == () and not jnp.issubdtype(action.dtype, jnp.inexact)
     else:
         fits = action.size == math.prod(space.shape)
-        allowed = f"of shape {space.shape}"
     if not fits:
-        raise UserError(
-            f"an action has shape {action.shape} and type {action.dtype}: it must be {allowed}."
-        )
+        raise misfit(action.shape, action.dtype, space)
+
+
+def misfit(shape: tuple[int, ...], dtype: Any, space: spaces.Box | spaces.Discrete) -> UserError:
+    """The error for an action of this shape and type."""
+    discrete = isinstance(space, spaces.Discrete)
+    allowed = (
+        f"a whole number below {space.n}, of shape ()" if discrete else f"of shape {space.shape}"
+    )
+    return UserError(f"an action has shape {shape} and type {dtype}: it must be {allowed}.")
 
 
 def clip_to_space(action: jax.Array, space: spaces.Box | spaces.Discrete) -> jax.Array:

@@ -12,7 +12,7 @@ from scb.environments.synthetic import SyntheticBandit
 from scb.environments.synthetic_mdp import SyntheticMDP
 from scb.errors import UserError
 from scb.keys import root_key, split_key
-from scb.spaces import flat_bounds
+from scb.spaces import flat_bounds, misfit
 
 Array: TypeAlias = np.ndarray
 Generator: TypeAlias = np.random.Generator
@@ -79,9 +79,8 @@ class InNumpy:
         self._synthetic = synthetic
         params: Any = synthetic.default_params
         self.one_step, self.max_steps = synthetic.one_step, int(params.max_steps_in_episode)
-        space = synthetic.action_space()
-        self._choices = space.n if isinstance(space, spaces.Discrete) else None
-        self._encode = _encoding(space)
+        self._space = synthetic.action_space()
+        self._encode = _encoding(self._space)
         self._draw, self._latent_size = _LATENTS[synthetic.config.latent], synthetic.latent_size
         weights = jax.tree.map(np.asarray, params.weights)
         self._networks = {
@@ -120,14 +119,15 @@ class InNumpy:
 
     def rewards_of(self, contexts: Array) -> Callable[[int, Any], float]:
         """[B, O] contexts of a bandit -> the reward of an action in a row of them, but for the action computed now."""
-        if self._choices is not None:
-            actions = range(self._choices)
+        space = self._space
+        if isinstance(space, spaces.Discrete):
+            actions = range(space.n)
             each = [self.step(contexts, np.full(len(contexts), action))[1] for action in actions]
             table = np.stack(each, axis=1).tolist()
 
             def of_table(row: int, action: Any) -> float:
                 if action.shape or action.dtype.kind not in "iu":
-                    raise _misshapen(action[None], "a whole number")
+                    raise misfit(action.shape, action.dtype, space)
                 if not 0 <= action < len(actions):
                     raise _outside(action, len(actions))
                 return float(table[row][action])
@@ -161,12 +161,6 @@ def _outside(action: Any, number: int) -> UserError:
     return UserError(f"an action is {action}: it must be 0 or larger, and below {number}.")
 
 
-def _misshapen(actions: Array, allowed: str) -> UserError:
-    return UserError(
-        f"an action of shape {actions.shape[1:]} and type {actions.dtype} was given: it must be {allowed}."
-    )
-
-
 def _encoding(space: spaces.Box | spaces.Discrete) -> Callable[[Array], Array]:
     """[B, ...] actions -> [B, A] as networks take them, see `scb.environments.synthetic.encode_action`."""
     if isinstance(space, spaces.Discrete):
@@ -174,7 +168,7 @@ def _encoding(space: spaces.Box | spaces.Discrete) -> Callable[[Array], Array]:
 
         def one_hot(action: Array) -> Array:
             if action.ndim != 1 or action.dtype.kind not in "iu":
-                raise _misshapen(action, "a whole number")
+                raise misfit(action.shape[1:], action.dtype, space)
             outside = (action < 0) | (action >= space.n)
             if outside.any():
                 raise _outside(action[outside][0], space.n)
@@ -187,7 +181,7 @@ def _encoding(space: spaces.Box | spaces.Discrete) -> Callable[[Array], Array]:
     def clipped(action: Array) -> Array:
         action = np.asarray(action, np.float32)
         if action.shape[1:] != space.shape:
-            raise _misshapen(action, f"of shape {space.shape}")
+            raise misfit(action.shape[1:], action.dtype, space)
         return np.minimum(np.maximum(action, low), high).reshape(len(action), -1)
 
     return clipped

@@ -23,7 +23,7 @@ from scb.agents.networks import ACTIVATIONS, MLP
 from scb.environments.linear import PolicyDistance, units
 from scb.errors import UserError, at_least, one_of
 from scb.keys import root_key, split_key
-from scb.spaces import action_size, flat_bounds, flat_size
+from scb.spaces import action_size, check_action, flat_bounds, flat_size
 
 Weights: TypeAlias = dict[str, dict[str, Any]]
 
@@ -312,19 +312,17 @@ def encode_action(action: ArrayLike, space: spaces.Box | spaces.Discrete) -> jax
     """An action as networks take it: [A], a discrete one one-hot, a continuous one clipped to its bounds.
 
     Raises:
-      UserError: a discrete one is no number, or, where it is not traced, none of the space's.
+      UserError: one of another kind or size; a discrete one that is, where it is not traced, none of the space's.
     """
+    action = jnp.asarray(action)
+    check_action(action, space)
     if isinstance(space, spaces.Discrete):
-        if jnp.shape(action) != ():
-            raise UserError(
-                f"the action has shape {jnp.shape(action)}: a discrete one is a number, of shape ()."
-            )
         if not isinstance(action, jax.core.Tracer) and action not in range(space.n):
             raise UserError(
                 f"the action is {action}: it must be a whole number from 0 to {space.n - 1}."
             )
-        return jax.nn.one_hot(action, action_size(space))
-    return jnp.reshape(jnp.clip(jnp.asarray(action), space.low, space.high), (action_size(space),))
+        return jax.nn.one_hot(action.astype(int), action_size(space))
+    return jnp.reshape(jnp.clip(action, space.low, space.high), (action_size(space),))
 
 
 def bandit_for(

@@ -7,6 +7,7 @@ import pytest
 from gymnax.environments import spaces
 from scipy import stats
 
+import scb
 from scb.environments.synthetic import (
     ACTIVATIONS,
     LATENTS,
@@ -18,6 +19,7 @@ from scb.environments.synthetic import (
     encode_action,
 )
 from scb.errors import UserError
+from scb.keys import root_key
 from tests.scb.probes import context_bandit
 
 BOX = spaces.Box(-2.0, 2.0, (2,), jnp.float32)
@@ -88,16 +90,28 @@ def test_a_discrete_action_enters_the_reward_one_hot():
 @pytest.mark.parametrize(
     ("action", "message"),
     [
-        (jnp.zeros(1, int), r"the action has shape \(1,\): a discrete one is a number"),
+        (
+            jnp.zeros(1, int),
+            r"an action has shape \(1,\) and type int32: it must be a whole number below 3",
+        ),
         (3, "the action is 3: it must be a whole number from 0 to 2"),
         (jnp.int32(-1), "the action is -1: it must be"),
-        (0.5, "the action is 0.5: it must be"),
+        (0.5, r"has shape \(\) and type float32: it must be a whole number below 3, of"),
     ],
 )
 def test_a_discrete_action_that_is_none_is_refused(action, message):
     with pytest.raises(UserError, match=message):
         encode_action(action, spaces.Discrete(3))
     np.testing.assert_array_equal(encode_action(np.int64(2), spaces.Discrete(3)), [0, 0, 1])
+
+
+def test_a_step_refuses_an_action_of_another_kind():
+    env, params = scb.make("Synthetic-CartPole-v1")
+    _, state = env.reset(root_key(0), params)
+    for action in (0.5, jnp.nan, jnp.zeros(2)):
+        with pytest.raises(UserError, match="it must be a whole number below 2"):
+            env.step(root_key(0), state, jnp.asarray(action), params)
+    env.step(root_key(0), state, jnp.asarray(True), params)
 
 
 def test_a_continuous_action_beyond_its_bounds_is_the_action_at_the_bound():
