@@ -276,6 +276,8 @@ def call(
     """Runs the command that the arguments name, of functions and LongRuns by name."""
     name = arguments[0] if arguments else ""
     command = commands.get(name)
+    if flags_given(arguments[1:], "out").get("out") == "":
+        raise UserError("--out names no folder: give one, such as --out runs/NAME.")
     if name == "--version":
         versions = package_versions()
         beside = ", ".join(f"{k} {v}" for k, v in versions.items() if k != "lpo")

@@ -4,11 +4,14 @@ gymnax computes a constant as it is imported, and evosax does. By then JAX has c
 longer ask for one a core, and several hosts can no longer be joined. The package imports this module before all others.
 """
 
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 
 from jax._src.xla_bridge import backends_are_initialized
 from jax.extend.backend import clear_backends
+
+from scb.errors import UserError
 
 
 @contextmanager
@@ -21,4 +24,13 @@ def unstarted() -> Iterator[None]:
 
 
 with unstarted():
-    import gymnax  # noqa: F401
+    try:
+        import gymnax  # noqa: F401
+    # JAX starts here first: without a word where a plugin is not installed.
+    except (AssertionError, RuntimeError) as error:
+        if not (platforms := os.environ.get("JAX_PLATFORMS")):
+            raise
+        raise UserError(
+            f"JAX_PLATFORMS is {platforms}, and JAX finds no such device here, or lacks the plugin for it: leave the "
+            "variable out, or make it cpu."
+        ) from error

@@ -129,8 +129,8 @@ class EnvironmentSpec:
             return self.name
         if self.stands_for is None:
             raise UserError(
-                f"{self.name} does not say which environment it stands for: write "
-                '"evaluation_environment" into "config" of the .json beside it.'
+                f"{self.name} does not say which environment it stands for: name that (--evaluation-environment), or "
+                'write "evaluation_environment" into "config" of the .json beside it.'
             )
         return self.stands_for
 

@@ -76,6 +76,14 @@ def test_jax_gets_a_device_a_core_and_a_cache_unless_told_otherwise(
     assert finished.stdout.strip() == expected
 
 
+def test_a_device_that_is_not_there_is_told_in_a_sentence(python):
+    finished = python("-c", "import scb", JAX_PLATFORMS="foo")
+    assert finished.returncode == 1
+    assert finished.stderr.splitlines()[-1].startswith(
+        "scb.errors.UserError: JAX_PLATFORMS is foo, and JAX finds no such device here"
+    )
+
+
 def test_a_caller_that_has_used_jax_keeps_its_devices(monkeypatch):
     before = jax.device_count()
     monkeypatch.delenv("JAX_NUM_CPU_DEVICES", raising=False)

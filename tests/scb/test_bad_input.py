@@ -177,6 +177,8 @@ pytestmark = pytest.mark.usefixtures("small_agents")
         ("discover --out FILE/run", "cannot write to"),
         ("discover --resume FOLDER", "is not a run"),
         ("discover --resume", "--resume names no run: give the folder of one"),
+        ("discover --out", "--out names no folder: give one, such as --out runs/NAME."),
+        ("explain Synthetic-Pendulum-v1 --out=", "--out names no folder: give one"),
     ],
 )
 def test_a_wrong_input_is_one_sentence_and_exit_code_2(
