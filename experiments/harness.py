@@ -15,9 +15,9 @@ import time
 import tomllib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import asdict, dataclass, field, make_dataclass
+from dataclasses import asdict, dataclass, field, make_dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import tyro
@@ -58,6 +58,14 @@ class Preset:
 
     preset: Literal["quick", "paper"] = "quick"
     """quick has fewer runs or steps than the paper"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Keeping:
+    """What an experiment is run with that keeps agents until its report has them."""
+
+    rows: Annotated[Path | None, tyro.conf.Fixed, tyro.conf.Suppress] = None
+    """the folder for them, beside the report"""
 
 
 @dataclass(frozen=True)
@@ -251,7 +259,11 @@ class Experiment:
         further = {k: v for k, v in asdict(options).items() if k != "preset"}
         # Where a measurement may keep its agents until its part of the report is saved.
         rows = out.with_suffix(".rows")
-        given = {**plan, **further, "rows": rows} if self.presets else options
+        given = options
+        if self.presets:
+            given = {**plan, **further, "rows": rows}
+        elif isinstance(options, Keeping):
+            given = replace(options, rows=rows)
         if isinstance(self.measure, InParts) and jobs.executor != "here":
             kept = out.with_suffix(".parts")
             elsewhere(

@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from experiments.claims import FAILS, HOLDS, Claim, Judged, judge, of_agents
-from experiments.harness import Experiment, Report, lost, settled
+from experiments.harness import Experiment, Keeping, Report, lost, settled
 from experiments.parts import InParts, Part, file_name
 from experiments.robustness import learned_for, named
 from lpo.comparison import compare, ppo_spec
@@ -44,7 +44,7 @@ Rates = Mapping[str, Mapping[str, Sequence[float]]]
 
 
 @dataclass(frozen=True)
-class Options:
+class Options(Keeping):
     """What is trained, and where."""
 
     environments: tuple[str, ...] = suite("classic")
@@ -57,8 +57,6 @@ class Options:
     """that are reported, of each objective at each rate"""
     choosing: int = 10
     """others, that choose each objective's rate"""
-    runs: Path = Path("runs/learning_rates")
-    """for agents until they are saved"""
 
     def __post_init__(self) -> None:
         at_least(2, self, "agents", "choosing")
@@ -88,7 +86,7 @@ def parts(options: Options, report: dict[str, Any]) -> Iterator[Part]:
     for (environment, rate), spec in specs.items():
         for name in names:
             places = tuple((role, name, str(rate)) for role in seeds)
-            trained = partial(_trained, environment, name, spec, rate, seeds, options.runs)
+            trained = partial(_trained, environment, name, spec, rate, seeds, options.rows)
             yield Part(("environments", environment), trained, places)
 
 
@@ -98,7 +96,7 @@ def _trained(
     spec: AgentSpec,
     rate: float,
     seeds: Mapping[str, Sequence[int]],
-    runs: Path,
+    kept_in: Path | None,
 ) -> dict[str, Any]:
     objective = load_objective(name)
     (found,) = compare(
@@ -107,7 +105,7 @@ def _trained(
         [seed for of_it in seeds.values() for seed in of_it],
         spec,
         points=1,
-        rows=Rows(runs / environment / f"{file_name(name, str(rate))}.rows.jsonl"),
+        rows=Rows(kept_in and kept_in / environment / f"{file_name(name, str(rate))}.rows.jsonl"),
         tell=print,
     ).curves
     earned = dict(zip(found.seeds, found.final, strict=True))

@@ -22,7 +22,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from experiments.claims import HOLDS
-from experiments.harness import Experiment, Report
+from experiments.harness import Experiment, Keeping, Report
 from experiments.locomotion_claims import ASKED, STATED, claims, confirmed, leading, since, texts
 from experiments.parts import InParts, Keys, Part, file_name
 from lpo import figures
@@ -39,7 +39,7 @@ from scb.statistics import DECIDING, Estimate, iqm
 
 
 @dataclass(frozen=True)
-class Options:
+class Options(Keeping):
     """What is trained, and where."""
 
     environments: tuple[str, ...] = ("hopper",)
@@ -65,8 +65,6 @@ class Options:
     """learning rates at which the objectives are trained on those seeds as well"""
     learning_rate: float | None = None
     """of the agents that report; None for the environment's own"""
-    runs: Path = Path("runs/locomotion")
-    """for agents until they are saved"""
 
     def __post_init__(self) -> None:
         at_least(1, self, "seeds", "together")
@@ -144,7 +142,7 @@ def _of(
             few: dict[Keys, int] = {
                 (*place, name, str(s)): s for s in seeds[start : start + options.together]
             }
-            trained = partial(_trained, path[1], environment, name, options.runs, place, spec)
+            trained = partial(_trained, path[1], environment, name, options.rows, place, spec)
             yield Part.lacking(report, path, few, trained)
 
 
@@ -201,13 +199,13 @@ def _trained(
     entry: str,
     environment: str,
     objective: str,
-    runs: Path,
+    kept_in: Path | None,
     place: Keys,
     spec: AgentSpec,
     seeds: list[int],
 ) -> dict[str, Any]:
     name = file_name(objective, *place[1:], str(seeds[0]))
-    rows = Rows(runs / file_name(entry) / f"{name}.rows.jsonl")
+    rows = Rows(kept_in and kept_in / file_name(entry) / f"{name}.rows.jsonl")
     (found,) = compare(
         environment,
         [load_objective(objective)],

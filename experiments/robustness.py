@@ -21,7 +21,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from experiments.claims import TENTH, Claim, Judged, judge
-from experiments.harness import Experiment, Report, finite, plan_of, settled
+from experiments.harness import Experiment, Keeping, Report, finite, plan_of, settled
 from experiments.parts import InParts, Keys, Part
 from lpo.comparison import ppo_spec
 from lpo.objectives import REFERENCE, Objective, check_names, learned_in, load_objective
@@ -49,7 +49,7 @@ over_environments = partial(stratified_estimate, shared=True)
 
 
 @dataclass(frozen=True)
-class Options:
+class Options(Keeping):
     """What is trained, and where."""
 
     environments: tuple[str, ...] = suite("classic")
@@ -69,8 +69,6 @@ class Options:
     """on seeds that report nothing, to choose among objectives; in a report of its own (--out)"""
     confirmation: bool = False
     """instead, what was stated first (plans/robustness.toml), on further seeds that report"""
-    runs: Path = Path("runs/robustness")
-    """for agents until they are saved"""
 
     def __post_init__(self) -> None:
         at_least(2, self, "draws")
@@ -125,7 +123,7 @@ def parts(options: Options, report: dict[str, Any]) -> Iterator[Part]:
             drawn = Agents.drawn_from(spec, first + i, options.draws)
             for name, objective in objectives.items():
                 place = (environment, name, key)
-                trained = partial(_trained, *place, objective, spec, drawn, options.runs)
+                trained = partial(_trained, *place, objective, spec, drawn, options.rows)
                 there = (*path, "environments", environment)
                 yield Part(there, trained, (("returns", name, key),))
 
@@ -152,10 +150,10 @@ def _trained(
     objective: Objective | None,
     spec: AgentSpec,
     drawn: Agents,
-    runs: Path,
+    kept_in: Path | None,
 ) -> dict[str, Any]:
     """What agents of one setting earn at the end of their training."""
-    kept = Rows(runs / environment / f"{name}, {key}.rows.jsonl")
+    kept = Rows(kept_in and kept_in / environment / f"{name}, {key}.rows.jsonl")
     objectives = () if objective is None else (objective,)
     place = Place.named(environment)
     rows = measure(spec, place, agents=drawn, objectives=objectives, rows=kept)

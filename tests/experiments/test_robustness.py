@@ -83,7 +83,7 @@ def test_settings_are_paired_by_their_seeds_whatever_ended_first():
 
 
 def test_without_ppos_clip_there_is_nothing_to_compare_with(tmp_path):
-    options = module.Options(("CartPole-v1",), ("dpo",), draws=2, runs=tmp_path)
+    options = module.Options(("CartPole-v1",), ("dpo",), draws=2, rows=tmp_path)
     names = [x.names[0][1] for x in module.parts(options, {})]
     assert names == ["ppo", "dpo"] * 3
 
@@ -216,7 +216,7 @@ def test_what_was_stated_is_decided_when_all_of_its_agents_are_there(report, sta
 
 
 def test_a_confirmation_is_of_what_was_stated_and_stands_apart_in_the_report(stated, tmp_path):
-    report, options = {}, module.Options(confirmation=True, runs=tmp_path)
+    report, options = {}, module.Options(confirmation=True, rows=tmp_path)
     parts = list(module.parts(options, report))
     assert [x.path[:3] for x in parts[::3]] == [
         ("confirmation", "environments", name) for name in stated["environments"]
