@@ -1,4 +1,4 @@
-"""Discoveries that experiments compare: each in a run folder of its own, so that a killed one goes on."""
+"""Searches that experiments compare, for bandits and for objectives: each in a run folder of its own, and goes on there."""
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence

@@ -103,7 +103,7 @@ def points_of(lines: Sequence[str], limits: Any) -> np.ndarray:
 
 
 def coverage(points: np.ndarray, limits: Any) -> float:
-    """The share of a plane's 20 x 20 cells that the points visit."""
+    """The share of a plane's `CELLS` x `CELLS` cells that the points visit."""
     counts, _, _ = np.histogram2d(points[:, 0], points[:, 1], CELLS, [list(x) for x in limits])
     return float(np.mean(counts > 0))
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from experiments.understanding import read_comparison
-from experiments.zoo_entry import _short
+from experiments.zoo_objective import _short
 
 
 def test_a_comparison_names_a_run_by_its_folder_and_the_entry_by_its_name():

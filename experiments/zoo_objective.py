@@ -1,6 +1,6 @@
 """Puts a learned objective into the zoo, with what it was measured to be worth.
 
-    python -m experiments zoo_entry runs/mine/objective.npz lpo-pendulum --comparisons runs/eval/comparison.json
+    python -m experiments zoo_objective runs/mine/objective.npz lpo-pendulum --comparisons runs/eval/comparison.json
 
 The comparisons are what `lpo evaluate --out` wrote for that objective; nothing is edited by hand.
 """
@@ -69,5 +69,5 @@ def measure(options: Options, report: dict[str, Any], save: Save) -> None:
 
 
 EXPERIMENT = Experiment(
-    "zoo_entry", "A learned objective into the zoo", measure, options=Options, reports=False
+    "zoo_objective", "A learned objective into the zoo", measure, options=Options, reports=False
 )
