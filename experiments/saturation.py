@@ -101,7 +101,7 @@ def spread(means: np.ndarray) -> dict[str, Any]:
 def earned_together(
     agent: Agent, states: Any, candidate: Candidate, place: Place, key: jax.Array
 ) -> dict[str, np.ndarray]:
-    """[episodes] what agents of these states earn by the mean of their actions, and a bandit's best action, by episode."""
+    """[EPISODES] what agents of these states earn by the mean of their actions, and a bandit's best action."""
     params = candidate.bandit.default_params
 
     def all_as_one(observation: jax.Array, key: jax.Array) -> jax.Array:

@@ -1,4 +1,4 @@
-"""Searches that experiments compare, for bandits and for objectives: each in a run folder of its own, and goes on there."""
+"""Searches for bandits and objectives that experiments compare: each goes on in a run folder of its own."""
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
