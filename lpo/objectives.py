@@ -23,10 +23,7 @@ from scb.own import code_of
 KIND = "drift"
 KNOWN: dict[str, Drift] = {"ppo": ClipDrift(), "dpo": DPODrift(), "none": NoDrift()}
 REFERENCE = "ppo"
-REFERENCES = (
-    REFERENCE,
-    "dpo",
-)  # what a learned objective is compared with where nothing else is asked
+REFERENCES = (REFERENCE, "dpo")  # what an objective is compared with where nothing else is asked
 CLIPS = ("ppo-0.1", "ppo", "ppo-0.3", "ppo-0.5", "ppo-1")  # among which a tuned one is looked for
 _SUGGESTED = tuple(dict.fromkeys((*KNOWN, *CLIPS, "dpo-4-1.2")))  # to who mistypes a name
 _ZOO = Path(__file__).parent / "zoo"
