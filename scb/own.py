@@ -247,7 +247,10 @@ def _held(value: Any) -> Any:
     # Whatever cannot be copied says so as it likes: a lock, a generator.
     except Exception:
         return getattr(value, "__name__", {})
-    return made if isinstance(made, str) else made[1:3]
+    if isinstance(made, str):
+        return made
+    items = (list(x) for x in made[3:5] if x is not None)  # such as a deque's
+    return [*made[1:3], *items]
 
 
 def _names(code: CodeType) -> set[str]:
