@@ -19,14 +19,14 @@ from matplotlib.figure import Figure
 
 from experiments import zoo_table
 from experiments.claims import Claim, of_agents
-from experiments.harness import Experiment, Preset, Report, lost
+from experiments.harness import Experiment, Preset, Report, lost, rows_in
 from experiments.parts import InParts, Part
 from experiments.zoo_table_page import BANDITS, PAPER, label, of_label, paper_return
 from lpo.full_size import full_size
 from scb import measurement, plotting
 from scb.agents.spec import AgentSpec, bandit_agent, environment_agent
 from scb.environments.registry import environment_spec
-from scb.rows import Rows, pivot
+from scb.rows import pivot
 from scb.seeds import REPORTING
 from scb.statistics import DECIDING, estimate, median
 
@@ -131,8 +131,7 @@ def _curves(
     """{"steps": [P + 1], "returns": [N, P + 1], "failed"}: `number` agents, most likely actions."""
     agents = measurement.Agents.drawn_from(spec, REPORTING.start, number)
     size = {"points": plan["points"], "episodes": plan["episodes"]}
-    folder = plan.get("rows")
-    kept = Rows(folder and folder / f"{train_in.name}, {spec.algorithm}.jsonl")
+    kept = rows_in(plan.get("rows"), train_in.name, spec.algorithm)
     rows = measurement.measure(spec, train_in, judge_in, agents, **size, rows=kept)
     returns, failed = measurement.as_random(pivot(rows, "agent", "step"), judge_in)
     return {
@@ -238,8 +237,8 @@ def facts(report: Report) -> dict[str, Any]:
     """Final returns, ours and the paper's, and steps to match."""
     rows = []
     for name, algorithms in report["bandits"].items():
-        own = report["environments"][_environment_of(name)]
-        environment, backend = of_label(_environment_of(name))
+        there = _environment_of(name)
+        own, (environment, backend) = report["environments"][there], of_label(there)
         for algorithm, curves in algorithms.items():
             both = [x and {**x, "final": finals(x)} for x in (curves, own.get(algorithm))]
             stated = PAPER.get(environment, {}).get(algorithm)

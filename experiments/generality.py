@@ -20,7 +20,15 @@ from matplotlib.figure import Figure
 import scb
 from experiments import searches
 from experiments.claims import OF_THE_WAY, TENTH, Claim
-from experiments.harness import CLASSIC_CONTROL, Experiment, Report, bandit_of, finite, lost
+from experiments.harness import (
+    CLASSIC_CONTROL,
+    Experiment,
+    Report,
+    bandit_of,
+    finite,
+    lost,
+    rows_in,
+)
 from experiments.parts import InParts, Keys, Part
 from scb import measurement, plotting
 from scb.agents.spec import ALGORITHMS, algorithms_for, bandit_agent
@@ -33,7 +41,7 @@ from scb.keys import root_key, split_key
 from scb.measurement import Agents, Place
 from scb.neuroevolution import NeuroevolutionConfig, evolve_policy
 from scb.population import map_population
-from scb.rows import Rows, pivot
+from scb.rows import pivot
 from scb.seeds import reporting
 from scb.statistics import (
     Estimate,
@@ -143,8 +151,7 @@ def _returns(agent: str, train_in: Place, judge_in: Place, plan: Mapping[str, An
     if agent not in (OPTIMAL, EVOLVED):
         spec = bandit_agent(algorithm, judge_in.name).with_values(**NETWORKS[network])
         agents = Agents.drawn_from(spec, seed, number)
-        folder = plan.get("rows")
-        kept = Rows(folder and folder / f"{judge_in.name}, {train_in.name}, {agent}.jsonl")
+        kept = rows_in(plan.get("rows"), judge_in.name, train_in.name, agent)
         rows = measurement.measure(spec, train_in, judge_in, agents, episodes=episodes, rows=kept)
         return pivot(rows, "agent")
     config = NeuroevolutionConfig(**plan["neuroevolution"])

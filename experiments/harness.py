@@ -25,7 +25,7 @@ from matplotlib.figure import Figure
 
 from experiments import claims, rendering
 from experiments.claims import Claim, Judged
-from experiments.parts import InParts, Jobs, elsewhere
+from experiments.parts import InParts, Jobs, elsewhere, file_name
 from scb import plotting
 from scb.cli import exit_code
 from scb.command_line import flags
@@ -37,6 +37,7 @@ from scb.errors import UserError
 from scb.files import make_folder, write_json
 from scb.machine import machine_description, package_versions
 from scb.measurement import Place, as_random
+from scb.rows import Rows
 from scb.runs import held
 
 CLASSIC_CONTROL = tuple(sorted(families()["classic"].suite))
@@ -399,6 +400,11 @@ def forget_other(entries: dict[str, Any], name: str, digest: str, of: str = "sha
     """Takes out an entry that is of another bandit, or objective, than the one with this checksum; `of` is its key."""
     if name in entries and entries[name].get(of) != digest:
         del entries[name]
+
+
+def rows_in(folder: Path | None, *names: str) -> Rows:
+    """Where agents of this name are kept until the report has them: in a file of the folder, or in memory."""
+    return Rows(folder and folder / f"{file_name(*names)}.jsonl")
 
 
 def lost(report: Any, of_them: bool = False) -> int:

@@ -18,8 +18,8 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from experiments.claims import FAILS, HOLDS, Claim, Judged, judge, of_agents
-from experiments.harness import Experiment, Keeping, Report, lost, settled
-from experiments.parts import InParts, Part, file_name
+from experiments.harness import Experiment, Keeping, Report, lost, rows_in, settled
+from experiments.parts import InParts, Part
 from experiments.robustness import learned_for, named
 from lpo.comparison import compare, ppo_spec
 from lpo.figures import looks
@@ -30,7 +30,6 @@ from scb.agents.spec import AgentSpec
 from scb.environments.registry import environment_spec
 from scb.errors import UserError, at_least
 from scb.files import packed_row, unpacked_row
-from scb.rows import Rows
 from scb.seeds import reporting, validation
 from scb.statistics import Estimate, stratified_estimate
 
@@ -105,7 +104,7 @@ def _trained(
         [seed for of_it in seeds.values() for seed in of_it],
         spec,
         points=1,
-        rows=Rows(kept_in and kept_in / environment / f"{file_name(name, str(rate))}.rows.jsonl"),
+        rows=rows_in(kept_in, environment, name, str(rate)),
         tell=print,
     ).curves
     earned = dict(zip(found.seeds, found.final, strict=True))

@@ -22,7 +22,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from experiments.claims import HOLDS
-from experiments.harness import Experiment, Keeping, Report
+from experiments.harness import Experiment, Keeping, Report, rows_in
 from experiments.locomotion_claims import ASKED, STATED, claims, confirmed, leading, since, texts
 from experiments.parts import InParts, Keys, Part, file_name
 from lpo import figures
@@ -33,7 +33,6 @@ from scb.agents.spec import AgentSpec
 from scb.agents.values import check_value
 from scb.errors import at_least, unused
 from scb.files import packed, plain
-from scb.rows import Rows
 from scb.seeds import reporting, validation
 from scb.statistics import DECIDING, Estimate, iqm
 
@@ -204,8 +203,7 @@ def _trained(
     spec: AgentSpec,
     seeds: list[int],
 ) -> dict[str, Any]:
-    name = file_name(objective, *place[1:], str(seeds[0]))
-    rows = Rows(kept_in and kept_in / file_name(entry) / f"{name}.rows.jsonl")
+    rows = rows_in(kept_in, entry, objective, *place[1:], str(seeds[0]))
     (found,) = compare(
         environment,
         [load_objective(objective)],

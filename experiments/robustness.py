@@ -21,7 +21,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from experiments.claims import TENTH, Claim, Judged, judge
-from experiments.harness import Experiment, Keeping, Report, finite, plan_of, settled
+from experiments.harness import Experiment, Keeping, Report, finite, plan_of, rows_in, settled
 from experiments.parts import InParts, Keys, Part
 from lpo.comparison import ppo_spec
 from lpo.objectives import REFERENCE, Objective, check_names, learned_in, load_objective
@@ -32,7 +32,6 @@ from scb.errors import UserError, at_least, unused
 from scb.files import packed_row, unpacked_row
 from scb.measurement import Agents, Place, measure
 from scb.plotting import BLUE, VERMILLION, estimate_row, figure_title
-from scb.rows import Rows
 from scb.seeds import REPORTING, VALIDATING
 from scb.statistics import Estimate, Statistic, normalized_score, stratified_estimate, worst_decile
 
@@ -153,7 +152,7 @@ def _trained(
     kept_in: Path | None,
 ) -> dict[str, Any]:
     """What agents of one setting earn at the end of their training."""
-    kept = Rows(kept_in and kept_in / environment / f"{name}, {key}.rows.jsonl")
+    kept = rows_in(kept_in, environment, name, key)
     objectives = () if objective is None else (objective,)
     place = Place.named(environment)
     rows = measure(spec, place, agents=drawn, objectives=objectives, rows=kept)

@@ -116,8 +116,6 @@ class _Reading:
         match value:
             case None | bool() | int() | float() | complex() | str() | bytes():
                 return repr(value)
-            case tuple() | list() | set() | frozenset() | Mapping():
-                return self._container(value)
             case CodeType():
                 return self._code(value)
             case ModuleType():
@@ -126,9 +124,13 @@ class _Reading:
             return "as before"
         if id(value) in self._around:
             return "around"
-        self._met[id(value)] = value
         self._around.add(id(value))
-        said = self._object(value)
+        match value:
+            case tuple() | list() | set() | frozenset() | Mapping():
+                said = self._container(value)
+            case _:
+                self._met[id(value)] = value
+                said = self._object(value)
         self._around.discard(id(value))
         return said
 
@@ -166,19 +168,14 @@ class _Reading:
         return [self.of(type(value)), self.of(_held(value))]
 
     def _container(self, value: Any) -> Any:
-        if id(value) in self._around:
-            return "around"
-        self._around.add(id(value))
         match value:
             case Mapping():
                 pairs = sorted(((self._apart(k), k) for k in value), key=itemgetter(0))
-                said = ["mapping", *([name, self.of(value[k])] for name, k in pairs)]
+                return ["mapping", *([name, self.of(value[k])] for name, k in pairs)]
             case set() | frozenset():
-                said = ["set", *sorted(map(self._apart, value))]
+                return ["set", *sorted(map(self._apart, value))]
             case _:
-                said = [type(value).__name__, *map(self.of, value)]
-        self._around.discard(id(value))
-        return said
+                return [type(value).__name__, *map(self.of, value)]
 
     def _apart(self, value: Any) -> str:
         """What a value says by itself, whatever was met before it: the order of sets is another in every process."""

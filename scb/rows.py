@@ -6,7 +6,6 @@ row was measured is in the .json beside it, by the digest in its column `configu
 
 import hashlib
 import json
-import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
@@ -16,7 +15,7 @@ import numpy as np
 
 from scb.configurations import first_difference
 from scb.errors import UserError
-from scb.files import cannot_write, write_json, write_text
+from scb.files import make_folder, write_json, write_text
 
 Row = dict[str, Any]
 _AGENT = ("environment", "backend", "trained_in", "algorithm", "objective", "seed", "agent")
@@ -122,8 +121,8 @@ class Rows:
 
     def expect_writable(self) -> None:
         """Raises a UserError where nothing can be added, before it is measured."""
-        if self.path is not None and not os.access(self.path.parent, os.W_OK):
-            raise cannot_write(self.path.parent, "place")
+        if self.path is not None:
+            make_folder(self.path.parent, "place")
 
     def add(self, rows: Sequence[Row]) -> None:
         """Appends an agent's rows."""
