@@ -22,6 +22,7 @@ import tyro
 
 from experiments import claims, harness, rendering
 from experiments.harness import DATA, DOCS, Experiment, Files
+from experiments.reports import complete, read
 from scb import termination
 from scb.cli import INTERRUPTED
 from scb.errors import UserError, unknown_name
@@ -96,11 +97,11 @@ def overview(experiments: Sequence[Experiment], data: Path) -> str:
         entry: dict[str, Any] = {"experiment": experiment, "outcome": ""}
         sections.append(entry)
         try:
-            report = harness.read(path, keys=experiment.keys)
+            report = read(path, keys=experiment.keys)
         except UserError:
             entry["problem"] = "Its report cannot be read."
             continue
-        if not harness.complete(report):
+        if not complete(report):
             entry["problem"] = "Measured in part only."
             continue
         outcome = claims.outcome(experiment.judged(report))
@@ -115,10 +116,10 @@ def overview(experiments: Sequence[Experiment], data: Path) -> str:
 
 def _is_whole_paper(out: Path) -> bool:
     try:
-        report = harness.read(out, missing_is_new=True)
+        report = read(out, missing_is_new=True)
     except UserError:
         return False  # the experiment says so itself
-    return report.get("preset") == "paper" and harness.complete(report)
+    return report.get("preset") == "paper" and complete(report)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

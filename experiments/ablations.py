@@ -16,8 +16,9 @@ from matplotlib.figure import Figure
 
 from experiments import searches
 from experiments.claims import ENOUGH, OF_THE_WAY, Claim, of_the_way
-from experiments.harness import Experiment, Report
+from experiments.harness import Experiment
 from experiments.parts import InParts, Part
+from experiments.reports import Report
 from experiments.searches import NONE
 from scb import plotting
 from scb.discovery import DiscoveryConfig

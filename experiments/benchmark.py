@@ -35,7 +35,8 @@ import jax
 import numpy as np
 
 import scb
-from experiments.harness import Experiment, Save, bandit_of, last_line, settled
+from experiments.harness import Experiment, Save, last_line
+from experiments.reports import bandit_of, settled
 from scb.agents.spec import bandit_agent
 from scb.artefacts import flatten
 from scb.environments.zoo import space_description

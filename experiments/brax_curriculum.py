@@ -16,8 +16,9 @@ from matplotlib.figure import Figure
 
 from experiments import searches
 from experiments.claims import Claim
-from experiments.harness import Experiment, Report
+from experiments.harness import Experiment
 from experiments.parts import InParts, Part
+from experiments.reports import Report
 from experiments.searches import NONE, curriculum_of
 from scb import plotting
 from scb.curriculum import horizon

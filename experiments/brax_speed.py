@@ -14,7 +14,8 @@ from typing import Any
 import jax
 import numpy as np
 
-from experiments.harness import Experiment, Report, Save, settled
+from experiments.harness import Experiment, Save
+from experiments.reports import Report, settled
 from experiments.timing import OWN, in_turn, without_compilation_cache
 from scb.environments.brax_physics import CHUNK
 from scb.environments.registry import environment_spec, families

@@ -19,8 +19,9 @@ from matplotlib.figure import Figure
 
 from experiments import zoo_table
 from experiments.claims import Claim, of_agents
-from experiments.harness import Experiment, Preset, Report, lost, rows_in
+from experiments.harness import Experiment, Preset
 from experiments.parts import InParts, Part
+from experiments.reports import Report, lost, rows_in
 from experiments.zoo_table_page import BANDITS, PAPER, label, of_label, paper_return
 from lpo.full_size import full_size
 from scb import measurement, plotting

@@ -15,7 +15,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from experiments.claims import OF_THE_WAY, TENTH, Claim, of_searches
-from experiments.harness import Experiment, Report, Save, bandit_of, finite
+from experiments.harness import Experiment, Save
+from experiments.reports import Report, bandit_of, finite
 from scb import plotting
 from scb.agents.spec import bandit_agent
 from scb.analysis import components

@@ -16,8 +16,9 @@ from matplotlib.figure import Figure
 
 from experiments import searches
 from experiments.claims import OF_THE_WAY, TENTH, Claim
-from experiments.harness import CLASSIC_CONTROL, Experiment, Report, finite, lost
+from experiments.harness import CLASSIC_CONTROL, Experiment
 from experiments.parts import InParts, Part
+from experiments.reports import Report, finite, lost
 from scb import plotting
 from scb.agents.spec import AgentSpec, algorithms_for, bandit_agent
 from scb.curriculum import paper_curriculum

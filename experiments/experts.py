@@ -15,8 +15,9 @@ from matplotlib.figure import Figure
 
 import scb
 from experiments.claims import Claim, of_the_way
-from experiments.harness import Experiment, Report
+from experiments.harness import Experiment
 from experiments.parts import InParts, Part
+from experiments.reports import Report
 from scb import plotting
 from scb.agents.spec import environment_agent
 from scb.analysis.components import SACExpert, train_sac_expert

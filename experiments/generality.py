@@ -20,16 +20,9 @@ from matplotlib.figure import Figure
 import scb
 from experiments import searches
 from experiments.claims import OF_THE_WAY, TENTH, Claim
-from experiments.harness import (
-    CLASSIC_CONTROL,
-    Experiment,
-    Report,
-    bandit_of,
-    finite,
-    lost,
-    rows_in,
-)
+from experiments.harness import CLASSIC_CONTROL, Experiment
 from experiments.parts import InParts, Keys, Part
+from experiments.reports import Report, bandit_of, finite, lost, rows_in
 from scb import measurement, plotting
 from scb.agents.spec import ALGORITHMS, algorithms_for, bandit_agent
 from scb.analysis.optimal_actions import optimal_policy

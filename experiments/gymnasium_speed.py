@@ -17,7 +17,8 @@ import gymnax
 import numpy as np
 from gymnax.wrappers.gym import GymnaxToGymWrapper, GymnaxToVectorGymWrapper
 
-from experiments.harness import Experiment, Report, Save, settled
+from experiments.harness import Experiment, Save
+from experiments.reports import Report, settled
 from experiments.timing import OWN, in_turn
 from scb.errors import UserError, at_least, positive
 from scb.gymnasium import NAMESPACE

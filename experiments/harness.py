@@ -13,31 +13,27 @@ import shutil
 import subprocess
 import time
 import tomllib
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, field, make_dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import numpy as np
 import tyro
 from matplotlib.figure import Figure
 
 from experiments import claims, rendering
 from experiments.claims import Claim, Judged
-from experiments.parts import InParts, Jobs, elsewhere, file_name
+from experiments.parts import InParts, Jobs, elsewhere
+from experiments.reports import Report, complete, forget_replaced, read
 from scb import plotting
 from scb.cli import exit_code
 from scb.command_line import flags
 from scb.configurations import grown
-from scb.environments.registry import environment_spec, families
-from scb.environments.synthetic import SyntheticBandit
-from scb.environments.zoo import bandit_metadata, load_bandit, zoo_names
+from scb.environments.registry import families
 from scb.errors import UserError
 from scb.files import make_folder, write_json
 from scb.machine import machine_description, package_versions
-from scb.measurement import Place, as_random
-from scb.rows import Rows
 from scb.runs import held
 
 CLASSIC_CONTROL = tuple(sorted(families()["classic"].suite))
@@ -47,7 +43,6 @@ PLANS = Path(__file__).with_name("plans")
 # How what is interrupted goes on.
 AGAIN = "the same command measures what its report lacks."
 Save = Callable[[], None]
-Report = Mapping[str, Any]
 Measure = Callable[[Any, dict[str, Any], Save], None]
 Draw = Callable[[Report], Figure | dict[str, Figure]]
 Claims = Callable[[Report], Sequence[Claim]]
@@ -321,100 +316,7 @@ def last_line(command: Sequence[str]) -> dict[str, Any]:
     return dict(json.loads(done.stdout.strip().splitlines()[-1]))
 
 
-def complete(report: Report) -> bool:
-    """Whether everything that the report is about was measured."""
-    return bool(report.get("complete"))
-
-
-def read(path: Path, missing_is_new: bool = False, keys: Iterable[str] = ()) -> dict[str, Any]:
-    """A report from its file, with these keys at least; a UserError where there is none."""
-    if missing_is_new and not path.exists():
-        return {}
-    try:
-        report: Any = json.loads(path.read_text())
-        if not isinstance(report, dict):
-            raise ValueError("it is no JSON object")
-        if lacking := [key for key in keys if key not in report]:
-            raise ValueError(f"it lacks {', '.join(lacking)}")
-    except (OSError, ValueError) as error:
-        raise UserError(
-            f"{path} is no report of this command ({error}): measure first, or choose another --out."
-        ) from error
-    return report
-
-
 def command_of(name: str, options: Any) -> str:
     """The command that measures with these options; where it writes is none of them."""
     words = shlex.join(flags(options, type(options)()))
     return f"python -m experiments {name} {words}".rstrip()
-
-
-def settled(report: dict[str, Any], **settings: Any) -> None:
-    """Notes in a report what it is measured with.
-
-    Raises:
-      UserError: what it holds was measured with something else.
-    """
-    for name, value in settings.items():
-        value = json.loads(json.dumps(value))
-        if report.setdefault(name, value) != value:
-            raise UserError(
-                f"the report holds what was measured with {name} {report[name]}, and {value} is asked for: choose "
-                "another --out."
-            )
-
-
-def bandit_of(environment: str) -> tuple[SyntheticBandit, str]:
-    """The zoo's bandit of an environment, and the checksum of its weights."""
-    name = environment_spec(environment).bandit
-    return load_bandit(name), bandit_metadata(name)["sha256"]
-
-
-def forget_replaced(report: dict[str, Any]) -> None:
-    """Takes out of a report what is of bandits that the zoo has replaced since, so that it is measured again.
-
-    An entry's "sha256" says which bandit it is of; "published" ends the names of entries of other people's. None
-    keeps the entry's place.
-    """
-    ours = {bandit_metadata(name)["sha256"] for name in zoo_names()}
-
-    def replaced(entry: Any) -> bool:
-        digest = entry.get("sha256") if isinstance(entry, dict) else None
-        return isinstance(digest, str) and digest not in ours
-
-    def forget(tree: dict[str, Any]) -> None:
-        for name, entry in tree.items():
-            if name.endswith("published"):
-                continue
-            if replaced(entry):
-                tree[name] = None
-            elif isinstance(entry, dict):
-                forget(entry)
-
-    if replaced(report):
-        report.clear()
-    forget(report)
-
-
-def forget_other(entries: dict[str, Any], name: str, digest: str, of: str = "sha256") -> None:
-    """Takes out an entry that is of another bandit, or objective, than the one with this checksum; `of` is its key."""
-    if name in entries and entries[name].get(of) != digest:
-        del entries[name]
-
-
-def rows_in(folder: Path | None, *names: str) -> Rows:
-    """Where agents of this name are kept until the report has them: in a file of the folder, or in memory."""
-    return Rows(folder and folder / f"{file_name(*names)}.jsonl")
-
-
-def lost(report: Any, of_them: bool = False) -> int:
-    """How many agents of a report, or of a part of it, earned no number: what is under "failed", at any depth."""
-    if isinstance(report, Mapping):
-        return sum(lost(x, of_them or name == "failed") for name, x in report.items())
-    return report if of_them else 0
-
-
-def finite(returns: Any, place: Place) -> tuple[list[float], int]:
-    """([N] returns to two digits, how many were no number): those count as random actions there."""
-    values, failed = as_random(np.asarray(returns, np.float64), place)
-    return np.round(values, 2).tolist(), int(failed.sum())

@@ -16,8 +16,9 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from experiments.claims import corrected
-from experiments.harness import Experiment, Report, forget_other, settled
+from experiments.harness import Experiment
 from experiments.parts import InParts, Part
+from experiments.reports import Report, forget_other, settled
 from lpo import figures
 from lpo.inner_loop import MetaTrainingConfig, TaskTraining
 from lpo.objectives import REFERENCE, load_objective, zoo_names

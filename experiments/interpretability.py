@@ -15,8 +15,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from experiments.claims import Claim
-from experiments.harness import CLASSIC_CONTROL, Experiment, Report, bandit_of
+from experiments.harness import CLASSIC_CONTROL, Experiment
 from experiments.parts import InParts, Part
+from experiments.reports import Report, bandit_of
 from scb import plotting
 from scb.analysis import figures
 from scb.analysis.explain import explain

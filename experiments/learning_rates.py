@@ -18,8 +18,9 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from experiments.claims import FAILS, HOLDS, Claim, Judged, judge, of_agents
-from experiments.harness import Experiment, Keeping, Report, lost, rows_in, settled
+from experiments.harness import Experiment, Keeping
 from experiments.parts import InParts, Part
+from experiments.reports import Report, lost, rows_in, settled
 from experiments.robustness import learned_for, named
 from lpo.comparison import compare, ppo_spec
 from lpo.figures import looks

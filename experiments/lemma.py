@@ -19,8 +19,9 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from experiments.claims import Claim
-from experiments.harness import Experiment, Report
+from experiments.harness import Experiment
 from experiments.parts import InParts, Part
+from experiments.reports import Report
 from scb import plotting
 
 Floats = NDArray[np.floating]

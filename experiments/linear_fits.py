@@ -18,8 +18,9 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from experiments.claims import ENOUGH, Claim, of_searches
-from experiments.harness import Experiment, Report, settled
+from experiments.harness import Experiment
 from experiments.parts import InParts, Part
+from experiments.reports import Report, settled
 from scb import plotting
 from scb.agents.spec import bandit_agent
 from scb.environments.registry import environment_spec

@@ -22,9 +22,10 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from experiments.claims import HOLDS
-from experiments.harness import Experiment, Keeping, Report, rows_in
+from experiments.harness import Experiment, Keeping
 from experiments.locomotion_claims import ASKED, STATED, claims, confirmed, leading, since, texts
 from experiments.parts import InParts, Keys, Part, file_name
+from experiments.reports import Report, rows_in
 from lpo import figures
 from lpo.comparison import Comparison, LearningCurves, changed, compare, ppo_spec
 from lpo.full_size import as_comparison, looked_at

@@ -20,8 +20,9 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from experiments.alignment import CONFIRMATION_SEED
-from experiments.harness import Experiment, Report, forget_other, settled
+from experiments.harness import Experiment
 from experiments.parts import InParts, Keys, Part
+from experiments.reports import Report, forget_other, settled
 from lpo.alignment import Alignment, Regime, alignment, regime_fitness
 from lpo.comparison import LearningCurves, compare
 from lpo.fitness import FITNESSES, LABELS

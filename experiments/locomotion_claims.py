@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 
 from experiments.claims import Claim, Judged, corrected, judge, of_agents
-from experiments.harness import Report
+from experiments.reports import Report
 from lpo.comparison import LearningCurves
 from lpo.full_size import Confirmation, as_comparison, looked_at, with_pairs
 from lpo.objectives import REFERENCE

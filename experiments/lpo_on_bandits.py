@@ -21,8 +21,9 @@ from typing import Any
 import numpy as np
 
 from experiments import meta_training_cost
-from experiments.harness import Experiment, Preset, Save, settled
+from experiments.harness import Experiment, Preset, Save
 from experiments.lpo_on_bandits_page import claims, draw, facts
+from experiments.reports import settled
 from experiments.searches import machines, objective_of_run, read_log
 from lpo.comparison import compare
 from lpo.objectives import CLIPS, Objective, load_objective

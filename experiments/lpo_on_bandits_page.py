@@ -9,9 +9,9 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, LogLocator, NullFormatter, StrMethodFormatter
 
 from experiments.claims import OF_THE_WAY, Claim, of_searches, of_the_way
-from experiments.harness import Report
 from experiments.locomotion_claims import MARGIN, paired
 from experiments.rendering import on
+from experiments.reports import Report
 from experiments.searches import elsewhere, ran_on
 from lpo import figures
 from lpo.comparison import LearningCurves

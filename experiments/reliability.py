@@ -29,7 +29,8 @@ from typing import Any
 
 import numpy as np
 
-from experiments.harness import Experiment, Report, Save, settled
+from experiments.harness import Experiment, Save
+from experiments.reports import Report, settled
 from lpo import objectives
 from lpo.commands import MetaTrain
 from scb.commands import Discover

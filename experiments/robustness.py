@@ -21,8 +21,9 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from experiments.claims import TENTH, Claim, Judged, judge
-from experiments.harness import Experiment, Keeping, Report, finite, plan_of, rows_in, settled
+from experiments.harness import Experiment, Keeping, plan_of
 from experiments.parts import InParts, Keys, Part
+from experiments.reports import Report, finite, rows_in, settled
 from lpo.comparison import ppo_spec
 from lpo.objectives import REFERENCE, Objective, check_names, learned_in, load_objective
 from lpo.suite import suite

@@ -21,8 +21,9 @@ import jax.numpy as jnp
 import numpy as np
 from matplotlib.figure import Figure
 
-from experiments.harness import Experiment, Report, finite, forget_other, settled
+from experiments.harness import Experiment
 from experiments.parts import InParts, Part
+from experiments.reports import Report, finite, forget_other, settled
 from experiments.zoo_table import Candidate, bandits
 from experiments.zoo_table_page import BANDITS
 from scb import plotting

@@ -22,8 +22,9 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
 from experiments.claims import Claim, judge, of_agents
-from experiments.harness import Experiment, Report, bandit_of, last_line, settled
+from experiments.harness import Experiment, last_line
 from experiments.parts import InParts, Part
+from experiments.reports import Report, bandit_of, settled
 from scb import plotting
 from scb.environments.registry import environment_spec
 from scb.environments.zoo import bandit_metadata, load_bandit

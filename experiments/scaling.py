@@ -22,8 +22,9 @@ from typing import Any
 import jax
 import numpy as np
 
-from experiments.harness import Experiment, Report, settled
+from experiments.harness import Experiment
 from experiments.parts import InParts, Part
+from experiments.reports import Report, settled
 from lpo.inner_loop import MetaTrainingConfig
 from lpo.meta_training import MetaTraining
 from scb import processes

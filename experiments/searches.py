@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from experiments.claims import ENOUGH
-from experiments.harness import Report
 from experiments.rendering import text
+from experiments.reports import Report
 from lpo.commands import MetaTrain
 from lpo.objectives import Objective
 from scb.command_line import SharedOutput

@@ -16,9 +16,10 @@ from matplotlib.figure import Figure
 
 from experiments import experts
 from experiments.claims import Claim
-from experiments.harness import Experiment, Report, bandit_of
+from experiments.harness import Experiment
 from experiments.interpretability import action_bar, draw_actions
 from experiments.parts import InParts, Part
+from experiments.reports import Report, bandit_of
 from scb import plotting
 from scb.analysis.components import ReplacedBandit, q_reward
 from scb.analysis.optimal_actions import first_action, optimal_actions

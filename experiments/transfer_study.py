@@ -21,8 +21,9 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from experiments.claims import ENOUGH, FAILS, HOLDS, Claim, confidence, judge, of_searches
-from experiments.harness import Experiment, Report, plan_of, settled
+from experiments.harness import Experiment, plan_of
 from experiments.parts import InParts, Keys, Part
+from experiments.reports import Report, settled
 from experiments.searches import meta_training, objective_of_run
 from lpo.comparison import compare, ppo_spec
 from lpo.objectives import Objective, load_objective

@@ -15,7 +15,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from experiments.claims import UNDECIDED, Claim, judge
-from experiments.harness import CLASSIC_CONTROL, Experiment, Report, Save, bandit_of
+from experiments.harness import CLASSIC_CONTROL, Experiment, Save
+from experiments.reports import Report, bandit_of
 from scb import plotting
 from scb.agents.spec import bandit_agent
 from scb.analysis import animation

@@ -17,8 +17,9 @@ from typing import Any
 
 import numpy as np
 
-from experiments.harness import Experiment, Save, settled
+from experiments.harness import Experiment, Save
 from experiments.rendering import number, text
+from experiments.reports import settled
 from scb.agents.spec import algorithms_for, bandit_agent
 from scb.environments.synthetic import BanditConfig, bandit_for
 from scb.errors import at_least

@@ -11,7 +11,7 @@ import pytest
 import yaml
 
 from experiments import rendering
-from experiments.harness import bandit_of, forget_replaced
+from experiments.reports import bandit_of, forget_replaced
 from lpo.full_size import full_size
 from lpo.suite import SuiteScores
 from scb.environments.zoo import bandit_metadata, zoo_names
@@ -97,7 +97,7 @@ def test_what_was_measured_of_bandits_is_of_those_that_ship(data):
 
 def test_every_report_that_names_its_bandits_by_checksum_can_forget_them(monkeypatch):
     # Else the test above would see nothing. The table's entries are a list, which measures again by itself.
-    monkeypatch.setattr("experiments.harness.zoo_names", lambda: [])
+    monkeypatch.setattr("experiments.reports.zoo_names", lambda: [])
     naming, forgetting = set(), set()
     for path in (DOCS / "data").glob("*.json"):
         report = read(path.stem)

@@ -17,7 +17,8 @@ from experiments.generality import (
     WIDE,
     ZOO,
 )
-from experiments.harness import CLASSIC_CONTROL, forget_replaced
+from experiments.harness import CLASSIC_CONTROL
+from experiments.reports import forget_replaced
 from scb.environments.registry import environment_spec
 from scb.environments.zoo import bandit_metadata, load_bandit
 from scb.measurement import Place

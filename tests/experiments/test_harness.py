@@ -12,10 +12,8 @@ from experiments import __main__ as everything
 from experiments import harness, rendering
 from experiments.claims import Claim
 from experiments.harness import Experiment
-from experiments.parts import Part
 from experiments.rendering import text
-from scb.environments.zoo import bandit_metadata
-from scb.measurement import Place
+from experiments.reports import complete, read
 from scb.statistics import Estimate
 from tests.locking import is_locked
 
@@ -120,22 +118,6 @@ def test_a_report_stays_with_the_machine_that_measured_it(tmp_path):
     out.write_text(json.dumps(elsewhere))
     assert counting().main(flags) == 0
     assert json.loads(out.read_text())["machine"] == here["machine"]
-
-
-def test_what_is_of_a_bandit_that_was_replaced_is_measured_again():
-    ours = bandit_metadata("Synthetic-CartPole-v1")["sha256"]
-    kept = {"a": {"sha256": ours, "x": 1}, "b, published": {"sha256": "other"}, "c": {"x": 1}}
-    report = {"of": {"d": {"sha256": "replaced"}, **kept}, "published": {"sha256": "other"}}
-    harness.forget_replaced(report)
-    assert report == {"of": {"d": None, **kept}, "published": {"sha256": "other"}}
-    again = Part(("of", "d"), lambda: {"x": 2})
-    assert not again.there(report)
-    again.add(again.measured(), report)
-    assert list(report["of"]) == ["d", "a", "b, published", "c"] and again.there(report)
-    # A report of a single bandit.
-    report["sha256"] = "replaced"
-    harness.forget_replaced(report)
-    assert report == {}
 
 
 def test_an_experiment_forgets_what_is_of_a_replaced_bandit_before_it_measures(tmp_path):
@@ -316,11 +298,7 @@ def test_a_report_goes_on_where_only_what_may_grow_has_grown(tmp_path, capsys):
     assert growing({"value": 1, "of": {"x": 2, "y": 2}}).main(flags) == 2
 
 
-def test_returns_that_are_no_number_count_as_random_actions():
-    returns, failed = harness.finite(
-        [1.234, float("nan"), float("inf")], Place.named("MountainCar-v0")
-    )
-    assert (returns, failed) == ([1.23, -200.0, -200.0], 2)  # the limit of 200 steps at -1 each
+def test_equal_numbers_are_a_number_and_others_a_span():
     assert rendering.span([3, 3]) == "3" and rendering.span([30, 60, 30]) == "30 to 60"
 
 
@@ -343,10 +321,10 @@ PAGES = [x for x in everything.found().values() if rendering.has_template(x.name
 @pytest.mark.parametrize("experiment", PAGES, ids=[x.name for x in PAGES])
 def test_the_committed_page_is_that_of_the_committed_report(experiment):
     out = experiment.out or harness.DATA / f"{experiment.name}.json"
-    report = harness.read(out, keys=experiment.keys)
+    report = read(out, keys=experiment.keys)
     if experiment.presets:
         plan = json.loads(json.dumps(experiment.presets[report["preset"]]))
-        assert harness.complete(report) and report.get("plan", plan) == plan
+        assert complete(report) and report.get("plan", plan) == plan
     assert (harness.DOCS / f"{experiment.name}.md").read_text() == experiment.page(report)
 
 
