@@ -316,9 +316,13 @@ def measure_alignment(
     report: dict[str, Any] = dict(done or {})
     if not report:
         spec = ppo_spec(environment, steps).with_values(policy_output_scale=policy_output_scale)
-        found = compare(environment, objectives, seeds, spec, backend, points=1, rows=rows).curves
+        comparison = compare(environment, objectives, seeds, spec, backend, points=1, rows=rows)
+        found, caution = comparison.curves, comparison.caution
+        if caution:
+            tell(caution)
         report = {
             **asked,
+            "caution": caution,
             "outcome_iqm": {c.objective: float(iqm(c.final)) for c in found},
             # To as many digits as tell agents apart, of whatever size returns are.
             "outcome": {c.objective: [float(f"{x:.6g}") for x in c.final] for c in found},

@@ -71,7 +71,12 @@ class Certificate:
 
         Of a penalty that begins smoothly, as KL does, or further out, as a clip, nothing is left there.
         """
-        return (self.kink if self.kink_at_one is None else self.kink_at_one) > LARGEST_KINK
+        return self.deciding_kink > LARGEST_KINK
+
+    @property
+    def deciding_kink(self) -> float:
+        """`kink_at_one`, or `kink` where that was not measured."""
+        return self.kink if self.kink_at_one is None else self.kink_at_one
 
     def as_dict(self) -> dict[str, Any]:
         return asdict(self)
@@ -87,7 +92,8 @@ class Certificate:
         return (
             f"{verdict}: min f {self.minimum:.3g}, at ratio 1 |f| {self.value_at_one:.3g} and |df/dr| "
             f"{self.gradient_at_one:.3g}, |df/dr| {self.slope_at_0_001:.3g} at |r - 1| = 0.001 and "
-            f"{self.slope_at_0_01:.3g} at 0.01, kink {self.kink:.3g} ({self.grid})"
+            f"{self.slope_at_0_01:.3g} at 0.01, kink {self.kink:.3g} at 0.01 and {self.deciding_kink:.3g} "
+            f"carried on to ratio 1 ({self.grid})"
         )
 
 

@@ -128,6 +128,13 @@ class MetaTrainingConfig:
                     f"train on {environment_spec(name).bandit!r}."
                 )
         check_backend(self.backend, self.homes)
+        if not self.validation and all(environment_spec(n).synthetic for n in self.judged_in):
+            unused(
+                self,
+                "fitness is earned in bandits, which have no physics",
+                ("backend",),
+                "take validation, or the fitness transfer",
+            )
         known = {n: environment_spec(n).reference(self.backend) is not None for n in self.homes}
         if self.validation and len(known) > 1 and not all(known.values()):
             raise UserError(

@@ -47,6 +47,7 @@ class MetaTraining:
             raise UserError(
                 f"the drift is of the family {config.drift.name}, which has nothing to learn: take a LearnedDrift."
             )
+        config.drift.shapes()  # what could not be saved is refused before it is learned
         self.config = config
         self.tasks = {name: TaskTraining(config, name) for name in config.tasks}
         self.judges = self.tasks

@@ -127,12 +127,8 @@ class EvaluateConfig(JudgedConfig):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Comparing(Measuring):
-    """A command that compares objectives on one environment."""
-
-    def growing(self) -> Collection[str]:
-        # A suite's --out that is there is completed, and grows by nothing but --resume.
-        return () if self.output.out else ("seeds", "objectives")
+class OfObjectives(Measuring):
+    """A command that trains with objectives in an environment."""
 
     def inputs(self) -> dict[str, str]:
         environment = self.config.environment
@@ -140,6 +136,15 @@ class Comparing(Measuring):
         for objective in load_apart(self.config.objectives):
             told |= objective.digests
         return told
+
+
+@dataclass(frozen=True, kw_only=True)
+class Comparing(OfObjectives):
+    """A command that compares objectives on one environment."""
+
+    def growing(self) -> Collection[str]:
+        # A suite's --out that is there is completed, and grows by nothing but --resume.
+        return () if self.output.out else ("seeds", "objectives")
 
     def compare(self, objectives: Sequence[Objective]) -> Comparison:
         """Trains with the objectives, and leaves rows, comparison.json and curves.png where a folder is named."""
@@ -177,10 +182,13 @@ class Train(Comparing):
     config: Annotated[TrainConfig, tyro.conf.arg(name="")] = field(default_factory=TrainConfig)
 
     def run(self) -> None:
-        (curves,) = self.compare([load_objective(self.config.objective)]).curves
+        comparison = self.compare([load_objective(self.config.objective)])
+        (curves,) = comparison.curves
         for point, returns in zip(curves.steps, curves.returns.T, strict=True):
             print(f"{point:>9} steps: return {np.mean(returns):.1f}")
         print(f"final return, IQM: {estimate(curves.final)}")
+        if comparison.caution:
+            print(comparison.caution)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -332,7 +340,7 @@ class AlignConfig(Agents):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Align(Measuring):
+class Align(OfObjectives):
     """Measure which inner loop on a bandit ranks objectives as an environment does.
 
     Trains agents with a family of known objectives on the environment and in every combination of

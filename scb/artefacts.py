@@ -1,6 +1,7 @@
 """Artefacts: what was discovered, as two files that can be checked and need no trust.
 
-NAME.npz holds the weights and is read without pickle, so that opening one runs no code. NAME.json
+NAME.npz holds the weights and is read without pickle, so that opening one runs no code, but for what a file names of
+one's own: of a drift or an environment package.module:Class the module is imported, and it is called. NAME.json
 beside it says what they are and where they came from: schema version, kind, name, config, seeds,
 package versions, measured results, cost, the command, and the SHA-256 of the .npz. Equal input
 gives equal bytes.
@@ -13,7 +14,7 @@ import io
 import json
 import os
 import zipfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -24,6 +25,7 @@ from flax import traverse_util
 from scb import schema
 from scb.errors import UserError, first_line, unknown_name
 from scb.files import make_folder, strict_json, write_together
+from scb.keys import root_key
 from scb.machine import package_versions
 
 # numpy.ndarray leaves under any depth of dictionaries: {"reward": {"Dense_0": {"kernel": ...}}}.
@@ -263,6 +265,26 @@ def flatten(arrays: Mapping[str, Any]) -> dict[str, np.ndarray]:
             raise UserError(f"the group {name!r} holds no arrays: leave it out.")
         flat[name] = np.asarray(array)
     return dict(sorted(flat.items()))
+
+
+def shapes_of(init: Callable[[jax.Array], Any]) -> dict[str, tuple[int, ...]]:
+    """{"reward/Dense_0/kernel": (O + A, hidden), ...} of what is made of a key, without making it.
+
+    Raises:
+      UserError: it is no dictionary of arrays and of such dictionaries.
+    """
+    made = jax.eval_shape(init, root_key(0))
+    for path, _ in jax.tree_util.tree_flatten_with_path(made)[0]:
+        if other := [x for x in path if not isinstance(x, jax.tree_util.DictKey)]:
+            raise UserError(
+                f"the arrays are kept in a list, a tuple or a class (at {other[0]}): give dictionaries of arrays alone."
+            )
+    return {
+        name: array.shape
+        for name, array in flatten(
+            jax.tree.map(lambda x: np.broadcast_to(0.0, x.shape), made)
+        ).items()
+    }
 
 
 def unflatten(path: Path, flat: Mapping[str, np.ndarray]) -> ArrayTree:

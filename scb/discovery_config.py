@@ -9,7 +9,7 @@ import tyro
 from scb.agents.spec import ALGORITHMS
 from scb.agents.tables import Lists, Values
 from scb.command_line import GENERATIONS, listed, text
-from scb.curriculum import CurriculumConfig, read_curriculum
+from scb.curriculum import CurriculumConfig, paper_curriculum, read_curriculum
 from scb.environments.synthetic import BanditConfig
 from scb.environments.synthetic_mdp import PARAMETERIZATIONS
 from scb.environments.zoo import digests
@@ -122,8 +122,9 @@ class DiscoveryConfig:
 
     @property
     def growing(self) -> tuple[str, ...]:
-        """Settings of which a resumed search may have more (`Run.open`): none where the curriculum is "paper"."""
-        return () if self.curriculum == "paper" else GENERATIONS
+        """Settings of which a resumed search may have more (`Run.open`): none where a curriculum stretches to them."""
+        stretched = self.curriculum == "paper" and paper_curriculum(self.environment) is not None
+        return () if stretched else GENERATIONS
 
     def checksums(self) -> dict[str, str]:
         """{name: SHA-256} of what a name does not tell: a bandit that it starts from, an environment of one's own."""

@@ -70,6 +70,7 @@ def start(given: Mapping[str, str], environment: Mapping[str, str] = os.environ)
                 f"--coordinator is {given['coordinator']!r}: give HOST:PORT, with a port from 1 to 65535."
             )
     elif not any(_launched(name, environment) for name in _LAUNCHERS):
+        _expect_alone(environment)
         return
     if given and settings["process_id"] == 0 and settings["num_processes"] > 1:
         others = settings["num_processes"] - 1
@@ -130,6 +131,18 @@ def _launched(name: str, environment: Mapping[str, str]) -> bool:
     """Whether a launcher started several processes; parts of its variables, as a shell in a job has, say nothing."""
     said = all(variable in environment for variable in _LAUNCHERS[name])
     return said and environment[_NUMBERS[name]] not in ("", "0", "1")
+
+
+def _expect_alone(environment: Mapping[str, str]) -> None:
+    """A UserError where a launcher says that there are several, and not where: each would search for itself."""
+    _, size, rank = _LAUNCHERS["Open MPI"]
+    # Since Open MPI 5.
+    if rank in environment and environment.get(size, "1") not in ("", "0", "1"):
+        raise UserError(
+            f"Open MPI started {environment[size]} processes, and this release of it does not tell them where the "
+            f"first is: give each --coordinator HOST:PORT --processes {environment[size]} --process ${rank}, as by "
+            "mpirun ... sh -c '...'."
+        )
 
 
 def many() -> bool:

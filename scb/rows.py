@@ -6,6 +6,7 @@ row was measured is in the .json beside it, by the digest in its column `configu
 
 import hashlib
 import json
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
@@ -18,6 +19,7 @@ from scb.errors import UserError
 from scb.files import make_folder, write_json, write_text
 
 Row = dict[str, Any]
+_DIGEST = re.compile("[0-9a-f]{12}")  # of a configuration
 _AGENT = ("environment", "backend", "trained_in", "algorithm", "objective", "seed", "agent")
 
 
@@ -51,6 +53,10 @@ class Rows:
         self.rows: list[Row] = []
         self._configurations: dict[str, Any] = {}
         if self.path is None or not self.path.exists():
+            if self.path is not None and not self._own(self._described):
+                raise UserError(
+                    f"rows in {path} would replace {self._described}, which is of something else: choose another name."
+                )
             return
         try:
             self._configurations = dict(json.loads(self._described.read_text()))
@@ -75,6 +81,17 @@ class Rows:
     def _described(self) -> Path:
         assert self.path is not None
         return self.path.with_suffix(".json")
+
+    @staticmethod
+    def _own(described: Path) -> bool:
+        """Whether nothing is lost where configurations are written there, as before a first agent."""
+        if not described.exists():
+            return True
+        try:
+            there = json.loads(described.read_text())
+        except (OSError, ValueError):
+            return False
+        return isinstance(there, dict) and all(_DIGEST.fullmatch(name) for name in there)
 
     def cell(self, columns: Mapping[str, Any], configuration: Any, number: int) -> "Cell":
         """What is there of agents with these columns, each of `number` rows; a part of an agent is dropped.

@@ -293,6 +293,9 @@ def _lock(path: Path, of: Path) -> bool:
         file = path.open("a+")
     try:
         fcntl.lockf(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        # Whoever held it may have removed it after it was opened here; then a third one makes another.
+        if not (path.exists() and os.path.samestat(os.fstat(file.fileno()), path.stat())):
+            raise BlockingIOError
     except (BlockingIOError, PermissionError) as error:
         file.seek(0)
         holder = file.read().strip() or "which has just begun"

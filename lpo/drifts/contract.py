@@ -11,10 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from lpo.drifts.bases import BASES
-from scb import own
+from scb import artefacts, own
 from scb.agents.drift import USUAL_CLIP, relu
 from scb.errors import UserError, at_least, one_of, positive
-from scb.keys import root_key
 
 # Any: an array of JAX, NumPy or PyTorch; `xp` below is its library.
 Array: TypeAlias = Any
@@ -40,7 +39,10 @@ class Drift(ABC):
 
     @property
     def temporal(self) -> bool:
-        """Whether it changes with the fraction of training done."""
+        """Whether it changes with the fraction of training done.
+
+        Where it does and this does not say so, it is certified, shown and exported as it is at the start.
+        """
         return False
 
     @abstractmethod
@@ -101,8 +103,12 @@ class Drift(ABC):
         return [field.name for field in fields(cls)]  # type: ignore[arg-type]
 
     def shapes(self) -> dict[str, tuple[int, ...]]:
-        """Of the parameters, by name."""
-        return {name: x.shape for name, x in jax.eval_shape(self.init, root_key(0)).items()}
+        """Of the parameters, by name; "network/kernel" of those inside of another dictionary.
+
+        Raises:
+          UserError: they are no dictionaries of arrays, which alone a file holds.
+        """
+        return artefacts.shapes_of(self.init)
 
     def with_parameters(self, parameters: Any) -> Self:
         """The same drift with settings that say these parameters, where settings say any."""

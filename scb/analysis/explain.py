@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import tyro
+from gymnax.environments import spaces
 
 from scb.analysis.importance import reward_variance
 from scb.analysis.optimal_actions import first_action, optimal_actions, optimal_policy
@@ -83,8 +84,8 @@ def explain(
         "visited_std": dict(zip(names, np.round(visited.std(0), 4).tolist(), strict=True)),
     }
     everything = np.concatenate([contexts, shown])
-    low, high = flat_bounds(place.env.observation_space(place.params))
-    box = (np.asarray(low), np.asarray(high))
+    space = place.env.observation_space(place.params)
+    box = tuple(map(np.asarray, flat_bounds(space))) if isinstance(space, spaces.Box) else None
     parts = {
         "name": bandit.name,
         "summary": f"its optimal policy earns {earned} in {place.name}",

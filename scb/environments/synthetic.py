@@ -19,10 +19,11 @@ from flax import struct
 from gymnax.environments import environment, spaces
 from jax.typing import ArrayLike
 
+from scb import artefacts
 from scb.agents.networks import ACTIVATIONS, MLP
 from scb.environments.linear import PolicyDistance, units
 from scb.errors import UserError, at_least, one_of
-from scb.keys import root_key, split_key
+from scb.keys import split_key
 from scb.spaces import action_size, check_action, flat_bounds, flat_size
 
 Weights: TypeAlias = dict[str, dict[str, Any]]
@@ -184,9 +185,7 @@ class SyntheticEnvironment(environment.Environment[_State, _Params]):
 
     def weight_shapes(self) -> dict[str, tuple[int, ...]]:
         """{"reward/Dense_0/kernel": (O + A, hidden), ...}: what an artefact must hold."""
-        shapes = jax.eval_shape(self.init_weights, root_key(0))
-        flat = jax.tree_util.tree_flatten_with_path(shapes)[0]
-        return {"/".join(str(part.key) for part in path): leaf.shape for path, leaf in flat}
+        return artefacts.shapes_of(self.init_weights)
 
     def context(self, latent: jax.Array, params: _Params) -> jax.Array:
         """[L] latent -> [O] observation."""

@@ -128,7 +128,15 @@ def _load(name: str | Path, *kinds: str) -> SyntheticBandit | SyntheticMDP:
 
 
 def _start(description: Mapping[str, Any]) -> Made:
-    return make(description["environment"], **description["arguments"])
+    arguments = dict(description["arguments"])
+    backend = arguments.pop("backend", None)
+    # Whose function it may be, and a file is perhaps somebody else's.
+    if arguments:
+        raise UserError(
+            f"its .json starts {description['environment']!r} with the arguments {arguments}, where only a backend may "
+            "be: take them out."
+        )
+    return make(description["environment"], backend)
 
 
 def save_bandit(

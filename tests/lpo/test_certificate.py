@@ -262,6 +262,7 @@ def test_a_gate_takes_the_kink_from_any_weights():
         "is a drift whatever its weights, but one that MAY HOLD A POLICY STILL, with a kink above 0.03"
     )
     assert str(gated).startswith("is a drift whatever its weights: min f 0")
+    assert f"and {plain.kink_at_one:.3g} carried on to ratio 1" in str(plain)
 
 
 @pytest.mark.parametrize(

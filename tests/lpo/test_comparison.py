@@ -269,6 +269,19 @@ def test_a_comparison_keeps_its_rows_in_a_file(tmp_path, tiny_agent):
         compare("Synthetic-Pendulum-v1", ["ppo"], [0], spec, rows=3)
 
 
+def test_rows_replace_no_json_of_something_else(tmp_path, tiny_agent):
+    spec = AgentSpec("ppo", tiny_agent, PPOHyperparameters())
+    for content in ('{"schema_version": 1, "kind": "drift"}', "no json", "[]"):
+        (tmp_path / "mine.json").write_text(content)
+        with pytest.raises(UserError, match=r"rows in .*would replace .*mine\.json, which is of"):
+            compare("Synthetic-Pendulum-v1", ["ppo"], [0], spec, rows=tmp_path / "mine.jsonl")
+        assert (tmp_path / "mine.json").read_text() == content
+    # What a kill before the first agent leaves.
+    (tmp_path / "mine.json").write_text('{"0123456789ab": {"agent": 1}}')
+    compare("Synthetic-Pendulum-v1", ["ppo"], [0], spec, points=1, rows=tmp_path / "mine.jsonl")
+    assert "0123456789ab" not in (tmp_path / "mine.json").read_text()
+
+
 def test_a_file_that_may_only_be_read_gives_what_it_holds_and_trains_nobody(
     tmp_path, tiny_agent, monkeypatch
 ):

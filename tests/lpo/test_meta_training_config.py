@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import lpo
 from lpo.commands import MetaTrain
 from lpo.drifts import ClipDrift, LearnedDrift
 from lpo.inner_loop import MetaTrainingConfig
@@ -87,6 +88,10 @@ def test_a_configuration_that_cannot_be_is_refused(arguments, message, one_sente
             {"tasks": ("Pendulum-v1",), "backend": "spring"},
             "of Pendulum-v1 none has a choice: leave it out",
         ),
+        (
+            {"tasks": ("Synthetic-hopper",), "backend": "spring"},
+            "backend is spring, and fitness is earned in bandits, which have no physics",
+        ),
     ],
 )
 def test_an_environment_that_cannot_be_is_refused(config, changes, message, one_sentence):
@@ -134,6 +139,35 @@ def test_a_drift_that_no_import_finds_is_told_before_it_learns(config, tmp_path)
     other = replace(config, drift=Other(hidden_size=4))
     with pytest.raises(UserError, match="Here is not part of it; put that back"), pytest.warns():
         meta_train(other, tmp_path / "run", quiet=True)
+
+
+@dataclass(frozen=True)
+class Nested(lpo.Drift):
+    """One with a network's parameters, a dictionary inside of another one, or with what no file holds."""
+
+    learned = True
+    kind: str = "dict"
+
+    def init(self, key, scale=1.0):
+        weight = scale * jax.random.normal(key, (2,))
+        return {"network": {"kernel": weight} if self.kind == "dict" else [weight]}
+
+    def __call__(self, parameters, log_ratio, advantage, progress, xp=jnp):
+        (weight,) = jax.tree.leaves(parameters)
+        return xp.exp(weight[0]) * log_ratio**2
+
+
+def test_parameters_in_dictionaries_of_dictionaries_are_learned_and_saved(config, tmp_path):
+    assert Nested().shapes() == {"network/kernel": (2,)}
+    outcome = meta_train(replace(config, drift=Nested()), quiet=True)
+    path, _ = lpo.save_objective(tmp_path / "nested.npz", Nested(), outcome.mean)
+    back = lpo.load_objective(path)
+    jax.tree.map(np.testing.assert_array_equal, back.parameters, outcome.mean)
+
+
+def test_parameters_that_no_file_holds_are_told_before_they_are_learned(config):
+    with pytest.raises(UserError, match=r"in a list, a tuple or a class .*: give dictionaries"):
+        MetaTraining(replace(config, drift=Nested("list")))
 
 
 def test_a_mistake_leaves_no_folder_of_a_meta_training(config, tmp_path):

@@ -2,9 +2,11 @@
 
 import json
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 from lpo import cli, training_commands
 from lpo.comparison import Comparison, LearningCurves
@@ -107,20 +109,26 @@ def test_a_resumed_evaluation_keeps_its_settings(
     assert message in refused(*arguments, "--resume", "o")
 
 
+@pytest.mark.parametrize(
+    ("command", "objectives", "number"),
+    [("evaluate", ("dpo", "shares:share"), "--seeds"), ("align", ("shares:share",), "--agents")],
+)
 def test_a_refused_resume_leaves_the_folder_as_it_was(
-    trained, working_folder, refused, monkeypatch, capsys
+    trained, working_folder, refused, monkeypatch, capsys, command, objectives, number
 ):
-    for number in ("0.5", "0.25"):
-        (working_folder / number).mkdir()
-        text = f"def share(ratio, advantage):\n    return {number} * ratio * advantage\n"
-        (working_folder / number / "shares.py").write_text(text)
-    arguments = ["--objectives", "dpo", "shares:share", "--seeds=2"]
+    monkeypatch.setattr(training_commands, "measure_alignment", lambda *_, **__: {"regimes": []})
+    monkeypatch.setattr(training_commands.figures, "alignment_heatmap", lambda _: Figure())
+    for share in ("0.5", "0.25"):
+        (working_folder / share).mkdir()
+        text = f"def share(ratio, advantage):\n    return {share} * ratio * advantage\n"
+        (working_folder / share / "shares.py").write_text(text)
+    arguments = ["--objectives", *objectives, f"{number}=2"]
     monkeypatch.syspath_prepend(working_folder / "0.5")
-    assert cli.main(["evaluate", *arguments, "--out=o"]) == 0
+    assert cli.main([command, *arguments, "--out=o"]) == 0
     monkeypatch.delitem(sys.modules, "shares")
     monkeypatch.syspath_prepend(working_folder / "0.25")
     capsys.readouterr()
-    message = refused("evaluate", "--seeds=3", "--resume=o")
+    message = refused(command, f"{number}=2", "--resume=o")
     assert "cannot resume o: shares:share is not what it was when the run was started" in message
 
 
@@ -141,6 +149,17 @@ def test_train_prints_the_curve_and_stores_it(trained, working_folder, capsys):
     assert curve["returns"] == [[-1500.0, -300.0]] * 2
     assert (curve["seeds"], curve["mode_actions"]) == ([5, 6], False)
     assert (working_folder / "results" / "curves.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_train_says_of_agents_that_diverged_that_they_did(monkeypatch, capsys):
+    def diverged(*arguments, **settings):
+        (curve,) = compared(*arguments, **settings).curves
+        return Comparison([replace(curve, failed=1)])
+
+    monkeypatch.setattr(training_commands, "compare", diverged)
+    assert cli.main(["train", "--seeds=2"]) == 0
+    *_, end, caution = capsys.readouterr().out.splitlines()
+    assert end.startswith("final return") and caution.startswith("1 of 2 agents of ppo diverged")
 
 
 def test_evaluate_compares_with_the_first_objective(trained, working_folder, capsys, monkeypatch):

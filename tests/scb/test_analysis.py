@@ -8,6 +8,7 @@ from gymnax.environments import spaces
 
 import scb
 from scb.analysis import figures
+from scb.analysis.explain import explain
 from scb.analysis.importance import reward_variance
 from scb.analysis.optimal_actions import optimal_actions, optimal_policy
 from scb.analysis.planes import observation_names, plane_for
@@ -17,6 +18,7 @@ from scb.environments.synthetic import BanditConfig, SyntheticBandit
 from scb.environments.zoo import load_bandit
 from scb.errors import UserError
 from scb.evaluation import evaluate
+from scb.measurement import Place
 
 
 def tent(observation_size: int = 3, size: int = 1) -> SyntheticBandit:
@@ -207,6 +209,16 @@ def test_explain_writes_what_it_found(tmp_path, capsys):
     assert numbers["importance"]["velocity"] > numbers["importance"]["position"]
     assert (tmp_path / "a" / "explain.png").stat().st_size > 10_000
     assert "of the reward's variance, alone or with others: velocity" in capsys.readouterr().out
+
+
+def test_explain_takes_observations_that_are_numbers_of_states():
+    place = Place.named("FrozenLake-misc")
+    assert isinstance(place.env.observation_space(place.params), spaces.Discrete)
+    shapes = SyntheticBandit(1, spaces.Discrete(4), BanditConfig(hidden_size=4), name="Test")
+    weights = shapes.init_weights(jax.random.key(0))
+    bandit = SyntheticBandit(1, spaces.Discrete(4), shapes.config, weights, "Test")
+    numbers, parts = explain(bandit, place, episodes=2, seed=0)
+    assert parts["plane"] is None and len(numbers["importance"]) == 1
 
 
 def parts_of(size, plane):

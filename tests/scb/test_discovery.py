@@ -802,3 +802,5 @@ def test_a_search_with_the_papers_curriculum_does_not_grow():
     # It is stretched to the search's length.
     assert DiscoveryConfig(environment="MountainCar-v0", curriculum="paper").growing == ()
     assert DiscoveryConfig(curriculum="linear:10:20:1:2").growing == ("evolution.num_generations",)
+    # For Pendulum it has none.
+    assert DiscoveryConfig(curriculum="paper").growing == ("evolution.num_generations",)

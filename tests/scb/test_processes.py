@@ -213,6 +213,13 @@ def test_what_a_launcher_says_is_enough_where_it_says_all(monkeypatch, environme
     assert bool(asked) == joined
 
 
+def test_a_launcher_that_hides_where_the_first_is_asks_for_flags():
+    said = {"OMPI_COMM_WORLD_SIZE": "4", "OMPI_COMM_WORLD_RANK": "2"}
+    with pytest.raises(UserError, match=r"--processes 4 --process \$OMPI_COMM_WORLD_RANK"):
+        processes.start({}, said)
+    processes.start({}, said | {"OMPI_COMM_WORLD_SIZE": "1"})
+
+
 def test_a_machine_whose_own_name_has_no_address_is_told_so(monkeypatch):
     def unknown():
         raise RuntimeError("Unable to initialize backend 'cpu': rv == 0. -2 vs 0")

@@ -1,4 +1,5 @@
 import errno
+import fcntl
 import json
 import math
 import sys
@@ -73,6 +74,22 @@ def test_a_file_is_held_by_one_command(tmp_path):
         lock = tmp_path / ".report.json.lock"
         assert is_locked(lock)
     assert not lock.exists() and not path.exists()
+
+
+def test_a_lock_that_was_removed_as_it_was_taken_holds_nothing(tmp_path, monkeypatch):
+    path, lock = tmp_path / "report.json", tmp_path / ".report.json.lock"
+    lockf = fcntl.lockf
+
+    def late(file, flags):
+        lock.unlink()  # by whoever held it, before it let go
+        lockf(file, flags)
+
+    monkeypatch.setattr(fcntl, "lockf", late)
+    with pytest.raises(UserError, match="in use by another command"), held(path):
+        pass
+    monkeypatch.setattr(fcntl, "lockf", lockf)
+    with held(path):
+        assert is_locked(lock)
 
 
 @pytest.mark.parametrize("settings", ['{"theirs": 1}', "no json"])

@@ -577,6 +577,16 @@ def test_a_description_that_is_no_mdps_is_refused(tmp_path, change):
         load_synthetic(path)
 
 
+def test_a_file_gives_no_arguments_to_what_it_starts_in(tmp_path):
+    path, *_ = saved(tmp_path, "T")
+    ran = tmp_path / "ran"
+    start = {"environment": "os:makedirs", "arguments": {"name": str(ran)}}
+    edit(path, lambda config: config.update(start=start))
+    with pytest.raises(UserError, match=r"'os:makedirs' with the arguments .* take them out"):
+        load_synthetic(path)
+    assert not ran.exists()
+
+
 def test_weights_of_another_parameterization_or_architecture_are_refused(tmp_path):
     path, *_ = saved(tmp_path, "T")
     edit(path, lambda config: config["mdp"].update(parameterization="TI"))
