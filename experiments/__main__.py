@@ -104,10 +104,12 @@ def overview(experiments: Sequence[Experiment], data: Path) -> str:
         if not complete(report):
             entry["problem"] = "Measured in part only."
             continue
-        outcome = claims.outcome(experiment.judged(report))
+        judged = experiment.judged(report)
         entry |= {
             "report": report,
-            "outcome": outcome,
+            "outcome": claims.outcome(judged),
+            "judged": judged,
+            "refuted": sum(x.outcome == claims.FAILS for x in judged),
             "verdict": experiment.block("verdict", report),
         }
     rows = [entry for entry in sections if entry["outcome"]]

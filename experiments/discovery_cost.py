@@ -193,7 +193,7 @@ def starts(runs: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """Of every environment with a target and runs of both starts, the first of each to reach it, by total steps.
 
     Returns:
-      [{"environment", "target", "warm", "random": the run or None, "tried": how many there are of the start with more,
+      [{"environment", "target", "warm", "random": the run or None, "tried": {start: how many there are},
       "longest": the random run of most steps, "whole": whether it was not stopped before its end, "times": the random
       run's steps to the target (where it gets there; else all that the longest took) over those of the warm one}].
     """
@@ -221,7 +221,7 @@ def starts(runs: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
                 "environment": environment,
                 "target": longest["target"],
                 "longest": longest,
-                "tried": max(map(len, of_each.values())),
+                "tried": {start: len(of_it) for start, of_it in of_each.items()},
                 "whole": longest["planned_generations"] in (None, longest["generations"]),
                 "times": took / fast["reached"]["steps"] if fast else None,
                 **first,

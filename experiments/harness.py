@@ -32,7 +32,7 @@ from scb.command_line import flags
 from scb.configurations import grown
 from scb.environments.registry import families
 from scb.errors import UserError
-from scb.files import make_folder, write_json
+from scb.files import as_json, make_folder, write_json
 from scb.machine import machine_description, package_versions
 from scb.runs import held
 
@@ -228,7 +228,7 @@ class Experiment:
                     f"{out} holds the preset {report['preset']}: choose another --out for the preset {preset}, beside "
                     "which its page is then written; of all experiments another --data and --docs."
                 )
-            plan = json.loads(json.dumps(dict(self.presets[preset])))
+            plan = as_json(dict(self.presets[preset]))
             stored = report.get("plan", plan)
             more = {x: plan[x] for x in self.grows if grown(stored.get(x), plan[x])}
             if {**stored, **more} != plan:

@@ -29,13 +29,13 @@ from scb.keys import root_key, split_key
 from scb.measurement import Place
 from scb.statistics import Estimate, estimate
 
-# What the actions of each are.
-ACTIONS = {
-    "Acrobot-v1": "torque on joint 2, \u22121, 0, 1",
-    "CartPole-v1": "push left, right",
-    "MountainCar-v0": "push left, none, right",
-    "MountainCarContinuous-v0": "force (of its maximum)",
-    "Pendulum-v1": "torque (N m)",
+# What the actions of each are, and what discrete ones are called.
+ACTIONS: dict[str, tuple[str, tuple[str, ...]]] = {
+    "Acrobot-v1": ("torque on joint 2", ("\u22121", "0", "1")),
+    "CartPole-v1": ("push", ("left", "right")),
+    "MountainCar-v0": ("push", ("left", "none", "right")),
+    "MountainCarContinuous-v0": ("force (of its maximum)", ()),
+    "Pendulum-v1": ("torque (N m)", ()),
 }
 POINTS = 60  # of the grid of best actions, in either direction
 # An entry that causes less than this share of the reward's variance is one that it hardly depends on.
@@ -156,14 +156,12 @@ def draw_actions(axes: Axes, entry: Mapping[str, Any], actions: str) -> tuple[Pl
     return plane, figures.action_grid(axes, plane, unpacked(entry[actions]), *space)
 
 
-def action_bar(
-    figure: Figure, axes: Axes, drawn: Any, environment: str, num_actions: int | None
-) -> None:
+def action_bar(figure: Figure, axes: Axes, drawn: Any, environment: str) -> None:
     """The colour bar beside a map of best actions."""
-    bar = figure.colorbar(drawn, ax=axes, aspect=30)
-    bar.set_label(f"best action: {ACTIONS[environment]}", fontsize=8)
-    if num_actions:
-        bar.set_ticks(range(num_actions))
+    bar, (action, names) = figure.colorbar(drawn, ax=axes, aspect=30), ACTIONS[environment]
+    bar.set_label(f"best action: {action}", fontsize=8)
+    if names:
+        bar.set_ticks(range(len(names)), labels=names)
 
 
 def draw(report: Mapping[str, Any]) -> Figure:
@@ -173,7 +171,7 @@ def draw(report: Mapping[str, Any]) -> Figure:
     panels: Any = figure.subplots(rows, 2, squeeze=False)
     for (left, right), (name, found) in zip(panels, report["environments"].items(), strict=True):
         plane, drawn = draw_actions(left, found, "actions")
-        action_bar(figure, left, drawn, name, found["num_actions"])
+        action_bar(figure, left, drawn, name)
         figures.draw_trajectory(left, plane, unpacked(found["episode"]))
         left.set_title(name, fontsize=10)
         shares = [x["value"] for x in found["importance"].values()]

@@ -12,6 +12,7 @@ from scb.environments.registry import environment_spec
 from scb.environments.synthetic import SyntheticBandit
 from scb.environments.zoo import bandit_metadata, load_bandit, zoo_names
 from scb.errors import UserError
+from scb.files import as_json
 from scb.measurement import Place, as_random
 from scb.rows import Rows
 
@@ -47,7 +48,7 @@ def settled(report: dict[str, Any], **settings: Any) -> None:
       UserError: what it holds was measured with something else.
     """
     for name, value in settings.items():
-        value = json.loads(json.dumps(value))
+        value = as_json(value)
         if report.setdefault(name, value) != value:
             raise UserError(
                 f"the report holds what was measured with {name} {report[name]}, and {value} is asked for: choose "

@@ -184,7 +184,7 @@ def draw(report: Mapping[str, Any]) -> Figure:
             # A white edge, for black is hard to see on the dark ends of the background.
             axes.scatter(*points.T, s=6, color=plotting.BLACK, edgecolors="white", linewidths=0.3)
             axes.set_title(f"{name}: {whose}", fontsize=9)
-        action_bar(figure, right, drawn, name, entry["num_actions"])
+        action_bar(figure, right, drawn, name)
     plotting.figure_title(
         figure,
         f"{STATES} states of an expert in the environment and of the bandit, over the best actions",

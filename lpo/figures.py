@@ -63,22 +63,31 @@ _FURTHER = (
     Look(SKY_BLUE, (0, (1, 1)), "P"),
     Look(BLACK, (0, (3, 1, 1, 1)), "*"),
 )
+_ZOO_LOOKS = dict(
+    zip(
+        ("lpo-pendulum", "lpo-multi", "lpo-pendulum-ee", "ta-lpo", "lpo-cartpole-ee"),
+        (_LEARNED, *_FURTHER),
+        strict=True,
+    )
+)
 
 
 def looks(names: Sequence[str]) -> dict[str, Look]:
     """{objective: its look}, the same in every figure.
 
-    "ppo", "dpo" and "none" have their own, the first other name is taken for the learned one.
-    Further names ("ppo-0.3", "dpo-4-1.2", a second learned objective) take the remaining colours in turn.
+    "ppo", "dpo", "none" and those of the zoo have their own. Of others the first is taken for the learned one;
+    further names ("ppo-0.3", "dpo-4-1.2", a second learned objective) take the remaining colours in turn.
     """
-    chosen = {name: _LOOKS[name] for name in names if name in _LOOKS}
-    others = [name for name in dict.fromkeys(names) if name not in _LOOKS]
+    own = _LOOKS | _ZOO_LOOKS
+    chosen = {name: own[name] for name in names if name in own}
+    others = [name for name in dict.fromkeys(names) if name not in own]
     # Constants by value make a variant of PPO or DPO, which must not take the learned objective's look.
     learned = [name for name in others if not name.startswith(("ppo-", "dpo-"))]
-    if learned:
+    if learned and _LEARNED not in chosen.values():
         chosen[learned[0]] = _LEARNED
     further = [name for name in others if name not in chosen]
-    return chosen | {name: _FURTHER[i % len(_FURTHER)] for i, name in enumerate(further)}
+    free = [look for look in _FURTHER if look not in chosen.values()] or _FURTHER
+    return chosen | {name: free[i % len(free)] for i, name in enumerate(further)}
 
 
 def learning_curves(curves: "Sequence[LearningCurves]") -> Figure:
@@ -272,7 +281,7 @@ def alignment_heatmap(report: Mapping[str, Any]) -> Figure:
                     ha="center",
                     va="center",
                     fontsize=8,
-                    color="white" if abs(values[i, j]) > 0.7 else "black",
+                    color="white" if abs(values[i, j]) > 0.55 else "black",
                 )
         bar = figure.colorbar(image, ax=axes)
         bar.set_label("Spearman's correlation")

@@ -1,6 +1,5 @@
 """A configuration as a run's folder stores it, and how the one that is asked for now may differ from it."""
 
-import json
 from collections.abc import Collection
 from dataclasses import MISSING, asdict, fields, is_dataclass
 from functools import reduce
@@ -8,11 +7,12 @@ from pathlib import Path
 from typing import Any, get_type_hints
 
 from scb.errors import UserError
+from scb.files import as_json
 
 
 def config_dict(config: Any) -> dict[str, Any]:
     """A configuration's dataclass as plain JSON types."""
-    return dict(json.loads(json.dumps(asdict(config))))
+    return dict(as_json(asdict(config)))
 
 
 def with_defaults(stored: Any, config: Any) -> Any:
@@ -38,7 +38,7 @@ def with_defaults(stored: Any, config: Any) -> Any:
             if entry.default_factory is not MISSING:
                 default = entry.default_factory()
             if default is not MISSING:
-                found[entry.name] = json.loads(json.dumps(default))
+                found[entry.name] = as_json(default)
     return found
 
 
@@ -71,7 +71,7 @@ def as_if_shorter(
     Raises:
       UserError: the search has done more, or as many: the last one is judged as it is done.
     """
-    stored = json.loads(json.dumps(stored))
+    stored = as_json(stored)
     for path in growing:
         *parents, name = path.split(".")
         there, given = (reduce(_entry, parents, config) for config in (stored, asked))

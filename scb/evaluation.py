@@ -26,6 +26,11 @@ class Episodes(NamedTuple):
     speeds: jax.Array | None = None  # [E] mean forward velocity, of environments that have one
 
 
+def flat(policy: Callable[[jax.Array], jax.Array]) -> Policy:
+    """A deterministic policy of [O] flattened observations, as `evaluate` takes it."""
+    return lambda observation, key: policy(jnp.ravel(observation))
+
+
 def evaluate(
     env: environment.Environment[Any, Any],
     env_params: Any,

@@ -20,7 +20,7 @@ from scb.agents.normalization import RunningStatistics, normalize, update_statis
 from scb.agents.spec import AgentSpec
 from scb.curriculum import CurriculumConfig, EpisodeLengths
 from scb.errors import UserError
-from scb.evaluation import evaluate
+from scb.evaluation import evaluate, flat
 from scb.evolution import EnvironmentSteps, EvolutionConfig, evolve
 from scb.keys import named_key, root_key, split_key
 from scb.measurement import Judge, train_and_judge
@@ -57,11 +57,9 @@ def judged(
     environment_steps: int = 0,
 ) -> Expert:
     """An expert from any policy of flattened observations, its return measured."""
-    episodes = jax.jit(
-        lambda key: (
-            evaluate(env, env_params, lambda obs, _: policy(jnp.ravel(obs)), key, EPISODES).returns
-        )
-    )(key)
+    episodes = jax.jit(lambda key: evaluate(env, env_params, flat(policy), key, EPISODES).returns)(
+        key
+    )
     steps = environment_steps + EPISODES * int(env_params.max_steps_in_episode)
     return Expert(policy, float(np.mean(episodes)), steps)
 
@@ -171,15 +169,8 @@ class _PolicySearch:
     def _returns(
         self, weights: Any, key: jax.Array, env_params: Any, limit: Any = None
     ) -> jax.Array:
-        policy = self.policy(weights)
-        return evaluate(
-            self.env,
-            env_params,
-            lambda observation, _: policy(jnp.ravel(observation)),
-            key,
-            self.config.episodes,
-            limit,
-        ).returns
+        policy = flat(self.policy(weights))
+        return evaluate(self.env, env_params, policy, key, self.config.episodes, limit).returns
 
     def evaluate(self, candidate: Any, key: jax.Array, generation: jax.Array) -> dict[str, Any]:
         limit, env_params = self.lengths.limit(generation), self.lengths.params

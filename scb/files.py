@@ -65,6 +65,11 @@ def strict_json(text: str | bytes) -> Any:
     return json.loads(text, parse_constant=refuse)
 
 
+def as_json(content: Any) -> Any:
+    """What comes back of it from a JSON file: lists for tuples."""
+    return json.loads(json.dumps(content))
+
+
 def plain(number: Any) -> float | int | None:
     """A number as JSON takes it, which has no NaN and no infinity."""
     if not np.isfinite(number):

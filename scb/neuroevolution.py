@@ -14,7 +14,7 @@ from gymnax.environments import environment, spaces
 
 from scb.agents import networks
 from scb.errors import at_least
-from scb.evaluation import Policy, evaluate
+from scb.evaluation import Policy, evaluate, flat
 from scb.keys import split_key
 from scb.spaces import action_size, clip_to_space, flat_size, scale_to_space
 
@@ -78,9 +78,7 @@ def evolve_policy(
     size = flat_size(env.observation_space(env_params))
 
     def policy_of(weights: Any) -> Policy:
-        return lambda observation, _: network_action(
-            network.apply(weights, jnp.ravel(observation)), space
-        )
+        return flat(lambda observation: network_action(network.apply(weights, observation), space))
 
     key_init, key_start, key_search = split_key(key, 3)
     start = network.init(key_init, jnp.zeros(size))

@@ -30,7 +30,7 @@ from tensorboardX.summary import scalar
 from scb import termination
 from scb.configurations import as_if_shorter, config_dict, first_difference, with_defaults
 from scb.errors import UserError, of_class
-from scb.files import cannot_write, make_folder, plain, refusing, write_json, write_text
+from scb.files import as_json, cannot_write, make_folder, plain, refusing, write_json, write_text
 from scb.machine import machine_description
 
 _LOCK = ".lock"
@@ -79,7 +79,7 @@ class Run:
         folder = Path(folder)
         if wandb_project:
             _wandb()  # that a missing package leaves no folder behind
-        config = json.loads(json.dumps(config))
+        config = as_json(config)
         if resume:
             stored, asked = ({**c, "command": None} for c in (read_config(folder), config))
             if settings is not None and "config" in stored:

@@ -85,7 +85,10 @@ def explain(
     }
     everything = np.concatenate([contexts, shown])
     space = place.env.observation_space(place.params)
-    box = tuple(map(np.asarray, flat_bounds(space))) if isinstance(space, spaces.Box) else None
+    box = None
+    if isinstance(space, spaces.Box):
+        low, high = flat_bounds(space)
+        box = np.asarray(low), np.asarray(high)
     parts = {
         "name": bandit.name,
         "summary": f"its optimal policy earns {earned} in {place.name}",

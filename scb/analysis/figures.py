@@ -43,6 +43,8 @@ def action_map(
 
 def action_colors(number: int) -> list[str]:
     """A colour for each of so many discrete actions."""
+    if number == 2:
+        return list(DISCRETE[::2])  # white would look as if there were nothing
     if number <= len(DISCRETE):
         return list(DISCRETE[:number])
     return [to_hex(x) for x in colormaps["tab20"](np.linspace(0.0, 1.0, number))]

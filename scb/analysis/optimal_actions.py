@@ -17,7 +17,7 @@ from gymnax.environments import spaces
 from scb.environments.linear import PolicyDistanceParts
 from scb.environments.synthetic import BanditParams, SyntheticBandit
 from scb.errors import UserError, one_of
-from scb.evaluation import Policy
+from scb.evaluation import Policy, flat
 from scb.keys import root_key
 from scb.spaces import action_size, clip_to_space, flat_bounds
 
@@ -67,8 +67,7 @@ def optimal_actions(
 
 def optimal_policy(bandit: SyntheticBandit, params: BanditParams | None = None) -> Policy:
     """`optimal_actions` as `scb.evaluation.evaluate` takes a policy: of unflattened observations, with a key."""
-    best = optimal_actions(bandit, params)
-    return lambda observation, key: best(jnp.ravel(observation))
+    return flat(optimal_actions(bandit, params))
 
 
 def first_action(

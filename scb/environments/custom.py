@@ -102,7 +102,8 @@ def _check(name: str, env: environment.Environment[Any, Any], params: Any) -> No
     # gymnax's own step chooses between what is begun and what goes on, and asks is_truncated whether time is up.
     base, made = environment.Environment, type(env)
     selects = made.step is base.step
-    timed = selects and made.is_truncated is base.is_truncated
+    asks_time = made.is_truncated is base.is_truncated
+    timed = selects and asks_time
 
     def first_step(key: jax.Array) -> Any:
         found = env.reset(key, params)
@@ -120,11 +121,11 @@ def _check(name: str, env: environment.Environment[Any, Any], params: Any) -> No
             # Of arrays of other shapes its space says more.
             if len({getattr(x, "shape", None) for x in (observation, inner[0])} - {None}) < 2:
                 check_same("an observation", observation, inner[0])
-            if timed and not hasattr(state, "time"):
-                raise wrong(
-                    "has a state without time, the steps of its episode: give it that field, 0 after reset_env and one "
-                    "more after each step_env"
-                )
+        if asks_time and not hasattr(state, "time"):  # an evaluation asks it too, whoever selects
+            raise wrong(
+                "has a state without time, the steps of its episode: give it that field, 0 after reset_env and one "
+                "more after each step_env"
+            )
         step = env.step(key, state, action, params)
         check_values("step", step, "observation, state, reward, terminated, truncated, info")
         if "final_observation" not in step[5]:

@@ -280,14 +280,14 @@ def test_what_only_all_pairs_together_show_is_not_said_to_be_shown(monkeypatch):
     made = report(40)
     agents = made["environments"]["hopper"]["agents"]
     shown, row = (
-        "Shown to earn more over the training: dpo on hopper",
+        "Shown to earn more than it over the training: dpo on hopper",
         "dpo earns more over the training",
     )
     assert shown in module.EXPERIMENT.page(made)
     for seed in asked.seeds:  # the new pairs are level
         agents["dpo"][str(seed)] = agents["ppo"][str(seed)]
     page = module.EXPERIMENT.page(made)
-    assert "Shown to earn more over the training: none" in page
+    assert "Shown to earn more than it over the training: none" in page
     assert "all pairs together have an interval above: dpo on hopper earns more over the" in page
     (line,) = [x for x in page.splitlines() if x.startswith("| hopper: dpo | 40 |")]
     assert line.endswith(" not confirmed |") and line.count("**") == 2 * 2

@@ -16,7 +16,7 @@ from lpo import drift_figures, figures, search_figures
 from lpo.comparison import LearningCurves
 from lpo.drifts import Drift
 from lpo.inner_loop import MetaTrainingConfig
-from lpo.objectives import Objective, load_objective
+from lpo.objectives import Objective, load_objective, zoo_names
 from lpo.update_regions import surface
 from scb import plotting
 from scb.agents.ppo import DIAGNOSIS
@@ -164,6 +164,12 @@ def test_an_objective_looks_the_same_whatever_it_is_drawn_with():
     together = figures.looks(["ppo", "dpo", "mine", "none", "ppo-0.3"])
     assert figures.looks(["none", "dpo"]) == {k: together[k] for k in ("none", "dpo")}
     assert figures.looks(["ppo-0.3", "dpo-4-1.2", "mine", "ppo"])["mine"] == together["mine"]
+    # The zoo's also wherever they stand, and each apart from what stands beside it.
+    zoo = figures.looks(zoo_names())
+    for name in zoo_names():
+        beside = figures.looks(["mine", name, "ppo-0.3"])
+        assert beside[name] == zoo[name] and len({x.color for x in beside.values()}) == 3
+    assert len({x.color for x in zoo.values()}) == len(zoo) == 5
 
 
 def test_objectives_are_told_apart_without_colour():

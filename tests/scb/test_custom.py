@@ -158,6 +158,9 @@ class NoTime(Pendulum):
     def step_env(self, key, state, action, params):
         return jnp.zeros(3), state, 0.0, jnp.bool_(False), {}
 
+class OwnStepNoTime(NoTime):
+    step = OwnStep.step
+
 def no_steps():
     return Pendulum(), Pendulum().default_params.replace(max_steps_in_episode=0)
 
@@ -350,6 +353,7 @@ def test_the_physics_that_a_factory_takes_is_part_of_the_place(module):
         ("{}:WholeNumbers", r"observation that is float32\[3\] from reset_env and int32\[3\] from"),
         ("{}:ByName", r"an observation that is float32\[3\] from reset_env and something else fr"),
         ("{}:NoTime", "has a state without time, the steps of its episode: give it that field"),
+        ("{}:OwnStepNoTime", "has a state without time, the steps of its episode: give it that"),
         ("{}:no_steps", "has a max_steps_in_episode of 0, after which an episode ends"),
         ("{}:endless", "without max_steps_in_episode"),
         ("{}:wrong", "returned a str: it must return a gymnax"),
