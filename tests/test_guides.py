@@ -43,8 +43,9 @@ def test_agents_act_as_one(capsys):
 
 
 def test_objectives_are_compared_under_settings_of_ones_own(capsys):
-    code = block("objectives.md").replace("20_000", "2_000").replace("range(10)", "range(2)")
-    exec(compile(code, "objectives.md", "exec"), {})
+    *_, code = blocks("own_objective.md")
+    code = code.replace("20_000", "2_000").replace("range(10)", "range(2)")
+    exec(compile(code, "own_objective.md", "exec"), {})
     assert "(n=2)" in capsys.readouterr().out
 
 
@@ -52,7 +53,7 @@ def test_an_objective_of_ones_own_is_compared_and_its_family_is_the_examples(
     tmp_path, monkeypatch, capsys
 ):
     monkeypatch.chdir(tmp_path)
-    compared, family = blocks("own_objective.md")
+    compared, family, _ = blocks("own_objective.md")
     small = {"range(10)": "range(2)", "policy_output_scale=0.01": "total_steps=10_000"}
     for full, less in small.items():
         assert full in compared
