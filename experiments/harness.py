@@ -95,6 +95,7 @@ class Experiment:
       minutes: {preset: roughly how long it takes on two cores}.
       needs: what it needs beyond the library or keeps beside its report, in words; empty for nothing.
       facts: report -> what its template shows beside the report itself.
+      further: names of pages beside its own, of templates that are given the same.
       extras: (report, docs) writes what the page shows beside the figure; None for nothing.
       options: a data class whose fields are its flags.
       keys: what a report holds at least.
@@ -115,6 +116,7 @@ class Experiment:
     minutes: Mapping[str, str] | None = None
     needs: str = ""
     facts: Callable[[Report], Mapping[str, Any]] = lambda report: {}
+    further: Sequence[str] = ()
     extras: Callable[[Report, Path], None] | None = None
     options: type = Preset
     keys: Sequence[str] = ()
@@ -151,6 +153,14 @@ class Experiment:
     def page(self, report: Report) -> str:
         """The page in Markdown."""
         return rendering.template(self.name).render(self.context(report))
+
+    def pages(self, report: Report) -> dict[str, str]:
+        """{name: page} of all that it has, without those of which the report tells nothing."""
+        if not rendering.has_template(self.name):
+            return {}
+        context = self.context(report)
+        made = {x: rendering.template(x).render(context) for x in (self.name, *self.further)}
+        return {name: text for name, text in made.items() if text.strip()}
 
     def block(self, part: str, report: Report) -> str:
         """A part of the page: its verdict, its body."""
@@ -286,8 +296,8 @@ class Experiment:
                 f"the report of {self.name} is not complete: leave out --only-render, with --preset "
                 f"{report.get('preset', 'quick')}, and the command goes on where it was."
             )
-        if rendering.has_template(self.name):
-            (docs / f"{self.name}.md").write_text(self.page(report))
+        for name, page in self.pages(report).items():
+            (docs / f"{name}.md").write_text(page)
         for name, figure in self.figures(report).items():
             plotting.save(figure, docs / "figures" / f"{name}.png", self.dpi)
         if self.extras is not None:

@@ -349,6 +349,7 @@ EXPERIMENT = Experiment(
     draw=draw,
     claims=claims,
     facts=facts,
+    further=("locomotion_elsewhere", "locomotion_updates"),
     options=Options,
     keys=("environments",),
     out=Path("lpo/measured/locomotion.json"),

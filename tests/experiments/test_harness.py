@@ -224,7 +224,7 @@ def test_all_experiments_in_one_go_leave_one_page(tmp_path, monkeypatch):
     assert everything.main(flags) == 0
     overview = (tmp_path / "docs" / "experiments.md").read_text()
     assert "## [Counting](counting.md)" in overview and "2 measured." in overview
-    assert "| [Counting](counting.md) | no figure | holds | quick |" in overview
+    assert "| [Counting](counting.md) | no figure | holds | 1 | 0 | 0 | quick |" in overview
     assert everything.main([*flags, "--preset", "paper"]) == 2
     (tmp_path / "data" / "counting.json").write_text("{")
     assert everything.main(flags) == 2
@@ -325,7 +325,9 @@ def test_the_committed_page_is_that_of_the_committed_report(experiment):
     if experiment.presets:
         plan = json.loads(json.dumps(experiment.presets[report["preset"]]))
         assert complete(report) and report.get("plan", plan) == plan
-    assert (harness.DOCS / f"{experiment.name}.md").read_text() == experiment.page(report)
+    pages = experiment.pages(report)
+    assert pages.keys() == {experiment.name, *experiment.further}
+    assert {name: (harness.DOCS / f"{name}.md").read_text() for name in pages} == pages
 
 
 def test_the_committed_overview_is_that_of_the_committed_reports():

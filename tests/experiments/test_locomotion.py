@@ -334,6 +334,10 @@ def test_enough_pairs_at_another_rate_are_told_with_their_intervals():
     assert late == paired_difference(ours.late, theirs.late)
     page = module.EXPERIMENT.page(made)
     assert "| dpo at 0.001 | 10 | " in page and "dpo at 0.002" not in page
+    assert (
+        "locomotion_elsewhere.md" not in page
+        and "locomotion_elsewhere" not in module.EXPERIMENT.pages(made)
+    )
 
 
 def test_agents_that_report_at_another_rate_stand_apart(tmp_path, trained_at):
@@ -354,7 +358,13 @@ def test_agents_that_report_at_another_rate_stand_apart(tmp_path, trained_at):
     assert {"locomotion_hopper", "locomotion_hopper_at_0.0005"} <= module.draw(made).keys()
     page = module.EXPERIMENT.page(made)
     assert "*Hopper at 0.0005* is hopper with a learning rate of 0.0005." in page
-    assert "(figures/locomotion_hopper_at_0.0005.png)" in page
+    assert "[On hopper at 0.0005](locomotion_elsewhere.md); [what an iteration does" in page
+    assert "(figures/locomotion_hopper_at_0.0005.png)" not in page
+    pages = module.EXPERIMENT.pages(made)
+    assert pages.keys() == {"locomotion", "locomotion_elsewhere", "locomotion_updates"}
+    assert pages["locomotion_updates"].count("_updates.png)") == 2
+    assert "**On hopper at 0.0005 nothing is shown.**" in pages["locomotion_elsewhere"]
+    assert "(figures/locomotion_hopper_at_0.0005.png)" in pages["locomotion_elsewhere"]
     assert "--environments hopper`" in page and "`--learning-rate` for those" in page
 
 
