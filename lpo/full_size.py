@@ -32,6 +32,7 @@ class Confirmation:
         within a margin), "late lead" (more over it), "early" (more over the first half) or "area" (more over all).
       reference: which objective its agents are compared with.
       known: the one of both whose agents of these seeds had been trained, and seen, before.
+      suggested: what earlier pairs said of it, in words.
     """
 
     environment: str
@@ -40,6 +41,7 @@ class Confirmation:
     of: str = "final"
     reference: str = REFERENCE
     known: str | None = None
+    suggested: str = ""
 
     def __post_init__(self) -> None:
         if self.known not in (None, self.reference, self.objective):
@@ -52,19 +54,75 @@ class Confirmation:
 
 
 CONFIRMATIONS = (
-    Confirmation("hopper", "ta-lpo", reporting(30, offset=20)),
-    Confirmation("hopper", "lpo-pendulum", reporting(40, offset=10), "late", known=REFERENCE),
-    Confirmation("hopper", "ta-lpo", reporting(60, offset=50), "area"),
-    Confirmation("hopper", "ta-lpo", reporting(40, offset=110), "early"),
-    Confirmation("hopper", "lpo-pendulum-ee", reporting(40, offset=10), "area", known=REFERENCE),
-    Confirmation("hopper", "ta-lpo", reporting(40, offset=30), "area", "dpo", known="ta-lpo"),
-    Confirmation("hopper at 0.0005", "ta-lpo", reporting(40), "area"),
-    Confirmation("hopper at 0.0005", "ta-lpo", reporting(40, offset=40), "late lead"),
-    # Suggested by four pairs that report nothing, 58 to 168 more than the clip and 150 to 316 more than DPO.
-    Confirmation("hopper", "lpo-cartpole-ee", reporting(60), "area", known=REFERENCE),
-    Confirmation("hopper", "lpo-cartpole-ee", reporting(60), "area", "dpo", known="dpo"),
-    # Suggested by twelve pairs that report nothing, 348 [107, 604].
-    Confirmation("hopper at 0.001", "ta-lpo", reporting(60), "late lead"),
+    Confirmation(
+        "hopper",
+        "ta-lpo",
+        reporting(30, offset=20),
+        suggested="10, over the last quarter +204 [\u2212131, 568], which ten more took back",
+    ),
+    Confirmation(
+        "hopper",
+        "lpo-pendulum",
+        reporting(40, offset=10),
+        "late",
+        known=REFERENCE,
+        suggested="10, +167",
+    ),
+    Confirmation(
+        "hopper", "ta-lpo", reporting(60, offset=50), "area", suggested="50, +91 [\u221213, 216]"
+    ),
+    Confirmation(
+        "hopper", "ta-lpo", reporting(40, offset=110), "early", suggested="110, +173 [60, 286]"
+    ),
+    Confirmation(
+        "hopper",
+        "lpo-pendulum-ee",
+        reporting(40, offset=10),
+        "area",
+        known=REFERENCE,
+        suggested="10, +163",
+    ),
+    Confirmation(
+        "hopper",
+        "ta-lpo",
+        reporting(40, offset=30),
+        "area",
+        "dpo",
+        known="ta-lpo",
+        suggested="30, +150 [76, 229]",
+    ),
+    Confirmation("hopper at 0.0005", "ta-lpo", reporting(40), "area", suggested="4, +210"),
+    Confirmation(
+        "hopper at 0.0005",
+        "ta-lpo",
+        reporting(40, offset=40),
+        "late lead",
+        suggested="40, +236 [\u221278, 550], corrected",
+    ),
+    Confirmation(
+        "hopper",
+        "lpo-cartpole-ee",
+        reporting(60),
+        "area",
+        known=REFERENCE,
+        suggested="4 that report nothing, +110",
+    ),
+    Confirmation(
+        "hopper",
+        "lpo-cartpole-ee",
+        reporting(60),
+        "area",
+        "dpo",
+        known="dpo",
+        suggested="the same four, +267",
+    ),
+    Confirmation(
+        "hopper at 0.001",
+        "ta-lpo",
+        reporting(60),
+        "late lead",
+        suggested="12 that report nothing, +348 [107, 604]",
+    ),
 )
 
 

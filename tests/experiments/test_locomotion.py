@@ -390,12 +390,14 @@ def test_a_claim_stated_of_another_rate_is_of_its_agents_alone(monkeypatch):
 def test_of_a_pending_confirmation_whose_reference_was_known_the_objective_alone_is_left_out(
     monkeypatch,
 ):
-    asked = full_size.Confirmation("hopper", "dpo", range(4, 14), "late", known="ppo")
+    asked = full_size.Confirmation(
+        "hopper", "dpo", range(4, 14), "late", known="ppo", suggested="seen"
+    )
     monkeypatch.setattr(full_size, "CONFIRMATIONS", (asked,))
     made = report(13)
     counts = {c.objective: len(c.seeds) for c in module.facts(made)["comparisons"]["hopper"].curves}
     assert counts == {"ppo": 13, "dpo": 4, "lpo-pendulum": 13}
-    row = "| hopper: dpo earns no less over the last quarter than PPO | 10, seeds 4 to 13; ppo known before | "
+    row = "| hopper: dpo earns no less over the last quarter than PPO | seen | 10, seeds 4 to 13; ppo known before | "
     assert row in module.EXPERIMENT.page(made)
 
 
@@ -434,7 +436,7 @@ def test_a_confirmation_has_a_reference_of_its_own(monkeypatch):
     )
     assert judged.estimate.value == pytest.approx(np.subtract(ours, theirs).mean())
     assert "a twentieth of what dpo earns" in judged.claim.reason
-    row = "than dpo | 10, seeds 4 to 13; lpo-pendulum known before | "
+    row = "than dpo |  | 10, seeds 4 to 13; lpo-pendulum known before | "
     assert row in module.EXPERIMENT.page(made)
     for agents in made["environments"]["hopper"]["agents"]["lpo-pendulum"].values():
         agents["returns"] = "0 50 9000"
