@@ -59,11 +59,8 @@ REGIMES: dict[str, dict[str, Any]] = {
 OUTCOMES = {"area": "over the training", "late": "over the last quarter"}
 REPORTED = "reported"
 TOGETHER = "the mean score in all of them"
-KINDS = {
-    "PPO's clips, and none": plotting.GREY,
-    "DPO": plotting.BLUE,
-    "learned": plotting.VERMILLION,
-}
+BANDITS, ENVIRONMENTS = "objectives in a bandit, by their return", "objectives in an environment"
+KINDS = {BANDITS: plotting.BLUE, ENVIRONMENTS: plotting.VERMILLION}
 FITNESS = FITNESSES["return"].label  # what a search for an objective judges candidates by
 
 
@@ -230,12 +227,6 @@ def _everywhere(report: Report, curves: Mapping[str, LearningCurves]) -> dict[st
     return {name: curve for name, curve in curves.items() if all(name in x for x in others)}
 
 
-def kind(objective: str) -> str:
-    """The one of `KINDS` that an objective is of."""
-    clips, dpo, learned = KINDS
-    return {"none": clips, "ppo": clips, "dpo": dpo}.get(objective.split("-")[0], learned)
-
-
 def facts(report: Report) -> dict[str, Any]:
     """The correlations as tables, the best regime, those shown to rank, what objectives earn in the environments."""
     found, elsewhere = aligned(report), ranked_elsewhere(report)
@@ -287,6 +278,7 @@ def facts(report: Report) -> dict[str, Any]:
             }
             for environment in found
         },
+        "attainable": attainable,
         "elsewhere": {
             environment: {
                 other: [_text(x) for x in of_it.values()] for other, of_it in others.items()
@@ -328,42 +320,53 @@ def _text(found: Alignment) -> str:
 
 
 def draw(report: Mapping[str, Any]) -> dict[str, Figure]:
-    """Of each environment, a panel a regime or other environment: an objective's return there against that in it."""
-    drawn = {}
-    for environment, regimes in report["environments"].items():
-        curves = ranked(environment, regimes)
-        shown = {
-            f"bandit: {name}": ("return in the bandit", fitness(entry, FITNESS, curves))
-            for name, entry in regimes.items()
-        }
-        everywhere = _everywhere(report, curves)
-        shown |= {
-            f"environment: {name}": (
-                "return over the training",
-                {objective: unpacked_row(of_it[objective]["area"]) for objective in everywhere},
-            )
-            for name, of_it in report.get("others", {}).items()
-        }
-        figure = Figure(figsize=(13, 2.7 * -(-len(shown) // 3) + 0.8))
-        for axes, (title, (label, earned)) in zip(
-            plotting.panels(figure, len(shown), 3), shown.items(), strict=True
-        ):
-            for objective, agents in earned.items():
-                x, y = agents.mean(), float(iqm(curves[objective].area))
-                axes.plot([x], [y], "o", color=KINDS[kind(objective)])
-                axes.annotate(objective, (x, y), (3, 3), textcoords="offset points", fontsize=6)
-            axes.margins(x=0.2, y=0.1)  # room for the names
-            axes.set_title(title, fontsize=10)
-            axes.set_xlabel(label)
-            axes.set_ylabel(f"return on {environment}")
-        dot = {"marker": "o", "linestyle": ""}
-        plotting.legend_of(figure, {name: {"color": x, **dot} for name, x in KINDS.items()}, 3)
-        plotting.figure_title(
-            figure,
-            f"Objectives in bandits and other environments, and on {environment} over the training",
+    """Of each environment the correlation with each regime and other environment, a panel an outcome."""
+    drawn, elsewhere = {}, ranked_elsewhere(report)
+    for environment, found in aligned(report).items():
+        figure = Figure(
+            figsize=(plotting.WIDTH, 0.3 * (len(REGIMES) + len(report.get("others", {}))) + 1.8)
         )
+        panels: Any = figure.subplots(1, len(OUTCOMES), sharex=True, sharey=True)
+        curves = ranked(environment, report["environments"][environment])
+        for axes, (outcome, words) in zip(panels, OUTCOMES.items(), strict=True):
+            rows = [
+                (f"bandit: {name}", row[FITNESS], BANDITS) for name, row in found[outcome].items()
+            ]
+            rows += [
+                (name, of_it[outcome], ENVIRONMENTS)
+                for name, of_it in elsewhere.get(environment, {}).items()
+            ]
+            for position, (_, cell, kind) in enumerate(rows):
+                if cell.spearman is None:
+                    axes.text(0.0, position, "all alike", ha="center", va="center", fontsize=8)
+                    continue
+                color = KINDS[kind]
+                axes.plot([cell.spearman], [position], "o", color=color)
+                if cell.low is not None:
+                    axes.hlines(position, cell.low, cell.high, color=color)
+            if (agree := _agree(curves, outcome)) is not None and agree > 0:
+                axes.axvline(attainable(agree), color=plotting.GREY, linestyle=":")
+            axes.axvline(0.0, color=plotting.GREY, linewidth=0.8)
+            axes.set_yticks(range(len(rows)), [name for name, *_ in rows])
+            axes.set_xlim(-1.0, 1.0)
+            axes.set_xticks([-0.5, 0.0, 0.5])
+            axes.set_xlabel("rank correlation (95 % intervals)")
+            axes.set_title(words, fontsize=10)
+        panels[0].invert_yaxis()
+        kinds = {name: {"color": x, "marker": "o"} for name, x in KINDS.items()}
+        line = {"color": plotting.GREY, "linestyle": ":"}
+        plotting.legend_of(figure, {**kinds, "attainable with these agents": line}, 3)
+        plotting.figure_title(figure, f"How objectives are ranked, against how {environment} does")
         drawn[f"locomotion_alignment_{environment}"] = figure
     return drawn
+
+
+def attainable(agree: float) -> float:
+    """The correlation of what ranks as all agents would, without scatter of its own, where halves of them agree so.
+
+    The root of what all would agree with as many others (Spearman and Brown).
+    """
+    return float(np.sqrt(2 * agree / (1 + agree)))
 
 
 EXPERIMENT = Experiment(

@@ -9,7 +9,6 @@ import pytest
 from experiments import locomotion_alignment as module
 from lpo.fitness import LABELS
 from scb.environments.registry import environment_spec
-from scb.plotting import BLUE, GREY, VERMILLION
 
 EARNED = {"ppo": 3.0, "ppo-0.1": 1.0, "dpo": 4.0, "lpo-pendulum": 2.0}
 
@@ -195,7 +194,24 @@ def test_an_environment_without_agents_says_what_trains_some(
     assert "--environments swimmer --tuning-agents 4" in said and not trained
 
 
-def test_objectives_are_drawn_by_their_kind():
-    kinds = ("ppo", "ppo-0.3", "none", "dpo", "dpo-4-1.2", "lpo-pendulum", "ta-lpo")
-    colors = [module.KINDS[module.kind(name)] for name in kinds]
-    assert colors == [GREY] * 3 + [BLUE] * 2 + [VERMILLION] * 2
+def test_the_figure_has_a_row_for_each_regime_and_environment(tmp_path, environment, trained):
+    out = tmp_path / "report.json"
+    assert module.EXPERIMENT.main(["--others", "Pendulum-v1", "CartPole-v1", f"--out={out}"]) == 0
+    (figure,) = module.EXPERIMENT.figures(json.loads(out.read_text())).values()
+    rows = [f"bandit: {name}" for name in module.REGIMES]
+    rows += ["Pendulum-v1", "CartPole-v1", module.TOGETHER]
+    known = {"bandit: its own": 1.0, "bandit: Pendulum's": -1.0, "Pendulum-v1": 1.0}
+    for axes, sign in zip(figure.axes, (1.0, -1.0), strict=True):
+        names = [text.get_text() for text in figure.axes[0].get_yticklabels()]
+        assert sorted(names) == sorted(rows)
+        points = {
+            names[int(line.get_ydata()[0])]: line.get_xdata()[0]
+            for line in axes.lines
+            if line.get_marker() == "o"
+        }
+        # In these environments the last quarter is the training reversed, in all of them alike.
+        for name, correlation in known.items():
+            of_environment = not name.startswith("bandit")
+            expected = correlation if of_environment else sign * correlation
+            assert points[name] == pytest.approx(expected)
+    assert module.attainable(0.6) == pytest.approx(0.866, abs=1e-3)
