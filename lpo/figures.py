@@ -281,7 +281,7 @@ def alignment_heatmap(report: Mapping[str, Any]) -> Figure:
                     ha="center",
                     va="center",
                     fontsize=8,
-                    color="white" if abs(values[i, j]) > 0.55 else "black",
+                    color="white" if abs(values[i, j]) > 0.6 else "black",
                 )
         bar = figure.colorbar(image, ax=axes)
         bar.set_label("Spearman's correlation")
