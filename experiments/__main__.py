@@ -104,13 +104,13 @@ def overview(experiments: Sequence[Experiment], data: Path) -> str:
         if not complete(report):
             entry["problem"] = "Measured in part only."
             continue
-        judged = experiment.judged(report)
+        context = experiment.context(report)
         entry |= {
             "report": report,
-            "outcome": claims.outcome(judged),
-            "judged": judged,
-            "refuted": sum(x.outcome == claims.FAILS for x in judged),
-            "verdict": experiment.block("verdict", report),
+            "outcome": context["outcome"],
+            "judged": context["judged"],
+            "refuted": sum(x.outcome == claims.FAILS for x in context["judged"]),
+            "verdict": rendering.block(experiment.name, "verdict", context),
         }
     rows = [entry for entry in sections if entry["outcome"]]
     return rendering.template("experiments").render(rows=rows, sections=sections)

@@ -230,7 +230,8 @@ def claims(report: Report) -> list[Claim]:
         standing = environment_spec(row["environment"]).standing_still(row["backend"])
         if standing is not None:
             text = f"{name}: agents from the bandit earn more than standing still"
-            found.append(Claim(text, partial(estimate, row["finals"]), standing, places=0))
+            finals = of_agents(partial(estimate, row["finals"]), len(row["finals"]))
+            found.append(Claim(text, finals, standing, places=0))
     return found
 
 

@@ -148,9 +148,16 @@ def _judged(found: Mapping[str, Any]) -> float | None:
 
 def _warm_start(folder: Path, environment: str) -> dict[str, Any]:
     """What expert, fit and refinement took, as the run's bandit says it; None where that is unknown."""
-    path = folder / f"{environment_spec(environment).bandit}.json"
-    cost = json.loads(path.read_text()).get("cost", {}) if path.is_file() else {}
-    stages = [cost[name] for name in ("warm_start", "refinement") if cost.get(name)]
+
+    def cost_in(name: str) -> dict[str, Any]:
+        path = folder / f"{name}.json"
+        return dict(json.loads(path.read_text()).get("cost", {})) if path.is_file() else {}
+
+    names = ("warm_start", "refinement")
+    cost = cost_in(environment_spec(environment).bandit)
+    # Of a search that has not ended, what it starts from says it.
+    stages: list[dict[str, Any]] = [cost.get(name) or cost_in(name) for name in names]
+    stages = [stage for stage in stages if stage]
 
     def total(name: str) -> float | None:
         known = [stage.get(name) for stage in stages]
@@ -223,7 +230,9 @@ def starts(runs: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
                 "longest": longest,
                 "tried": {start: len(of_it) for start, of_it in of_each.items()},
                 "whole": longest["planned_generations"] in (None, longest["generations"]),
-                "times": took / fast["reached"]["steps"] if fast else None,
+                "times": took / fast["reached"]["steps"]
+                if fast and fast["reached"]["steps"]
+                else None,
                 **first,
             }
         )
@@ -348,6 +357,11 @@ class Options:
 
 def measure(options: Options, report: dict[str, Any], save: Save) -> None:
     """The runs of these folders, beside those that the report has of others."""
+    names = [folder.resolve().name for folder in options.folders]
+    if twice := [name for name in names if names.count(name) > 1]:
+        raise UserError(
+            f"two of the folders are called {twice[0]}, by which runs are known here: rename one."
+        )
     earlier = {run["name"]: run for run in report.get("runs", ())}
     found = collect(options.folders)
     runs = earlier | {run["name"]: run for run in found["runs"]}

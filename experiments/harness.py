@@ -140,11 +140,12 @@ class Experiment:
 
     def context(self, report: Report) -> dict[str, Any]:
         """What its template is rendered with."""
-        judged = self.judged(report)
+        found = self.claims(report)
+        judged = claims.judge(found)
         own = {
             "experiment": self,
             "judged": judged,
-            "level": claims.confidence(self.claims(report)),
+            "level": claims.confidence(found),
             "stored": any(x.stored for x in judged),
             "outcome": claims.outcome(judged),
         }
@@ -320,7 +321,12 @@ def last_line(command: Sequence[str]) -> dict[str, Any]:
     Raises:
       UserError: it failed; what it said of that is on stderr.
     """
-    done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=False)
+    try:
+        done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=False)
+    except OSError as error:
+        raise UserError(
+            f"{command[0]} cannot be run ({error.strerror}): give a program of Python, such as FOLDER/bin/python."
+        ) from error
     if done.returncode:
         raise UserError(f"an agent could not be trained: {shlex.join(command)} says why.")
     return dict(json.loads(done.stdout.strip().splitlines()[-1]))

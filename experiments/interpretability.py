@@ -40,6 +40,8 @@ ACTIONS: dict[str, tuple[str, tuple[str, ...]]] = {
 POINTS = 60  # of the grid of best actions, in either direction
 # An entry that causes less than this share of the reward's variance is one that it hardly depends on.
 HARDLY = 0.1
+# Of the plane, what is never and what often; and of the force, what is none.
+NEVER, OFTEN, NOTHING = 0.01, 0.1, 0.1
 
 
 def parts(plan: Mapping[str, Any], report: dict[str, Any]) -> Iterator[Part]:
@@ -84,7 +86,7 @@ def nothing_done(entry: Mapping[str, Any]) -> float:
     actions = unpacked(entry["actions"])
     if entry["num_actions"]:
         return float(np.mean(actions == 1))  # of push left, nothing, push right
-    return float(np.mean(np.abs(actions) < 0.1))
+    return float(np.mean(np.abs(actions) < NOTHING))
 
 
 def claims(report: Report) -> list[Claim]:
@@ -119,12 +121,15 @@ def claims(report: Report) -> list[Claim]:
                 places=3,
             )
         )
-    never = nothing_done(environments["MountainCar-v0"]) < 0.01
-    often = nothing_done(environments["MountainCarContinuous-v0"]) > 0.1
+    never = nothing_done(environments["MountainCar-v0"]) < NEVER
+    often = nothing_done(environments["MountainCarContinuous-v0"]) > OFTEN
     return [
         *found,
-        Claim("MountainCar's bandit never does nothing", never),
-        Claim("its continuous sibling's often does", often),
+        Claim(f"MountainCar's bandit does nothing in less than {NEVER:.0%} of the plane", never),
+        Claim(
+            f"its continuous sibling's does, with less than {NOTHING:.0%} of the force, in more than {OFTEN:.0%}",
+            often,
+        ),
     ]
 
 

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from experiments.claims import FAILS, HOLDS, Claim, Judged, judge, of_agents
 from experiments.harness import Experiment, Keeping
 from experiments.parts import InParts, Part
-from experiments.reports import Report, lost, rows_in, settled
+from experiments.reports import Report, lost, rows_in, same_objectives, settled
 from experiments.robustness import learned_for, named
 from lpo.comparison import compare, ppo_spec
 from lpo.figures import looks
@@ -73,7 +73,9 @@ def parts(options: Options, report: dict[str, Any]) -> Iterator[Part]:
     """The agents of one objective at one rate in one environment: those that choose, and those that are reported."""
     settled(report, agents=options.agents, choosing=options.choosing, rates=options.rates)
     names = tuple(dict.fromkeys((*REFERENCES, *options.objectives)))
-    check_names([load_objective(name) for name in names])  # that nobody waits for a mistake
+    loaded = [load_objective(name) for name in names]
+    check_names(loaded)  # that nobody waits for a mistake
+    same_objectives(report, loaded)
     seeds = {
         CHOOSING: validation(options.choosing),
         REPORTED: reporting(options.agents, offset=OFFSET),

@@ -25,7 +25,7 @@ from experiments.claims import HOLDS
 from experiments.harness import Experiment, Keeping
 from experiments.locomotion_claims import ASKED, STATED, claims, confirmed, leading, since, texts
 from experiments.parts import InParts, Keys, Part, file_name
-from experiments.reports import Report, rows_in
+from experiments.reports import Report, rows_in, same_objectives
 from lpo import figures
 from lpo.comparison import Comparison, LearningCurves, changed, compare, ppo_spec
 from lpo.full_size import as_comparison, looked_at
@@ -89,8 +89,7 @@ def parts(options: Options, report: dict[str, Any]) -> Iterator[Part]:
     """The choice of a clip, then a few seeds of every objective at a time: all have as many wherever it ends."""
     objectives = tuple(dict.fromkeys((REFERENCE, *options.objectives)))
     # That nobody waits for a name that is none, or for a rate.
-    for name in (*objectives, *options.validated):
-        load_objective(name)
+    same_objectives(report, map(load_objective, (*objectives, *options.validated)))
     given = options.learning_rate
     for rate in (*options.rates, *([] if given is None else [given])):
         check_value("learning_rate", rate)

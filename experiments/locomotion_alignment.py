@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from experiments.alignment import CONFIRMATION_SEED
 from experiments.harness import Experiment
 from experiments.parts import InParts, Keys, Part
-from experiments.reports import Report, forget_other, settled
+from experiments.reports import Report, forget_other, same_objectives, settled
 from lpo.alignment import Alignment, Regime, alignment, regime_fitness
 from lpo.comparison import LearningCurves, compare
 from lpo.fitness import FITNESSES, LABELS
@@ -99,6 +99,7 @@ def parts(options: Options, report: dict[str, Any]) -> Iterator[Part]:
                 f"on {environment} {len(objectives)} objectives have agents that report nothing, and fewer than 3 rank "
                 f"nothing: python -m experiments locomotion --environments {environment} --tuning-agents 4 trains some."
             )
+        same_objectives(report, map(load_objective, objectives))
         for name in REGIMES:
             of_it = regime(environment, name)
             digest = bandit_metadata(of_it.bandit)["sha256"]

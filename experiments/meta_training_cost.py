@@ -16,6 +16,7 @@ import numpy as np
 from experiments.harness import Experiment, Save
 from lpo.inner_loop import MetaTrainingConfig
 from lpo.meta_training import MetaTraining, environment_problem
+from scb.errors import at_least
 from scb.keys import root_key
 from scb.population import map_population
 from scb.runs import Stopwatch
@@ -28,6 +29,9 @@ class Options:
     population_size: int = 32
     generations: int = 3
     """timed generations, the first not counted"""
+
+    def __post_init__(self) -> None:
+        at_least(1, self, "population_size", "generations")
 
 
 def measure(options: Options, report: dict[str, Any], save: Save) -> None:

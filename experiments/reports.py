@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from experiments.parts import file_name
+from lpo.objectives import Objective
 from scb.environments.registry import environment_spec
 from scb.environments.synthetic import SyntheticBandit
 from scb.environments.zoo import bandit_metadata, load_bandit, zoo_names
@@ -54,6 +55,22 @@ def settled(report: dict[str, Any], **settings: Any) -> None:
                 f"the report holds what was measured with {name} {report[name]}, and {value} is asked for: choose "
                 "another --out."
             )
+
+
+def same_objectives(report: dict[str, Any], objectives: Iterable[Objective]) -> None:
+    """Notes in a report what its objectives' names do not tell: what is in their files, and code of somebody's own.
+
+    Raises:
+      UserError: it holds agents of another objective with such a name.
+    """
+    noted = report.setdefault("digests", {})
+    for objective in objectives:
+        for name, digest in objective.digests.items():
+            if noted.setdefault(name, digest) != digest:
+                raise UserError(
+                    f"the report holds agents of another objective with the name {name}: choose another --out, or give "
+                    "this one another name."
+                )
 
 
 def bandit_of(environment: str) -> tuple[SyntheticBandit, str]:

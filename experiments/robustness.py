@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from experiments.claims import TENTH, Claim, Judged, judge
 from experiments.harness import Experiment, Keeping, plan_of
 from experiments.parts import InParts, Keys, Part
-from experiments.reports import Report, finite, rows_in, settled
+from experiments.reports import Report, finite, rows_in, same_objectives, settled
 from lpo.comparison import ppo_spec
 from lpo.objectives import REFERENCE, Objective, check_names, learned_in, load_objective
 from lpo.suite import suite
@@ -115,6 +115,7 @@ def parts(options: Options, report: dict[str, Any]) -> Iterator[Part]:
     loaded = [None if x == DRAWN else load_objective(x) for x in names]
     check_names([x for x in loaded if x])
     learned_in([x for x in loaded if x])  # before the first waits, and not after
+    same_objectives(report, [x for x in loaded if x])
     objectives = {DRAWN if x is None else x.name: x for x in loaded}
     for environment in options.environments:
         for i, (words, setting) in enumerate(settings_of(environment).items()):

@@ -194,8 +194,13 @@ def facts(report: Report) -> dict[str, Any]:
         )
     slope, intercept = grown([(int(n), ms) for n, ms in report["gathering"].items()])
     gathering = intercept + slope * report["devices"]
+    largest = str(max(POPULATIONS))
+    if not all(largest in found for found in report["strategy"].values()):
+        raise UserError(
+            "the report of scaling is not complete: leave out --only-render, and the command goes on where it was."
+        )
     strategy = {
-        kind: {"parameters": found[str(max(POPULATIONS))]["parameters"], "times": found}
+        kind: {"parameters": found[largest]["parameters"], "times": found}
         for kind, found in report["strategy"].items()
     }
     return {
@@ -209,7 +214,7 @@ def facts(report: Report) -> dict[str, Any]:
         "costly": SHARE,
         "from": (1000 * alone * SHARE - intercept) / slope if slope > 1e-9 else None,
         "kinds": strategy,
-        "largest": str(max(POPULATIONS)),
+        "largest": largest,
     }
 
 

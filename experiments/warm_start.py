@@ -20,7 +20,7 @@ import numpy as np
 from experiments.harness import Experiment, Save
 from experiments.rendering import number, text
 from experiments.reports import settled
-from scb.agents.spec import algorithms_for, bandit_agent
+from scb.agents.spec import algorithms_for, bandit_agent, tables_of
 from scb.environments.synthetic import BanditConfig, bandit_for
 from scb.errors import at_least
 from scb.expert_data import expert_dataset
@@ -82,6 +82,8 @@ class Options:
 
     def __post_init__(self) -> None:
         at_least(2, self, "agents")  # a single one has no interval
+        for name in self.algorithms:
+            tables_of(name)  # which says so of a name that is none
         at_least(1, self, "episodes")
 
 
@@ -90,6 +92,8 @@ def measure(options: Options, report: dict[str, Any], save: Save) -> None:
     settled(report, seed=SEED, agents=options.agents, episodes=options.episodes)
     report.setdefault("environments", {})
     for name in options.environment:
+        if name in report["environments"]:
+            continue
         judge_in = Place.named(name)
         env, env_params = judge_in.env, judge_in.params
         space = env.action_space(env_params)

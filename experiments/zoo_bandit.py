@@ -7,7 +7,6 @@ measured at its end; nothing is edited by hand. A new bandit enters with what it
 measures the zoo, and the same command again fills the table's results in.
 """
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +14,8 @@ from typing import Any
 
 import tyro
 
-from experiments.harness import Experiment, Save
+from experiments.harness import DATA, Experiment, Save
+from experiments.reports import read
 from scb.environments.zoo import bandit_metadata, load_bandit, save_bandit
 
 
@@ -49,13 +49,15 @@ class Options:
 
     bandits: tyro.conf.Positional[tuple[Path, ...]]
     """files that scb discover wrote"""
-    table: Path = Path("docs/data/zoo_table.json")
+    table: Path | None = None
+    """what they are worth, of zoo_table; docs/data/zoo_table.json where that is there"""
     folder: Path = Path("scb/zoo")
 
 
 def measure(options: Options, report: dict[str, Any], save: Save) -> None:
     """Writes the entries."""
-    table = json.loads(options.table.read_text()) if options.table.exists() else {}
+    usual = DATA / "zoo_table.json"
+    table = read(options.table or usual, missing_is_new=options.table is None)
     for path in options.bandits:
         bandit = load_bandit(path)
         metadata = dict(bandit_metadata(str(path)))

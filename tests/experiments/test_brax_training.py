@@ -100,8 +100,13 @@ def test_claims_follow_the_figures(report):
     body = experiment.EXPERIMENT.block("body", report)
     assert "| 200 [200, 200] | 2 of 2 | 200000 | 600000 | 20 to 60 | 20 to 60 |" in body
     assert "| 200 [200, 200] | 0 of 2 | 800000 |  | more than 80 |" in body
-    # Two agents each decide nothing, whatever they say. And 200 is less than standing still.
-    assert outcomes(report) == (["undecided", "undecided"], ["does not hold"] * 2)
+    # Two agents each decide nothing, whatever they say.
+    assert outcomes(report) == (["undecided", "undecided"], ["undecided"] * 2)
+    bandit = report["bandits"][NAMES[0]]["ppo"]
+    report["bandits"][NAMES[0]]["ppo"] = {**bandit, "returns": bandit["returns"] * 5}
+    # Ten do, and 200 is less than standing still.
+    assert sorted(outcomes(report)[1]) == ["does not hold", "undecided"]
+    report["bandits"][NAMES[0]]["ppo"] = bandit
     curve = report["environments"]["hopper (generalized)"]["ppo"]
     many = {**curve, "returns": curve["returns"] * 5}
     report["environments"]["hopper (generalized)"]["ppo"] = many

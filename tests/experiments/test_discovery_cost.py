@@ -240,6 +240,28 @@ def test_runs_that_were_read_before_stay_but_where_the_same_folder_is_read_again
     assert {run["name"]: run["generations"] for run in runs} == {"a": 4, "b": 4}
 
 
+def test_what_a_search_that_goes_on_starts_from_is_paid_for(tmp_path):
+    folder = run_folder(tmp_path / "a", rows=3)
+    cost = {"environment_steps": 1000, "seconds": 120.0}
+    for name in ("warm_start", "refinement"):
+        (folder / f"{name}.json").write_text(json.dumps({"cost": cost}))
+    [run] = discovery_cost.collect([folder])["runs"]
+    assert run["points"][0][1:3] == [4.0, 2000]
+    # One that says nothing of it and is at the target from the start saves no number of times.
+    none = run_folder(tmp_path / "b", judged={0: -150.0})
+    never = run_folder(tmp_path / "c", "random", judged={0: -400.0}, final=-300.0)
+    [found] = discovery_cost.starts(discovery_cost.collect([none, never])["runs"])
+    assert found["warm"]["reached"]["steps"] == 0 and found["times"] is None
+
+
+def test_folders_of_one_name_are_refused(tmp_path, capsys):
+    (tmp_path / "x").mkdir()
+    folders = [str(run_folder(tmp_path / "a")), str(run_folder(tmp_path / "x" / "a", "random"))]
+    places = ["--out", str(tmp_path / "cost.json"), "--docs", str(tmp_path)]
+    assert discovery_cost.EXPERIMENT.main([*folders, *places]) == 2
+    assert "two of the folders are called a" in capsys.readouterr().err
+
+
 def test_what_a_warm_start_saves_is_told(tmp_path):
     # The target is -170: the warm run is there before generation 2, after 220 steps, the random one after 440.
     warm = run_folder(tmp_path / "a")

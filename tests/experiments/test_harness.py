@@ -14,6 +14,7 @@ from experiments.claims import Claim
 from experiments.harness import Experiment
 from experiments.rendering import text
 from experiments.reports import complete, read
+from scb.errors import UserError
 from scb.statistics import Estimate
 from tests.locking import is_locked
 
@@ -296,6 +297,12 @@ def test_a_report_goes_on_where_only_what_may_grow_has_grown(tmp_path, capsys):
     assert growing(tables).main(flags) == 0
     assert growing({"value": 1, "of": {"x": 1, "y": 2}}).main(flags) == 0
     assert growing({"value": 1, "of": {"x": 2, "y": 2}}).main(flags) == 2
+
+
+def test_a_folder_in_the_place_of_a_program_is_told(tmp_path):
+    with pytest.raises(UserError, match=r"cannot be run \(.*\): give a program of Python"):
+        harness.last_line([str(tmp_path)])
+    assert harness.last_line([sys.executable, "-c", "print('{\"a\": 1}')"]) == {"a": 1}
 
 
 def test_equal_numbers_are_a_number_and_others_a_span():

@@ -274,6 +274,28 @@ def test_a_confirmation_is_decided_by_its_own_agents_when_all_are_there(monkeypa
     assert locomotion_claims.confirmed(made) == []
 
 
+def test_where_all_agents_wait_for_a_claim_the_page_says_so(monkeypatch, tmp_path):
+    asked = full_size.Confirmation("hopper", "dpo", range(20), "area")
+    monkeypatch.setattr(full_size, "CONFIRMATIONS", (asked,))
+    made = report(13)
+    assert module.EXPERIMENT.pages(made).keys() == {"locomotion"}
+    assert "**Nothing is compared yet**" in module.EXPERIMENT.page(made)
+    (tmp_path / "report.json").write_text(json.dumps({"experiment": "locomotion", **made}))
+    flags = [f"--out={tmp_path / 'report.json'}", "--only-render"]
+    assert module.EXPERIMENT.main(flags) == 0
+
+
+def test_what_pairs_say_that_were_trained_after_a_claim_stands_beside_it(monkeypatch):
+    asked = full_size.Confirmation("hopper", "dpo", range(4, 14), "area")
+    made = report(23)
+    assert locomotion_claims.since(made, asked) is None  # nine are too few
+    made = report(24)
+    seeds, found = locomotion_claims.since(made, asked)
+    assert seeds == list(range(14, 24))
+    # (200 - 100) / 2 over the second half of the training.
+    assert found.value == pytest.approx(50.0)
+
+
 def test_what_only_all_pairs_together_show_is_not_said_to_be_shown(monkeypatch):
     asked = full_size.Confirmation("hopper", "dpo", range(30, 40), "area")
     monkeypatch.setattr(full_size, "CONFIRMATIONS", (asked,))

@@ -1,7 +1,17 @@
+from dataclasses import replace
+
 import pytest
 
 from experiments.parts import Part
-from experiments.reports import finite, forget_other, forget_replaced, lost, settled
+from experiments.reports import (
+    finite,
+    forget_other,
+    forget_replaced,
+    lost,
+    same_objectives,
+    settled,
+)
+from lpo.objectives import load_objective
 from scb.environments.zoo import bandit_metadata
 from scb.errors import UserError
 from scb.measurement import Place
@@ -48,3 +58,14 @@ def test_an_entry_of_another_bandit_is_forgotten_and_no_other_one():
 
 def test_lost_agents_are_counted_at_any_depth_and_nothing_else_is():
     assert lost({"a": {"failed": 2, "agents": 8}, "b": {"failed": {"sac": 1, "ppo": 3}}}) == 6
+
+
+def test_a_name_stands_for_one_objective_in_a_report():
+    report = {}
+    ppo, learned = load_objective("ppo"), load_objective("lpo-pendulum")
+    same_objectives(report, [ppo, learned])
+    same_objectives(report, [learned])
+    assert report == {"digests": {"lpo-pendulum": learned.sha256}}
+    other = replace(learned, metadata={**learned.metadata, "sha256": "another"})
+    with pytest.raises(UserError, match="another objective with the name lpo-pendulum: choose ano"):
+        same_objectives(report, [other])

@@ -49,6 +49,14 @@ def test_the_page_of_one_process_compares_nothing():
     assert "**One process is all that was measured.**" in scaling.EXPERIMENT.page(alone)
 
 
+def test_a_report_that_was_cut_off_says_so():
+    found = report({"2": 2.0})
+    for times in found["strategy"].values():
+        times.popitem()
+    with pytest.raises(UserError, match="the report of scaling is not complete: leave out"):
+        scaling.EXPERIMENT.page(found)
+
+
 def test_processes_are_in_their_order_whatever_was_measured_first():
     found = report({"2": 2.0, "4": 4.0})
     found["generations"] = dict(reversed(found["generations"].items()))

@@ -159,12 +159,15 @@ def trained(arguments, objectives):
     return {c.objective: c for c in comparison.curves}
 
 
-def test_every_member_of_the_contract_trains_inside_ppo(trained):
+def test_every_member_of_the_contract_trains_inside_ppo(trained, arguments):
     assert list(trained) == ["ppo", "dpo", "none", "tiny", "zero"]
+    spec = arguments["spec"].with_values(learning_rate=0.0)
+    (untrained,) = compare(objectives=["ppo"], **{**arguments, "spec": spec}).curves
     for name, curve in trained.items():
         assert np.all(np.isfinite(curve.returns))
-        # The agent has learned something: its return is another than before.
-        assert np.all(curve.returns[:, 1] != curve.returns[:, 0]), name
+        # The same agents to begin with, and then others than those that did not learn, in the same evaluations.
+        np.testing.assert_allclose(curve.returns[:, 0], untrained.returns[:, 0], rtol=1e-5)
+        assert np.all(curve.returns[:, 1] != untrained.returns[:, 1]), name
 
 
 def test_objectives_start_from_the_same_agents_and_lead_elsewhere(trained):
