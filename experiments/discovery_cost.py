@@ -160,7 +160,7 @@ def _warm_start(folder: Path, environment: str) -> dict[str, Any]:
     stages = [stage for stage in stages if stage]
 
     def total(name: str) -> float | None:
-        known = [stage.get(name) for stage in stages]
+        known: list[Any] = [stage.get(name) for stage in stages]
         return None if not known or None in known else sum(known)
 
     steps, seconds = total("environment_steps"), total("seconds")

@@ -112,9 +112,10 @@ def versions(packages: Mapping[str, str]) -> str:
     return f"{', '.join(f'{name} {version}' for name, version in packages.items())}."
 
 
-def rule(columns: int) -> str:
-    """Of a table, under its heads."""
-    return f"|{' --- |' * columns}"
+def heads(*columns: str | Iterable[Any]) -> str:
+    """The heads of a table, and the rule under them; what an iterable has are so many columns."""
+    names = [name for x in columns for name in ([x] if isinstance(x, str) else x)]
+    return f"| {' | '.join(map(str, names))} |\n|{' --- |' * len(names)}"
 
 
 def that(judged: Sequence[Judged], outcome: str) -> list[str]:
@@ -165,7 +166,7 @@ ENVIRONMENT.filters |= {
     "told": told,
     "versions": versions,
 }
-ENVIRONMENT.globals["rule"] = rule
+ENVIRONMENT.globals["heads"] = heads
 
 
 def has_template(name: str) -> bool:
