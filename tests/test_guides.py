@@ -5,6 +5,7 @@ import sys
 from pathlib import Path
 
 import jax.numpy as jnp
+import pytest
 
 from examples.own_objective import TwoSided
 from scb.environments.registry import environment_spec, make
@@ -28,6 +29,7 @@ def test_an_agent_is_kept_and_acts_in_gymnasiums_environment(tmp_path, capsys):
     assert -1000 < float(capsys.readouterr().out) < 0
 
 
+@pytest.mark.slow
 def test_agents_of_several_learning_rates_train_at_once(capsys):
     _, vmapped, _ = blocks("agents.md")
     exec(compile(vmapped, "agents.md", "exec"), {})
@@ -35,6 +37,7 @@ def test_agents_of_several_learning_rates_train_at_once(capsys):
     assert len(set(returns)) == 4 and min(returns) > -1600 and max(returns) < -50
 
 
+@pytest.mark.slow
 def test_agents_act_as_one(capsys):
     *_, as_one = blocks("agents.md")
     exec(compile(as_one, "agents.md", "exec"), {})
@@ -42,6 +45,7 @@ def test_agents_act_as_one(capsys):
     assert worst < mean < together < 0
 
 
+@pytest.mark.slow
 def test_objectives_are_compared_under_settings_of_ones_own(capsys):
     *_, code = blocks("own_objective.md")
     code = code.replace("20_000", "2_000").replace("range(10)", "range(2)")

@@ -11,6 +11,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 from lpo import cli as lpo_cli
 from lpo.objectives import load_objective, save_objective
@@ -94,6 +95,7 @@ def test_what_is_shown_is_also_in_numbers(objective_page, capsys, tmp_path):
 
 def test_objectives_of_runs_are_shown_apart_by_their_folders(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("lpo.showing.drift_and_gradient", lambda *_: Figure())
     objective = load_objective("lpo-pendulum")
     for name in ("a", "b"):
         save_objective(Path("runs", name, "objective.npz"), objective.drift, objective.parameters)

@@ -107,6 +107,7 @@ def test_defaults_take_a_bandit_with_noise():
     assert (default.drift, default.evolution.strategy) == (LearnedDrift(base="ppo"), "Open_ES")
 
 
+@pytest.mark.slow
 def test_a_folder_keeps_a_meta_training_from_python(config, tmp_path):
     folder = tmp_path / "run"
     longer = replace(config, evolution=replace(config.evolution, num_generations=4))

@@ -312,6 +312,7 @@ def test_what_no_import_finds_is_not_saved(module, tmp_path):
     assert not list(tmp_path.glob("x*"))
 
 
+@pytest.mark.slow
 def test_a_family_of_ones_own_is_learned_and_its_run_continued(module, capsys):
     words = "meta-train --drift own_module:Power --power 4 --generations 1 --population-size 2"
     rest = " --agents-per-candidate 1 --mean-evaluations 2 --contexts 20 --out run"

@@ -362,6 +362,7 @@ def test_a_candidates_own_optimal_policy_is_one_more_task(discovered, mode):
         assert (more.training, more.evaluation) == (fewer.training, fewer.evaluation + 2 * 500)
 
 
+@pytest.mark.slow
 def test_an_optimal_policy_errs_in_every_episode_by_another_function():
     config = replace(
         CONFIG, environment="Pendulum-v1", agents_per_candidate=1, optimal_policy_episodes=3
@@ -787,6 +788,7 @@ def test_impossible_discoveries_are_refused(arguments, message):
         BanditDiscovery(replace(CONFIG, **arguments))
 
 
+@pytest.mark.slow
 def test_a_folder_keeps_a_discovery_from_python(tmp_path):
     folder = tmp_path / "run"
     longer = replace(CONFIG, evolution=replace(CONFIG.evolution, num_generations=3))

@@ -427,6 +427,7 @@ def test_the_contexts_are_fitted_to_the_states(fitted, bandit_dataset):
     assert float(contexts.std()) == pytest.approx(0.289, abs=0.06)
 
 
+@pytest.mark.slow
 def test_an_entry_that_never_changes_leaves_the_others_theirs(bandit_dataset):
     size, dataset = 4, jax.tree.map(jnp.asarray, bandit_dataset)
     spread = jnp.array([2.0, 0.0, 0.5, 1.0])
