@@ -219,8 +219,7 @@ def draw(report: Mapping[str, Any]) -> Figure:
             each, pooled = iqm(scores, axis=1), pooled_estimate(scores)
             plotting.estimate_row(axes, i + offset, each, pooled, look["color"])
     axes.axvline(1.0, color=plotting.BLACK, linestyle=":", linewidth=1.2)
-    axes.set_yticks(range(len(REWARDS)), list(REWARDS))
-    axes.invert_yaxis()
+    plotting.name_rows(axes, REWARDS)
     axes.set_xlabel("normalised score on Pendulum (0: random policy, 1: the SAC expert)")
     plotting.figure_title(
         figure,

@@ -198,8 +198,7 @@ def draw(report: Mapping[str, Any]) -> Figure:
             label = name if row == 0 else None
             left.barh(row, share, left=start, color=color, label=label)
             start += share
-    left.set_yticks(range(len(report["environments"])), list(report["environments"]))
-    left.invert_yaxis()
+    plotting.name_rows(left, report["environments"])
     left.set(
         title="Steps of an episode, where many are allowed",
         xlabel="share of the episodes in the synthetic MDP",

@@ -186,8 +186,7 @@ def draw(report: Mapping[str, Any]) -> Figure:
         axes.barh(positions, shares, height=0.18, color=colors[contexts], label=contexts)
         for x, y in zip(shares, positions, strict=True):
             axes.text(x + 0.01, y, f"{x:.1%}", va="center", fontsize=7)
-    axes.set_yticks(range(len(REWARDS)), list(REWARDS))
-    axes.invert_yaxis()
+    plotting.name_rows(axes, REWARDS)
     axes.set_xlim(0, 1.1)
     axes.set_xlabel("share of MDPs where every optimal policy of the bandit is optimal")
     plotting.figure_title(figure, f"The lemma on {report['mdps']:,} random MDPs")

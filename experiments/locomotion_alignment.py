@@ -348,12 +348,11 @@ def draw(report: Mapping[str, Any]) -> dict[str, Figure]:
             if (agree := _agree(curves, outcome)) is not None and agree > 0:
                 axes.axvline(attainable(agree), color=plotting.GREY, linestyle=":")
             axes.axvline(0.0, color=plotting.GREY, linewidth=0.8)
-            axes.set_yticks(range(len(rows)), [name for name, *_ in rows])
+            plotting.name_rows(axes, [name for name, *_ in rows])
             axes.set_xlim(-1.0, 1.0)
             axes.set_xticks([-0.5, 0.0, 0.5])
             axes.set_xlabel("rank correlation (95 % intervals)")
             axes.set_title(words, fontsize=10)
-        panels[0].invert_yaxis()
         kinds = {name: {"color": x, "marker": "o"} for name, x in KINDS.items()}
         line = {"color": plotting.GREY, "linestyle": ":"}
         plotting.legend_of(figure, {**kinds, "attainable with these agents": line}, 3)

@@ -253,8 +253,7 @@ def _draw_finals(panel: Any, finals: Mapping[str, Any]) -> None:
         color = plotting.VERMILLION if objective.startswith("LPO") else plotting.BLUE
         pooled = pooled_estimate(returns)
         plotting.estimate_row(panel, position, np.ravel(returns), pooled, color)
-    panel.set_yticks(range(len(finals)), list(finals))
-    panel.invert_yaxis()
+    plotting.name_rows(panel, finals)
     panel.set_xlabel("final return")
 
 

@@ -32,7 +32,7 @@ from scb.environments.registry import environment_spec
 from scb.errors import UserError, at_least, unused
 from scb.files import packed_row, unpacked_row
 from scb.measurement import Agents, Place, measure
-from scb.plotting import BLUE, VERMILLION, estimate_row, figure_title
+from scb.plotting import BLUE, VERMILLION, estimate_row, figure_title, name_rows
 from scb.seeds import REPORTING, VALIDATING
 from scb.statistics import Estimate, Statistic, normalized_score, stratified_estimate, worst_decile
 
@@ -356,8 +356,7 @@ def draw(report: Mapping[str, Any]) -> Figure:
             color = BLUE if row["name"] in REFERENCES else VERMILLION
             estimate_row(axes, position, np.array([]), row[what], color)
         axes.set(xlabel=label)
-        axes.set_yticks(range(len(rows)), [row["name"] for row in rows])
-    axes.invert_yaxis()
+    name_rows(axes, [row["name"] for row in rows])
     figure_title(
         figure, "PPO with drawn hyperparameters: scores of all environments, 95 % intervals"
     )

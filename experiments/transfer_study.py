@@ -31,7 +31,7 @@ from lpo.suite import suite
 from scb.environments.registry import environment_spec
 from scb.errors import one_of
 from scb.measurement import check_seeds
-from scb.plotting import BLUE, GREY, VERMILLION, estimate_row
+from scb.plotting import BLUE, GREY, VERMILLION, estimate_row, name_rows
 from scb.rows import Rows
 from scb.seeds import REPORTING
 from scb.statistics import Estimate, estimate, pooled_estimate
@@ -181,8 +181,7 @@ def draw(report: Mapping[str, Any]) -> Figure:
         scale = "normalised score" if Evaluation(**at).normalized else "final return"
         axes.set(title=evaluation, xlabel=scale)
         axes.xaxis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10]))
-    panels[0].set_yticks(range(len(objectives)), list(objectives))
-    panels[0].invert_yaxis()
+    name_rows(panels[0], objectives)
     figure.suptitle("Interquartile mean with its 95 % interval, each agent a dot")
     return figure
 

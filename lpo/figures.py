@@ -34,6 +34,7 @@ from scb.plotting import (
     figure_style,
     figure_title,
     legend_below,
+    name_rows,
     panels,
 )
 from scb.statistics import correlation_text, estimate, paired_difference
@@ -237,8 +238,7 @@ def suite_scores(scores: "SuiteScores", suite: str) -> Figure:
         profile.set_ylabel("share of runs with a score above \u03c4")
         profile.set_ylim(0.0, 1.0)
         profile.set_title("Performance profiles: 95 % bands", fontsize=10, weight="normal")
-        aggregate.set_yticks(range(len(scores.objectives)), scores.objectives)
-        aggregate.invert_yaxis()
+        name_rows(aggregate, scores.objectives)
         aggregate.grid(axis="y", visible=False)
         aggregate.set_xlabel("normalised score")
         aggregate.set_title("Interquartile mean, 95 %", fontsize=10, weight="normal")

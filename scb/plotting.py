@@ -6,7 +6,7 @@ stay apart for colour-blind readers.
 """
 
 import textwrap
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -78,6 +78,13 @@ def estimate_row(
         color=color,
         capsize=3,
     )
+
+
+def name_rows(axes: Axes, names: Iterable[str]) -> None:
+    """Of a horizontal plot, whose rows are at 0, 1, ...: the first is on top."""
+    names = list(names)
+    axes.set_yticks(range(len(names)), names)
+    axes.yaxis.set_inverted(True)
 
 
 def error_bar(*found: Estimate) -> NDArray[np.floating]:

@@ -85,8 +85,7 @@ def importance_bars(
     axes.barh(positions, importance, color=plotting.BLUE)
     for position, (low, high) in zip(positions, intervals or (), strict=False):
         axes.hlines(position, low, high, color=plotting.BLACK, linewidth=2.5)
-    axes.set_yticks(positions, list(names))
-    axes.invert_yaxis()
+    plotting.name_rows(axes, names)
     axes.set_xlim(left=0.0)
     axes.set_xlabel("share of the reward's variance,\nalone or with others", fontsize=9)
 
