@@ -66,7 +66,7 @@ _FURTHER = (
 )
 _ZOO_LOOKS = dict(
     zip(
-        ("lpo-pendulum", "lpo-multi", "lpo-pendulum-ee", "ta-lpo", "lpo-cartpole-ee"),
+        ("lpo-pendulum", "lpo-multi", "ta-lpo", "lpo-pendulum-ee", "lpo-cartpole-ee"),
         (_LEARNED, *_FURTHER),
         strict=True,
     )
