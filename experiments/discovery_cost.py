@@ -156,8 +156,7 @@ def _warm_start(folder: Path, environment: str) -> dict[str, Any]:
     names = ("warm_start", "refinement")
     cost = cost_in(environment_spec(environment).bandit)
     # Of a search that has not ended, what it starts from says it.
-    stages: list[dict[str, Any]] = [cost.get(name) or cost_in(name) for name in names]
-    stages = [stage for stage in stages if stage]
+    stages = list(filter(None, (cost.get(name) or cost_in(name) for name in names)))
 
     def total(name: str) -> float | None:
         known: list[Any] = [stage.get(name) for stage in stages]

@@ -52,8 +52,10 @@ class Rows:
             )
         self.rows: list[Row] = []
         self._configurations: dict[str, Any] = {}
-        if self.path is None or not self.path.exists():
-            if self.path is not None and not self._own(self._described):
+        if self.path is None:
+            return
+        if not self.path.exists():
+            if not self._own(self._described):
                 raise UserError(
                     f"rows in {path} would replace {self._described}, which is of something else: choose another name."
                 )

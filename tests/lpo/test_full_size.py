@@ -17,7 +17,7 @@ def test_what_ships_can_be_shown_beside_a_short_run():
         whole = full_size(environment)
         assert whole.curves[0].objective == "ppo"
         others = {curve.objective for curve in whole.curves[1:]}
-        assert whole.differences().keys() == others, environment
+        assert whole.as_dict()["paired_differences"].keys() == others, environment
 
 
 def test_the_order_in_which_agents_ended_does_not_matter():

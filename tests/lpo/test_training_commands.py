@@ -128,7 +128,7 @@ def test_a_refused_resume_leaves_the_folder_as_it_was(
     monkeypatch.delitem(sys.modules, "shares")
     monkeypatch.syspath_prepend(working_folder / "0.25")
     capsys.readouterr()
-    message = refused(command, f"{number}=2", "--resume=o")
+    message = refused(command, f"{number}=3", "--resume=o")
     assert "cannot resume o: shares:share is not what it was when the run was started" in message
 
 
