@@ -1,0 +1,171 @@
+"""Claims on locomotion that were stated first are decided by their own agents, once, when all are there."""
+
+import json
+
+import numpy as np
+import pytest
+
+from experiments import claims, locomotion_claims
+from experiments import locomotion as module
+from lpo import full_size
+from tests.experiments.hoppers import report
+
+
+def test_a_confirmation_is_decided_by_its_own_agents_when_all_are_there(monkeypatch):
+    asked = full_size.Confirmation("hopper", "dpo", range(4, 14))
+    monkeypatch.setattr(full_size, "CONFIRMATIONS", (asked,))
+    made = report(13)
+    for seed in range(4):  # which say the opposite, and are not asked
+        made["environments"]["hopper"]["agents"]["dpo"][str(seed)]["returns"] = "0 0 -9000"
+    assert locomotion_claims.confirmed(made) == [(asked, 9, None)]
+    assert "9 of 10 pairs are trained" in module.EXPERIMENT.page(made)
+    # Until then they are in nothing else: of the seeds 0 to 3 the difference is below.
+    assert [len(c.seeds) for c in module.facts(made)["comparisons"]["hopper"].curves] == [4, 4, 13]
+    assert {x.estimate.n for x in claims.judge(locomotion_claims.claims(made)) if x.estimate} == {4}
+    monkeypatch.setattr(full_size, "_kept", lambda: made)
+    assert [len(c.seeds) for c in full_size.full_size("hopper").curves] == [4, 4, 13]
+    more = report(14)["environments"]["hopper"]["agents"]
+    for name, agents in made["environments"]["hopper"]["agents"].items():
+        agents["13"] = more[name]["13"]
+    ((_, pairs, judged),) = locomotion_claims.confirmed(made)
+    assert (pairs, judged.outcome) == (10, claims.HOLDS)
+    assert "| +100 [100, 100] | −5 | confirmed |" in module.EXPERIMENT.page(made)
+    made["environments"]["hopper"]["agents"].pop("dpo")
+    assert locomotion_claims.confirmed(made) == []
+
+
+def test_where_all_agents_wait_for_a_claim_the_page_says_so(monkeypatch, tmp_path):
+    asked = full_size.Confirmation("hopper", "dpo", range(20), "area")
+    monkeypatch.setattr(full_size, "CONFIRMATIONS", (asked,))
+    made = report(13)
+    assert module.EXPERIMENT.pages(made).keys() == {"locomotion"}
+    assert "**Nothing is compared yet**" in module.EXPERIMENT.page(made)
+    (tmp_path / "report.json").write_text(json.dumps({"experiment": "locomotion", **made}))
+    flags = [f"--out={tmp_path / 'report.json'}", "--only-render"]
+    assert module.EXPERIMENT.main(flags) == 0
+
+
+def test_what_pairs_say_that_were_trained_after_a_claim_stands_beside_it(monkeypatch):
+    asked = full_size.Confirmation("hopper", "dpo", range(4, 14), "area")
+    made = report(23)
+    assert locomotion_claims.since(made, asked) is None  # nine are too few
+    made = report(24)
+    seeds, found = locomotion_claims.since(made, asked)
+    assert seeds == list(range(14, 24))
+    # (200 - 100) / 2 over the second half of the training.
+    assert found.value == pytest.approx(50.0)
+
+
+def test_what_only_all_pairs_together_show_is_not_said_to_be_shown(monkeypatch):
+    asked = full_size.Confirmation("hopper", "dpo", range(30, 40), "area")
+    monkeypatch.setattr(full_size, "CONFIRMATIONS", (asked,))
+    made = report(40)
+    agents = made["environments"]["hopper"]["agents"]
+    shown, row = (
+        "Shown to earn more than it over the training: dpo on hopper",
+        "dpo earns more over the training",
+    )
+    assert shown in module.EXPERIMENT.page(made)
+    for seed in asked.seeds:  # the new pairs are level
+        agents["dpo"][str(seed)] = agents["ppo"][str(seed)]
+    page = module.EXPERIMENT.page(made)
+    assert "Shown to earn more than it over the training: none" in page
+    assert "all pairs together have an interval above: dpo on hopper earns more over the" in page
+    (line,) = [x for x in page.splitlines() if x.startswith("| hopper: dpo | 40 |")]
+    assert line.endswith(" not confirmed |") and line.count("**") == 2 * 2
+    (stated,) = [x for x in page.splitlines() if x.startswith(f"| hopper: {row}")]
+    assert "| not confirmed: " in stated
+
+
+def test_a_claim_stated_of_another_rate_is_of_its_agents_alone(monkeypatch):
+    asked = full_size.Confirmation("hopper at 0.0005", "dpo", range(10), "area")
+    monkeypatch.setattr(full_size, "CONFIRMATIONS", (asked,))
+    made = report(13)
+    assert locomotion_claims.confirmed(made) == []
+    entry = {**report(9)["environments"]["hopper"], "environment": "hopper"}
+    made["environments"]["hopper at 0.0005"] = {
+        **entry,
+        "hyperparameters": {"learning_rate": 0.0005},
+    }
+    assert [pairs for _, pairs, _ in locomotion_claims.confirmed(made)] == [9]
+    # Without PPO's agents there is nothing that others could be compared with.
+    assert [*module.facts(made)["comparisons"]] == ["hopper"]
+    entry["agents"].update(report(10)["environments"]["hopper"]["agents"])
+    ((_, pairs, judged),) = locomotion_claims.confirmed(made)
+    assert (pairs, judged.outcome) == (10, claims.HOLDS)
+    assert judged.claim.text == "hopper at 0.0005: dpo earns more over the training than PPO"
+
+
+def test_of_a_pending_confirmation_whose_reference_was_known_the_objective_alone_is_left_out(
+    monkeypatch,
+):
+    asked = full_size.Confirmation(
+        "hopper", "dpo", range(4, 14), "late", known="ppo", suggested="seen"
+    )
+    monkeypatch.setattr(full_size, "CONFIRMATIONS", (asked,))
+    made = report(13)
+    counts = {c.objective: len(c.seeds) for c in module.facts(made)["comparisons"]["hopper"].curves}
+    assert counts == {"ppo": 13, "dpo": 4, "lpo-pendulum": 13}
+    row = "| hopper: dpo earns no less over the last quarter than PPO | seen | 10, seeds 4 to 13; ppo known before | "
+    assert row in module.EXPERIMENT.page(made)
+
+
+def test_what_was_known_before_is_one_of_both():
+    with pytest.raises(ValueError, match="known is one of both objectives, or None"):
+        full_size.Confirmation("hopper", "ta-lpo", range(4, 14), "area", "dpo", known="ppo")
+
+
+def test_a_confirmation_may_ask_of_the_clip_beside_another(monkeypatch):
+    asked = full_size.Confirmation("hopper", "ppo", range(4, 14), "area", "dpo")
+    monkeypatch.setattr(full_size, "CONFIRMATIONS", (asked,))
+    ((_, _, judged),) = locomotion_claims.confirmed(report(14))
+    assert judged.claim.text == "hopper: ppo earns more over the training than dpo"
+    assert (
+        judged.estimate.value < 0 and judged.outcome == claims.FAILS
+    )  # dpo has more in the report
+
+
+def test_a_confirmation_has_a_reference_of_its_own(monkeypatch):
+    asked = full_size.Confirmation(
+        "hopper", "lpo-pendulum", range(4, 14), "late", "dpo", "lpo-pendulum"
+    )
+    monkeypatch.setattr(full_size, "CONFIRMATIONS", (asked,))
+    made = report(13)
+    counts = {c.objective: len(c.seeds) for c in module.facts(made)["comparisons"]["hopper"].curves}
+    assert counts == {"ppo": 13, "dpo": 4, "lpo-pendulum": 13}
+    made = report(14)
+    ((_, pairs, judged),) = locomotion_claims.confirmed(made)
+    agents = made["environments"]["hopper"]["agents"]
+    ours, theirs = (
+        [float(agents[name][str(seed)]["returns"].split()[-1]) for seed in asked.seeds]
+        for name in ("lpo-pendulum", "dpo")
+    )
+    assert pairs == 10 and judged.claim.text == (
+        "hopper: lpo-pendulum earns no less over the last quarter than dpo"
+    )
+    assert judged.estimate.value == pytest.approx(np.subtract(ours, theirs).mean())
+    assert "a twentieth of what dpo earns" in judged.claim.reason
+    row = "than dpo |  | 10, seeds 4 to 13; lpo-pendulum known before | "
+    assert row in module.EXPERIMENT.page(made)
+    for agents in made["environments"]["hopper"]["agents"]["lpo-pendulum"].values():
+        agents["returns"] = "0 50 9000"
+    page = module.EXPERIMENT.page(made)
+    said = "Confirmed: lpo-pendulum on hopper earns no less over the last quarter than dpo."
+    assert f"{said}** PPO has" in page
+
+
+def test_a_lead_that_is_asked_of_one_objective_alone_has_no_margin_and_stands_beside_what_is_asked_of_all(
+    monkeypatch,
+):
+    asked = full_size.Confirmation("hopper", "lpo-pendulum", range(4, 14), "late lead")
+    monkeypatch.setattr(full_size, "CONFIRMATIONS", (asked,))
+    made = report(14)
+    for agents in made["environments"]["hopper"]["agents"]["lpo-pendulum"].values():
+        agents["returns"] = "0 50 9000"
+    ((_, _, judged),) = locomotion_claims.confirmed(made)
+    assert judged.claim.least == 0 and judged.estimate.low > 0
+    assert "lpo-pendulum on hopper earns more over the last quarter than PPO." in (
+        module.EXPERIMENT.page(made)
+    )
+    texts = {claim.text for claim in locomotion_claims.claims(made)}
+    assert not any("more over the last quarter" in text for text in texts)
