@@ -156,6 +156,10 @@ def facts(report: Report) -> dict[str, Any]:
         }
         for source, search in report["searches"].items()
     }
+    of_all = {
+        source: x["per"]["total"] * x["settings"]["generations"] + x["steps_to_judge"]
+        for source, x in searches.items()
+    }
     tables = {}
     for place, table in report["evaluations"].items():
         kinds = (table["finals"], table["areas"])
@@ -176,6 +180,7 @@ def facts(report: Report) -> dict[str, Any]:
         "environment": ENVIRONMENT,
         "same_size": of_one_size(report),
         "times": cheaper(report),
+        "times_judged": of_all["environment"] / of_all["bandit"],
         "bill": bill(report),
         "elsewhere": elsewhere(
             (c for x in report["searches"].values() for c in x["curves"]), report

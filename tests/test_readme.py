@@ -17,7 +17,7 @@ SHORTER = (
         "population_size=2, num_generations=1, mean_evaluations=2,",
     ),
     (
-        "population_size=32, num_generations=100",
+        "population_size=32, num_generations=150",
         "population_size=2, num_generations=1, mean_evaluations=2",
     ),
 )

@@ -151,7 +151,7 @@ def test_a_confirmation_has_a_reference_of_its_own(monkeypatch):
         agents["returns"] = "0 50 9000"
     page = module.EXPERIMENT.page(made)
     said = "Confirmed: lpo-pendulum on hopper earns no less over the last quarter than dpo."
-    assert f"{said}** PPO has" in page
+    assert f"**{said} " in page and "** PPO has" in page
 
 
 def test_a_lead_that_is_asked_of_one_objective_alone_has_no_margin_and_stands_beside_what_is_asked_of_all(
