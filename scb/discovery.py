@@ -30,6 +30,7 @@ from scb.analysis.optimal_actions import optimal_actions, optimal_policy
 from scb.configurations import config_dict
 from scb.curriculum import EpisodeLengths, check_curriculum, paper_curriculum
 from scb.discovery_config import DiscoveryConfig as DiscoveryConfig
+from scb.environments.linear import widened
 from scb.environments.registry import environment_spec
 from scb.environments.synthetic import SyntheticBandit, Weights
 from scb.environments.synthetic_mdp import synthetic_for
@@ -159,7 +160,10 @@ class BanditDiscovery:
                     f"{name} has the {what} {has}, and the bandit to discover {wanted}: ask for {has}, or start from "
                     "another."
                 )
-        return start.default_params.weights
+        weights, contexts = start.default_params.weights, self.config.warm_start
+        if start.linear and (contexts.stretch != 1 or contexts.jitter):
+            return widened(weights, contexts.stretch, contexts.jitter)
+        return weights
 
     def initial_solution(self, key: jax.Array) -> Weights:
         config, seed = self.config, root_key(self.config.evolution.seed)

@@ -24,6 +24,10 @@ from scb.warm_start import WarmStartConfig
 INITS = ("random", "expert")
 MODES = ("all", "sequential")
 SELECTIONS = ("final", "best")
+_OF_CONTEXTS = (
+    "stretch",
+    "jitter",
+)  # of a warm start's settings, what a linear bandit's contexts take too
 
 
 def _read_algorithms(words: str) -> tuple[str, ...]:
@@ -71,7 +75,8 @@ class DiscoveryConfig:
         SHAPE:INITIAL:FINAL:BEGIN:TRANSITION such as linear:100:1000:20:160 (lengths in steps, then
         generations).
       init: expert (fit the bandit to an expert first, in a minute) or random (as the paper).
-      start: start from this bandit (a zoo name or file.npz) instead, whatever the initialisation.
+      start: start from this bandit (a zoo name or file.npz) instead, whatever the initialisation. A linear one's
+        contexts are stretched and jittered where these are given.
       reward_std: scale the reward that the search starts from to this standard deviation, over
         contexts and uniform actions, and shift it to mean zero. PPO, which normalises advantages, is
         nearly indifferent; SAC, whose temperature starts at 1 and whose critics start near 0, is not.
@@ -176,10 +181,11 @@ class DiscoveryConfig:
                 "take TI or I",
             )
         if not self.fitted:
+            of_contexts = _OF_CONTEXTS if self.start and self.bandit.form == "linear" else ()
             unused(
                 self.warm_start,
                 "nothing is fitted to an expert",
-                [entry.name for entry in fields(self.warm_start)],
+                [x.name for x in fields(self.warm_start) if x.name not in of_contexts],
                 "choose init expert and no bandit to start from",
             )
         if self.bandit.form == "linear":

@@ -41,10 +41,11 @@ class DatasetConfig:
         they are. One that never changes stays. Agents learn little from an entry as small as a car's velocity.
         For action_distance only: Q-values cannot be simulated from states that don't exist.
       stretch: factor on the states' deviations from their mean, after that; the expert says what it does
-        there. Agents that meet more than they need learn better what they need. For action_distance only.
+        there. Agents that meet more than they need learn better what they need. For action_distance only, or for
+        the contexts of a linear bandit that a search starts from.
       jitter: standard deviation of independent noise on every entry of the states, in deviations of the
         entry before it is stretched; the expert says what it does there. Entries hang together along the expert's
-        trajectories, and agents that err leave these. For action_distance only.
+        trajectories, and agents that err leave these. For the same as stretch.
       discount: of the Q-function.
       num_states: states that the dataset holds.
       num_actions: actions that are tried in each of them, uniform but for the expert's.

@@ -133,6 +133,15 @@ def with_states(weights: Mapping[str, Any], observations: np.ndarray) -> dict[st
     return _weights(center, covariance, {**reward, "center": center, "bias": bias})
 
 
+def widened(weights: Mapping[str, Any], stretch: float, jitter: float) -> dict[str, Any]:
+    """The bandit of the same policy whose contexts are stretched and jittered, as an expert's states are for a fit."""
+    contexts = weights["initial_state"]["Dense_0"]
+    root, center = (np.asarray(contexts[k], np.float64) for k in ("kernel", "bias"))
+    covariance = root.T @ root
+    covariance = stretch**2 * covariance + np.diag(jitter**2 * np.diag(covariance))
+    return _weights(center, covariance, weights["reward"])
+
+
 def moments(states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """[O] mean and [O, O] covariance of [S, O] states."""
     return states.mean(axis=0), np.cov(states.T).reshape(states.shape[1], -1)

@@ -1,5 +1,7 @@
 """Bandits of the form linear: contexts normally distributed, rewards a distance to a linear policy."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,7 +9,7 @@ import pytest
 from gymnax.environments import spaces
 
 from scb.configurations import config_dict
-from scb.discovery import DiscoveryConfig, discover
+from scb.discovery import BanditDiscovery, DiscoveryConfig, discover
 from scb.environments.linear import fitted
 from scb.environments.registry import make
 from scb.environments.synthetic import BanditConfig, SyntheticBandit, bandit_for
@@ -148,6 +150,28 @@ def test_its_reward_can_be_given_another_scale(bandit):
     rewards = bandit.sample_rewards(bandit.params(weights), jax.random.key(5), 4000)
     assert float(rewards.std()) == pytest.approx(3.0, rel=0.05)
     assert float(rewards.mean()) == pytest.approx(0.0, abs=0.2)
+
+
+def test_the_contexts_of_one_that_a_search_starts_from_are_widened(tmp_path):
+    path, bandit = tmp_path / "start.npz", bandit_for(*make("Pendulum-v1"), LINEAR, "start")
+    weights = bandit.init_weights(jax.random.key(3))
+    save_bandit(path, bandit, weights)
+    config = DiscoveryConfig(start=str(path), bandit=LINEAR)
+    wide = replace(config, warm_start=WarmStartConfig(stretch=2.0, jitter=1.0))
+    before, after = (BanditDiscovery(c).initial_solution(jax.random.key(0)) for c in (config, wide))
+    jax.tree.map(np.testing.assert_array_equal, after["reward"], before["reward"])
+    own, other = (
+        np.asarray(w["initial_state"]["Dense_0"]["kernel"], np.float64) for w in (before, after)
+    )
+    # Twice the deviations, of independent entries once more: variances times 5, covariances times 4.
+    expected = np.where(np.eye(3), 5.0, 4.0) * (own.T @ own)
+    np.testing.assert_allclose(other.T @ other, expected, rtol=1e-4, atol=1e-4)
+    np.testing.assert_array_equal(*(w["initial_state"]["Dense_0"]["bias"] for w in (before, after)))
+    for changes in ({"expert": "linear"}, {"min_spread": 1.0}):
+        with pytest.raises(UserError, match="and nothing is fitted to an expert"):
+            replace(config, warm_start=WarmStartConfig(**changes))
+    with pytest.raises(UserError, match=r"jitter.* is 1.0, and nothing is fitted to an expert"):
+        DiscoveryConfig(start="Synthetic-Pendulum-v1", warm_start=WarmStartConfig(jitter=1.0))
 
 
 def pendulum_config(**changes):
