@@ -17,14 +17,16 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, TypeVar
-
-import submitit
-from submitit.helpers import Checkpointable
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 from scb import termination
 from scb.errors import UserError, at_least, first_line, unused
 from scb.files import make_folder, write_json
+
+# Only what is measured elsewhere needs it, which the package's own requirements leave out.
+if TYPE_CHECKING:
+    import submitit
+    from submitit.helpers import DelayedSubmission
 
 Keys = tuple[str, ...]
 T = TypeVar("T")
@@ -148,12 +150,18 @@ class Jobs:
         if self.executor == "local":
             unused(self, "the jobs are this machine's", ("cpus", "slurm"), "take --executor slurm")
 
-    def executor_in(self, folder: Path) -> submitit.Executor:
+    def executor_in(self, folder: Path) -> "submitit.Executor":
         """That of submitit, whose files are in a folder.
 
         Raises:
-          UserError: SLURM is not here.
+          UserError: submitit is not installed, or SLURM is not here.
         """
+        try:
+            import submitit
+        except ImportError as error:
+            raise UserError(
+                f"--executor {self.executor} needs the package submitit: install it."
+            ) from error
         kinds = {"local": submitit.LocalExecutor, "slurm": submitit.SlurmExecutor}
         try:
             made: submitit.Executor = kinds[self.executor](folder)
@@ -175,7 +183,7 @@ class Jobs:
         return made
 
 
-class Measurement(Checkpointable):
+class Measurement:
     """A job: it measures one part and keeps what it found; where SLURM ends it early, it is submitted again."""
 
     def __init__(self, part: Part, kept: Path) -> None:
@@ -193,6 +201,12 @@ class Measurement(Checkpointable):
             except Exception as error:
                 self.kept.with_suffix(".error").write_text(first_line(error))
                 raise
+
+    def checkpoint(self) -> "DelayedSubmission":
+        """What submitit submits again where SLURM ends the job early."""
+        from submitit.helpers import DelayedSubmission
+
+        return DelayedSubmission(self)
 
 
 def elsewhere(

@@ -1,5 +1,6 @@
 """Parts are measured once, here or as jobs elsewhere; what jobs found is kept, and failures are told."""
 
+import importlib.util
 import json
 import os
 import signal
@@ -12,6 +13,9 @@ from functools import partial
 from pathlib import Path
 
 import pytest
+
+# It closes all handlers of logging as it is imported, pytest's too where that is within a test.
+import submitit  # noqa: F401
 
 from experiments.harness import Experiment
 from experiments.parts import InParts, Jobs, Measurement, Part, _digest, elsewhere
@@ -54,6 +58,18 @@ def test_without_jobs_parts_are_measured_one_after_the_other(tmp_path):
     measure(["a", "bb", "ccc"], report, lambda: saved.append(len(report["found"])))
     assert saved == [1, 2, 3] and times(tmp_path) == ["a", "bb", "ccc"]
     assert report["found"]["ccc"]["number"] == 3
+
+
+def test_only_jobs_need_submitit(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "submitit", None)
+    spec = importlib.util.find_spec("experiments.parts")
+    parts = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(parts)
+    report = {}
+    parts.InParts(lambda *_: parts_of(tmp_path, "a"))(None, report, lambda: None)
+    assert report["found"]["a"]["number"] == 1
+    with pytest.raises(UserError, match="local needs the package submitit: install it"):
+        parts.Jobs("local").executor_in(tmp_path)
 
 
 def counting(folder, *names):
@@ -111,7 +127,25 @@ def test_what_an_earlier_start_found_is_taken(tmp_path, monkeypatch):
     assert not (tmp_path / "kept.json").exists()
 
 
-def test_what_was_found_with_other_settings_is_not_taken(tmp_path):
+class AtOnce:
+    """An executor whose jobs have ended when they are submitted, in this process."""
+
+    job_id = "1"
+
+    def submit(self, job):
+        job()
+        return self
+
+    def done(self):
+        return True
+
+
+@pytest.fixture
+def at_once(monkeypatch):
+    monkeypatch.setattr(Jobs, "executor_in", lambda *_: AtOnce())
+
+
+def test_what_was_found_with_other_settings_is_not_taken(tmp_path, at_once):
     (part,) = parts_of(tmp_path, "a")
     Measurement(part, tmp_path / f"{_digest(part, 'few')}.json")()
     for settings, number in (("many", 2), ("few", 2)):
@@ -120,7 +154,7 @@ def test_what_was_found_with_other_settings_is_not_taken(tmp_path):
         assert part.there(report) and len(times(tmp_path)) == number
 
 
-def test_what_is_named_twice_is_one_job(tmp_path):
+def test_what_is_named_twice_is_one_job(tmp_path, at_once):
     report, told = {}, []
     parts = [*parts_of(tmp_path, "a"), *parts_of(tmp_path, "a")]
     elsewhere(parts, report, lambda: None, Jobs("local"), tmp_path, told.append, every=0.1)
