@@ -31,8 +31,9 @@ class LPO(PPO):
     def train(self) -> None:
         self.policy.set_training_mode(True)
         self._update_learning_rate(self.policy.optimizer)
-        # SB3 collects whole batches, the last of them past the number of steps that was asked for.
-        progress = min(1.0, 1.0 - self._current_progress_remaining)
+        # Before this batch was collected, as where objectives are learned; SB3's own counts it in.
+        collected = self.num_timesteps - self.n_steps * self.n_envs
+        progress = collected / self._total_timesteps
         for _ in range(self.n_epochs):
             for batch in self.rollout_buffer.get(self.batch_size):
                 discrete = isinstance(self.action_space, spaces.Discrete)

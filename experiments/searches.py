@@ -136,9 +136,13 @@ def curve(metrics: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]:
 
     Returns:
       {"generation", "fitness" (interquartile mean over agents; None where all failed), "mean" (over agents),
-      "failed" (mean number of candidates without a finite fitness since the last judgement)}.
+      "failed" (mean number of candidates without a finite fitness since the last judgement)}. The judgement of an
+      earlier end, of a search that went on for more generations, is left out: others have none there.
     """
-    judged = judgements(metrics)
+    before = [
+        {k: x for k, x in line.items() if not k.startswith("final_mean/")} for line in metrics[:-1]
+    ]
+    judged = judgements([*before, *metrics[-1:]])
     failed, last = [], 0
     for generation, _ in judged:
         since = [x["failed"] for x in metrics if last <= x["generation"] < generation]

@@ -83,7 +83,8 @@ def numpy_drift(
 def torch_drift(objective: Named) -> "TorchFunction":
     """The drift of an objective for PyTorch, differentiable; arguments and errors as for `drift_function`.
 
-    It takes tensors and computes in log_ratio's type and on its device.
+    It takes tensors and computes on log_ratio's device, in its type or, of half precision and under autocast, which
+    hold no squares of large ratios, in float32.
 
     Raises:
       UserError: as for `numpy_drift`, or PyTorch is not installed.
@@ -150,7 +151,9 @@ def _in_torch(
             )
     if not log_ratio.is_floating_point():  # which would cut the advantage's decimals off
         log_ratio = log_ratio.to(advantage if advantage.is_floating_point() else torch.float32)
-    return _evaluate(torch, drift, parameters, log_ratio, advantage.to(log_ratio), progress)
+    log_ratio = log_ratio.to(torch.promote_types(log_ratio.dtype, torch.float32))
+    with torch.autocast(log_ratio.device.type, enabled=False):
+        return _evaluate(torch, drift, parameters, log_ratio, advantage.to(log_ratio), progress)
 
 
 def _loss_in_torch(

@@ -290,7 +290,8 @@ class OffPolicyAgent(Agent):
 
 def target_values(batch: Transition, next_value: jax.Array, discount: ArrayLike) -> jax.Array:
     """[B] r + discount * V(s'), without V where the episode terminated (a truncation is no termination)."""
-    return batch.reward + discount * (1.0 - batch.terminated) * next_value
+    # Chosen and not multiplied: 0 times what is no number is none.
+    return batch.reward + discount * jnp.where(batch.terminated > 0, 0.0, next_value)
 
 
 def polyak_average(target: Any, online: Any, polyak: ArrayLike) -> Any:

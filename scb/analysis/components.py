@@ -57,6 +57,10 @@ class ReplacedBandit(SyntheticBandit):
             return super().mean_reward(context, action, params)
         return self._replaced_reward(context, jnp.asarray(action))
 
+    @property
+    def tells_best_action(self) -> bool:
+        return self._replaced_reward is None and super().tells_best_action
+
     def reset_env(self, key: jax.Array, params: BanditParams) -> tuple[jax.Array, BanditState]:
         if self._states is None:
             return super().reset_env(key, params)

@@ -53,7 +53,7 @@ def optimal_actions(
         candidates = jnp.arange(space.n)
     elif method == "grid":
         candidates = _grid(space)
-    elif bandit.linear:
+    elif bandit.tells_best_action:
         return _read_off(bandit, params, space)
     else:
         return _ascent(bandit, params, space)

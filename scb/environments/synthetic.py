@@ -241,6 +241,11 @@ class SyntheticBandit(SyntheticEnvironment[BanditState, BanditParams]):
         """Whether it is of the form linear."""
         return self.config.form == "linear"
 
+    @property
+    def tells_best_action(self) -> bool:
+        """Whether the best action of a context is written in the weights."""
+        return self.linear
+
     def _network(self, name: str) -> nn.Module:
         if not self.linear:
             return super()._network(name)

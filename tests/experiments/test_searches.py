@@ -78,6 +78,19 @@ def test_a_judgement_without_a_number_is_a_gap_and_failures_are_averaged():
     }
 
 
+def test_a_search_that_went_on_is_drawn_beside_one_that_did_not_end_before():
+    def line(generation, kind=None, worth=None):
+        judged = {f"{kind}/fitness{of}": worth for of in ("", "_iqm")} if kind else {}
+        return {"generation": generation, "failed": 0, **judged}
+
+    begun, after = line(0, "mean", 1.0), [line(2, "mean", 3.0), line(3, "final_mean", 4.0)]
+    ended = line(1, "final_mean", 2.0)
+    straight = searches.curve([begun, line(1), *after])
+    assert searches.curve([begun, ended, *after]) == straight
+    assert (straight["generation"], straight["fitness"]) == ([0, 2, 4], [1.0, 3.0, 4.0])
+    assert searches.curve([begun, ended])["fitness"] == [1.0, 2.0]
+
+
 def test_a_line_is_the_mean_over_searches_and_leaves_gaps():
     axes = Figure().subplots()
     curves = [

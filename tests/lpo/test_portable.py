@@ -381,6 +381,23 @@ class TestTorch:
         with pytest.raises(UserError, match="same shape"):
             torch_loss("ppo")(torch.zeros(5), torch.zeros(5, 1), 0.0)
 
+    @pytest.mark.parametrize("objective", ["dpo", "lpo-pendulum"])
+    def test_half_precision_and_autocast_are_computed_in_float32(self, objective, torch):
+        far = np.float32([6.0, -12.0, 0.1]), np.ones(3, np.float32)
+        loss = torch_loss(objective)
+        expected, expected_slope = in_torch(loss, *far, 0.0)
+        leaf = torch.tensor(far[0], requires_grad=True)
+        with torch.autocast("cpu", torch.float16):
+            value = loss(leaf, torch.tensor(far[1]), 0.0)
+        value.backward()
+        assert value.item() == expected
+        np.testing.assert_array_equal(leaf.grad, expected_slope)
+        half = torch.tensor(far[0], dtype=torch.float16, requires_grad=True)
+        value = loss(half, torch.ones(3, dtype=torch.float16), 0.0)
+        value.backward()
+        assert value.dtype == torch.float32 and torch.isfinite(half.grad).all()
+        assert value.item() == pytest.approx(float(expected), rel=1e-2)
+
     @pytest.mark.parametrize("objective", ["ppo", "ta-lpo"])
     def test_a_loss_is_one_graph_of_torch_compile(self, torch, objective):
         loss = torch_loss(objective)

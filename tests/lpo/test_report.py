@@ -294,6 +294,15 @@ def test_a_failed_certificate_is_not_hidden(tmp_path):
     assert "smallest penalty f -0.25 ≥ 0 no" in text
 
 
+def test_what_rounding_leaves_of_nothing_is_no_failed_condition(tmp_path):
+    made = results()
+    made["objective"]["certificate"] |= {"holds": True, "minimum": -1e-7, "gradient_at_one": 2e-6}
+    text = write(tmp_path, made).text
+    assert "mine is a drift" in text
+    assert "smallest penalty f -1e-07 ≥ 0, but for rounding yes" in text
+    assert "largest |df/dr| at ratio 1 2e-06 0, but for rounding yes" in text
+
+
 def test_results_read_from_a_file_give_the_same_bytes(tmp_path, picture):
     made = results()
     first = report.write_report(tmp_path, made, {"hopper": picture}).read_bytes()

@@ -12,6 +12,7 @@ from scb.agents.sac import SAC, SACConfig, SACHyperparameters
 from scb.agents.spec import AgentSpec
 from scb.analysis import components
 from scb.analysis.components import ReplacedBandit, SACExpert
+from scb.analysis.optimal_actions import optimal_actions
 from scb.environments.synthetic import BanditConfig, bandit_for
 from scb.environments.zoo import load_bandit
 
@@ -51,6 +52,16 @@ def test_contexts_come_from_the_states_that_are_given():
     np.testing.assert_array_equal(
         replaced.mean_reward(shown[0], action, params),
         bandit.mean_reward(shown[0], action, bandit.default_params),
+    )
+
+
+def test_the_best_action_of_a_replaced_reward_is_not_the_linear_bandits():
+    bandit = load_bandit("Synthetic-MountainCarContinuous-v0")
+    best = optimal_actions(ReplacedBandit(bandit, reward=lambda o, a: -((a[0] + 0.25) ** 2)))
+    assert best(jnp.zeros(2))[0] == pytest.approx(-0.25, abs=0.01)
+    other_contexts = ReplacedBandit(bandit, states=np.zeros((1, 2)))
+    np.testing.assert_array_equal(
+        optimal_actions(other_contexts)(jnp.ones(2)), optimal_actions(bandit)(jnp.ones(2))
     )
 
 

@@ -95,7 +95,9 @@ def test_the_target_bootstraps_unless_the_episode_terminated():
     # 1 + 0.5 * 4 = 3; a terminated step is worth its reward, 2.
     two = np.zeros((2, 1))
     batch = Transition(two, two, np.array([1.0, 2.0]), np.array([0.0, 1.0]), two)
-    np.testing.assert_array_equal(target_values(batch, np.array([4.0, 4.0]), 0.5), [3.0, 2.0])
+    for last in (4.0, np.inf, np.nan):
+        found = target_values(batch, np.array([4.0, last]), 0.5)
+        np.testing.assert_array_equal(found, [3.0, 2.0])
 
 
 def test_a_polyak_of_099_keeps_99_percent_of_the_target():
