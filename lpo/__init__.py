@@ -1,4 +1,4 @@
-"""Learned policy optimisation: evolve the objective that PPO maximises, on bandits a hundred times cheaper.
+"""Learned policy optimisation: evolve the objective that PPO maximises, on one-step bandits, which are cheap.
 
 Names are imported when they are first used: the command line has to configure JAX before anything
 imports it for good.
@@ -12,7 +12,7 @@ _HOME = {
     for module, names in {
         "certificate": ("Certificate", "certify"),
         "drifts": ("ClipDrift", "DPODrift", "Drift", "LearnedDrift", "NoDrift"),
-        "comparison": ("compare", "learning_curves"),
+        "comparison": ("Comparison", "LearningCurves", "compare", "learning_curves"),
         "inner_loop": ("MetaTrainingConfig",),
         "meta_training": ("meta_train",),
         "objectives": ("Objective", "load_objective", "save_objective"),

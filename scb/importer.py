@@ -101,6 +101,11 @@ def import_published_command(
 ) -> None:
     """Import the bandits that the paper's authors published, so that every command takes them by file.
 
+    Their checkpoints are pickles, which run code when they are opened, and which a current JAX does not read: convert
+    them where you trust them, with the versions that wrote them. A file holds eight float32 arrays:
+    initial_state/Dense_0/kernel [latent, 32], /bias [32], initial_state/Dense_1/kernel [32, observation], /bias, and
+    reward/Dense_0/kernel [observation + action, 32], /bias, reward/Dense_1/kernel [32, 1], /bias.
+
     Args:
       directory: folder with their arrays, such as pendulum.npz, or one such file.
       out: folder for the bandits, such as Synthetic-Pendulum-v1.npz.

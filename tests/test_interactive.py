@@ -14,7 +14,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from lpo import cli as lpo_cli
-from lpo.objectives import load_objective, save_objective
+from lpo.objectives import load_objective
 from lpo.update_regions import analyze
 from scb import cli as scb_cli
 from scb.environments.zoo import load_bandit
@@ -96,14 +96,20 @@ def test_what_is_shown_is_also_in_numbers(objective_page, capsys, tmp_path):
 def test_objectives_of_runs_are_shown_apart_by_their_folders(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("lpo.showing.drift_and_gradient", lambda *_: Figure())
-    objective = load_objective("lpo-pendulum")
+
+    def copied(folder):
+        folder.mkdir(parents=True)
+        zoo = Path(lpo_cli.__file__).with_name("zoo")
+        for kind in (".npz", ".json"):
+            shutil.copy(zoo / f"lpo-pendulum{kind}", folder / f"objective{kind}")
+        return folder / "objective.npz"
+
     for name in ("a", "b"):
-        save_objective(Path("runs", name, "objective.npz"), objective.drift, objective.parameters)
+        copied(Path("runs", name))
         assert lpo_cli.main(["show", f"runs/{name}/objective", "--beside"]) == 0
     assert sorted(x.name for x in Path("runs/show").iterdir()) == ["a", "b"]
     # Two of one name: it is told apart by its path, which is no folder's name.
-    other = Path("others/a/objective.npz").absolute()
-    save_objective(other, objective.drift, objective.parameters)
+    other = copied(Path("others/a").absolute())
     assert lpo_cli.main(["show", str(other), "--beside", "runs/a/objective"]) == 0
     assert [x.name for x in other.parent.iterdir() if x.is_dir()] == []
 

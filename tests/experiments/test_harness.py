@@ -325,7 +325,23 @@ def test_an_end_that_is_not_zero_within_two_more_places_is_not_written_as_zero()
 PAGES = [x for x in everything.found().values() if rendering.has_template(x.name)]
 
 
+@pytest.fixture(scope="module")
+def once():
+    """What is computed of a committed report is so once, for its pages and for the overview."""
+    computed, known = Experiment.context, {}
+
+    def context(experiment, report):
+        if experiment.name not in known:
+            known[experiment.name] = computed(experiment, report)
+        return known[experiment.name]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Experiment, "context", context)
+        yield
+
+
 @pytest.mark.parametrize("experiment", PAGES, ids=[x.name for x in PAGES])
+@pytest.mark.usefixtures("once")
 def test_the_committed_page_is_that_of_the_committed_report(experiment):
     out = experiment.out or harness.DATA / f"{experiment.name}.json"
     report = read(out, keys=experiment.keys)
@@ -337,6 +353,7 @@ def test_the_committed_page_is_that_of_the_committed_report(experiment):
     assert {name: (harness.DOCS / f"{name}.md").read_text() for name in pages} == pages
 
 
+@pytest.mark.usefixtures("once")
 def test_the_committed_overview_is_that_of_the_committed_reports():
     experiments = everything.of_the_paper()
     assert (harness.DOCS / "experiments.md").read_text() == everything.overview(

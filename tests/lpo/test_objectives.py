@@ -395,8 +395,8 @@ def test_an_objective_is_itself_and_nothing_else_is_one():
 
 
 def test_a_file_is_found_by_the_name_that_it_was_saved_with(tmp_path):
-    learned = load_objective("lpo-pendulum")
-    save_objective(tmp_path / "mine", learned.drift, learned.parameters)
+    learned, small = load_objective("lpo-pendulum"), LearnedDrift(hidden_size=4)
+    save_objective(tmp_path / "mine", small, small.init(jax.random.key(0)))
     assert load_objective(tmp_path / "mine").name == "mine"
     assert load_apart([str(tmp_path / "mine"), learned])[1] is learned
     for unknown in (tmp_path / "other", "x" * 300):

@@ -146,7 +146,7 @@ def test_an_agent_that_diverged_earns_no_number(name, mode):
     with small_agents():
         spec = environment_agent(name, "CartPole-v1")
     agent = spec.agent(env)
-    state = agent.init(jax.random.key(0), spec.hyperparameters, env.default_params)
+    state = jax.jit(agent.init)(jax.random.key(0), spec.hyperparameters, env.default_params)
     earned = jax.jit(lambda s: agent.evaluate(s, jax.random.key(1), 3, mode=mode).returns)
     assert np.isfinite(earned(state)).all()
     broken = jax.tree.map(
@@ -208,8 +208,13 @@ def test_agents_train_where_numbers_have_64_bits(name, env):
         spec = environment_agent(name, "Pendulum-v1" if name == "td3" else "CartPole-v1")
     with jax.enable_x64(True):
         agent = spec.agent(env)
-        trained = jax.jit(agent.train)(jax.random.key(0), spec.hyperparameters, env.default_params)
-        assert np.isfinite(agent.evaluate(trained, jax.random.key(1), 2).returns).all()
+
+        @jax.jit
+        def earned(hyperparameters):
+            trained = agent.train(jax.random.key(0), hyperparameters, env.default_params)
+            return agent.evaluate(trained, jax.random.key(1), 2).returns
+
+        assert np.isfinite(earned(spec.hyperparameters)).all()
 
 
 # -- a new algorithm: its module and a row of the tables

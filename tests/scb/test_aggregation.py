@@ -34,12 +34,12 @@ def turning(observation):
     return 2 * jnp.tanh(observation[1:2] - observation[2:])
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def place():
     return Place.named("Pendulum-v1")
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def bandit(place):
     return bandit_for(place.env, place.params, BanditConfig(form="linear"), "Synthetic-Pendulum-v1")
 

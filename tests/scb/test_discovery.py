@@ -353,7 +353,7 @@ def test_a_candidates_own_optimal_policy_is_one_more_task(discovered, mode):
     policy = optimal_policy(problem.bandit, problem.bandit.params(outcome.mean))
     episodes = evaluate(place.env, place.params, policy, named_key(key, "optimal policy"), 2)
     assert made["fitness"][-1] == made["fitness/optimal policy"] == episodes.returns.mean()
-    judged = problem.evaluate_mean(outcome.mean, key)
+    judged = jax.jit(problem.evaluate_mean)(outcome.mean, key)
     both = 3 * judged["fitness/ppo"] + judged["fitness/optimal policy"]
     assert float(judged["fitness"]) == pytest.approx(float(both) / 4, rel=1e-6)
     # It trains nothing, and CartPole's episodes have 500 steps at most.
@@ -488,7 +488,8 @@ def test_the_papers_curriculum_raises_mountaincars_limit(monkeypatch):
     assert problem.steps(500).evaluation == 3 * 2 * 600
     agent = problem.specs["ppo"].agent(problem.bandit)
     weights = problem.bandit.init_weights(jax.random.key(0))
-    state = agent.init(jax.random.key(1), PPOHyperparameters(), problem.bandit.params(weights))
+    params = problem.bandit.params(weights)
+    state = jax.jit(agent.init)(jax.random.key(1), PPOHyperparameters(), params)
     zeros = jax.tree.map(jnp.zeros_like, state.params["policy"])
     state = state.replace(params={**state.params, "policy": zeros})
     judges = []
@@ -503,10 +504,12 @@ def test_the_papers_curriculum_raises_mountaincars_limit(monkeypatch):
     problem.evaluate_mean(weights, key)
     along, mean = judges
     assert along.limit == 1000
+    cut = jax.jit(lambda limit: along._replace(limit=limit)(agent, state, key))
     for limit in (1000, 600, 200):
-        found = along._replace(limit=jnp.int32(limit))(agent, state, key)
+        found = cut(jnp.int32(limit))
         np.testing.assert_array_equal(found.returns, -float(limit))
-    np.testing.assert_array_equal(mean(agent, state, key).returns, -200.0)
+    whole = jax.jit(lambda: mean(agent, state, key))()
+    np.testing.assert_array_equal(whole.returns, -200.0)
 
 
 def test_a_curriculum_must_end_within_the_environments_limit():

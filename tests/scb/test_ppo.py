@@ -35,11 +35,11 @@ def test_a_diagnosis_is_of_a_batch_before_and_after_its_update(monkeypatch):
     params = CorridorParams(rewards=jnp.array([[0.0, 1.0], [3.0, 0.0], [0.5, 0.0]]), random_start=1)
     config = PPOConfig(num_envs=8, num_steps=8, num_minibatches=2, normalize_observations=True)
     agent, hyperparameters = PPO(Corridor(), config), PPOHyperparameters(learning_rate=0.005)
-    state = agent.init(jax.random.key(0), hyperparameters, params)
-    state = agent.iterate(state, hyperparameters, params)
-    found = agent.diagnose(state, hyperparameters, params)
+    state = jax.jit(agent.init)(jax.random.key(0), hyperparameters, params)
+    state = jax.jit(agent.iterate)(state, hyperparameters, params)
+    found = jax.jit(agent.diagnose)(state, hyperparameters, params)
 
-    after, batch = agent._iterate(state, hyperparameters, params)
+    after, batch = jax.jit(agent._iterate)(state, hyperparameters, params)
     # The observations that the update saw are normalised as before it.
     seen = replace(after, statistics=state.statistics)
     before, later = (
@@ -72,9 +72,10 @@ def test_a_drift_meets_no_ratio_beyond_the_bound(monkeypatch, bound, whole):
     config = PPOConfig(num_envs=8, num_steps=8, num_minibatches=2)
     agent, params = PPO(Corridor(), config, breaking), CorridorParams(random_start=1)
     hyperparameters = PPOHyperparameters(learning_rate=10.0)
-    state = agent.init(jax.random.key(0), hyperparameters, params)
+    state = jax.jit(agent.init)(jax.random.key(0), hyperparameters, params)
+    iterate = jax.jit(agent.iterate)
     for _ in range(3):
-        state = agent.iterate(state, hyperparameters, params)
+        state = iterate(state, hyperparameters, params)
     leaves = jax.tree.leaves(state.params["policy"])
     assert all(np.isfinite(x).all() for x in leaves) == whole
 
