@@ -161,9 +161,9 @@ class BanditDiscovery:
                     "another."
                 )
         weights, contexts = start.default_params.weights, self.config.warm_start
-        if start.linear and (contexts.stretch != 1 or contexts.jitter):
-            return widened(weights, contexts.stretch, contexts.jitter)
-        return weights
+        if not self.config.widened:
+            return weights
+        return widened(weights, contexts.stretch, contexts.jitter)
 
     def initial_solution(self, key: jax.Array) -> Weights:
         config, seed = self.config, root_key(self.config.evolution.seed)

@@ -140,6 +140,12 @@ class DiscoveryConfig:
         """Whether it starts from a fit to an expert."""
         return self.init == "expert" and self.start is None
 
+    @property
+    def widened(self) -> bool:
+        """Whether it starts from a linear bandit whose contexts are stretched or jittered."""
+        given = self.warm_start.stretch != 1 or self.warm_start.jitter > 0
+        return self.start is not None and self.bandit.form == "linear" and given
+
     def __post_init__(self) -> None:
         algorithms: Any = self.algorithms
         if isinstance(algorithms, str):
@@ -211,7 +217,8 @@ class DiscoveryConfig:
         if self.mode == "sequential":
             because = "which is another algorithm's in the mode sequential"
             check_memory(self.evolution.strategy, because, "use the mode all")
-        if not self.evolution.num_generations and not (self.fitted or self.refinement.rounds):
+        before = self.fitted or self.widened or self.refinement.rounds
+        if not self.evolution.num_generations and not before:
             raise UserError(
                 "there are 0 generations, and nothing is found before them: choose init expert or refinement rounds, "
                 "or at least 1."

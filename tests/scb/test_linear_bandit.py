@@ -157,7 +157,11 @@ def test_the_contexts_of_one_that_a_search_starts_from_are_widened(tmp_path):
     weights = bandit.init_weights(jax.random.key(3))
     save_bandit(path, bandit, weights)
     config = DiscoveryConfig(start=str(path), bandit=LINEAR)
-    wide = replace(config, warm_start=WarmStartConfig(stretch=2.0, jitter=1.0))
+    # That is something to be found before the first generation.
+    evolution = EvolutionConfig(num_generations=0)
+    wide = replace(config, warm_start=WarmStartConfig(stretch=2.0, jitter=1.0), evolution=evolution)
+    with pytest.raises(UserError, match="0 generations, and nothing is found before them"):
+        replace(config, evolution=evolution)
     before, after = (BanditDiscovery(c).initial_solution(jax.random.key(0)) for c in (config, wide))
     jax.tree.map(np.testing.assert_array_equal, after["reward"], before["reward"])
     own, other = (
