@@ -225,6 +225,27 @@ def test_what_readme_says_of_hopper_is_of_the_seeds_that_all_three_have():
     assert f"Hopper: the {len(shared)} seeds that all three have" in readme
 
 
+def intervals(text):
+    """The ends of what stands in brackets, without their signs: a lead of one is a lag of the other."""
+    found = re.findall(r"\[([−\d.]+), ([−\d.]+)\]", text)
+    return {frozenset(end.strip("−") for end in pair) for pair in found}
+
+
+def test_what_is_said_of_hopper_elsewhere_stands_on_its_page():
+    def read_between(path, start, end):
+        return path.read_text().partition(start)[2].partition(end)[0]
+
+    # What is added is of the seeds of one claim alone.
+    known = intervals((DOCS / "locomotion.md").read_text() + "[−48, 127]")
+    for path, start, end in (
+        (ROOT / "README.md", "| on [Hopper]", "\n"),
+        (DOCS / "results.md", "| To locomotion?", "\n"),
+        (DOCS / "aims.md", "*Hopper.*", "A bandit that ranks"),
+    ):
+        said = intervals(read_between(path, start, end))
+        assert said and said <= known, path
+
+
 def test_what_is_folded_is_closed_and_rendered():
     folded = [page.read_text() for page in PAGES if "<details" in page.read_text()]
     assert folded
