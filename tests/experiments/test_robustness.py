@@ -48,6 +48,7 @@ def report():
             "Acrobot-v1": entry("Acrobot-v1", learned, **scores),
         },
         "machine": {"cores": 2, "processor": "a processor"},
+        "first_seed": 22000,
         "lists": module._PLAN["lists"],
     }
 
