@@ -53,6 +53,7 @@ def test_objectives_are_compared_under_settings_of_ones_own(capsys):
     assert "(n=2)" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_an_objective_of_ones_own_is_compared_and_its_family_is_the_examples(
     tmp_path, monkeypatch, capsys
 ):

@@ -144,7 +144,7 @@ def test_an_environment_of_another_family_has_the_settings_of_classic_control():
     assert len(parts) == 3
 
 
-@pytest.mark.parametrize("objective", [None, "dpo"])
+@pytest.mark.parametrize("objective", [None, pytest.param("dpo", marks=pytest.mark.slow)])
 def test_a_part_trains_agents_with_the_draws_that_it_says(tmp_path, objective):
     size = {"total_steps": 64, "num_envs": 2, "num_steps": 8, "num_minibatches": 2}
     small = ppo_spec("CartPole-v1").with_values(**size)

@@ -176,6 +176,7 @@ def test_what_confirms_the_choice_did_not_choose():
     assert not parameters(other_drifts()) & parameters(known_drifts())
 
 
+@pytest.mark.slow
 def test_the_environment_of_a_bandit_has_the_physics_asked_for(monkeypatch):
     made, make = [], EnvironmentSpec.make
 

@@ -158,6 +158,7 @@ class Nested(lpo.Drift):
         return xp.exp(weight[0]) * log_ratio**2
 
 
+@pytest.mark.slow
 def test_parameters_in_dictionaries_of_dictionaries_are_learned_and_saved(config, tmp_path):
     assert Nested().shapes() == {"network/kernel": (2,)}
     outcome = meta_train(replace(config, drift=Nested()), quiet=True)

@@ -98,6 +98,7 @@ def test_the_same_in_pytorch(module):
         lpo.torch_drift(of_jax)(*given)
 
 
+@pytest.mark.slow
 def test_agents_train_with_it_as_with_the_same_of_ours(module, tiny_spec):
     comparison = lpo.compare(
         "Synthetic-Pendulum-v1",

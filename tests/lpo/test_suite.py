@@ -215,6 +215,7 @@ def test_a_new_family_has_its_suite(corridors, trained, monkeypatch):
     assert set(scores.environments) <= set(suites()["all"])
 
 
+@pytest.mark.slow
 def test_a_killed_suite_is_completed_to_the_same_scores(tmp_path, tiny_agent, monkeypatch, capsys):
     spec = AgentSpec("ppo", tiny_agent, PPOHyperparameters())
     monkeypatch.setattr("lpo.comparison.environment_agent", lambda *_: spec)

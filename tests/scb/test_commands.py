@@ -554,6 +554,7 @@ def test_what_the_fit_cost_that_a_bandit_goes_back_to():
         assert listing.warm_start_cost(metadata) == expected
 
 
+@pytest.mark.slow
 def test_the_programs_say_their_version_and_complete_their_words():
     result = call("--version")
     assert (result.code, result.err) == (0, "")

@@ -337,7 +337,7 @@ def test_in_the_mode_sequential_the_mean_is_judged_by_every_algorithm(trained_in
 # -------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("mode", ["all", "sequential"])
+@pytest.mark.parametrize("mode", ["all", pytest.param("sequential", marks=pytest.mark.slow)])
 def test_a_candidates_own_optimal_policy_is_one_more_task(discovered, mode):
     _, outcome = discovered
     config = replace(CONFIG, mode=mode, agents_per_candidate=3, optimal_policy_episodes=2)

@@ -194,6 +194,7 @@ def test_a_search_that_was_killed_does_not_repeat_its_starts(tmp_path, monkeypat
     assert again.environment_steps == whole.environment_steps
 
 
+@pytest.mark.slow
 def test_of_several_starts_the_best_goes_on(capsys, monkeypatch):
     monkeypatch.setattr("scb.linear_expert.START_GENERATIONS", 2)
     env, size = ContinuousCorridor(cells=2), {"generations": 3, "judge_every": 3}

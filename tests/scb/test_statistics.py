@@ -328,7 +328,7 @@ def with_failures(generator, groups, scatter, failing):
     return runs + whole + generator.normal(0.0, scatter, (groups, 1))
 
 
-@pytest.mark.parametrize("confidence", [0.95, 0.9983])
+@pytest.mark.parametrize("confidence", [pytest.param(0.95, marks=pytest.mark.slow), 0.9983])
 @pytest.mark.parametrize("failing", [0.0, 0.3])
 def test_few_groups_leave_the_truth_out_no_more_often_than_they_say(confidence, failing):
     generator, outside, number = np.random.default_rng(0), 0, 200
