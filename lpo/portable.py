@@ -10,6 +10,7 @@ at ±`MAX_LOG_RATIO`, and advantages that the caller has normalised over the min
 
 import importlib
 from collections.abc import Callable, Mapping
+from contextlib import nullcontext
 from functools import partial
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -152,7 +153,13 @@ def _in_torch(
     if not log_ratio.is_floating_point():  # which would cut the advantage's decimals off
         log_ratio = log_ratio.to(advantage if advantage.is_floating_point() else torch.float32)
     log_ratio = log_ratio.to(torch.promote_types(log_ratio.dtype, torch.float32))
-    with torch.autocast(log_ratio.device.type, enabled=False):
+    device = log_ratio.device.type
+    off = (
+        torch.autocast(device, enabled=False)
+        if torch.amp.is_autocast_available(device)
+        else nullcontext()
+    )
+    with off:
         return _evaluate(torch, drift, parameters, log_ratio, advantage.to(log_ratio), progress)
 
 

@@ -397,6 +397,9 @@ class TestTorch:
         value.backward()
         assert value.dtype == torch.float32 and torch.isfinite(half.grad).all()
         assert value.item() == pytest.approx(float(expected), rel=1e-2)
+        # One that knows no autocast.
+        nowhere = torch.zeros(3, device="meta")
+        assert torch_drift(objective)(nowhere, nowhere, 0.0).shape == (3,)
 
     @pytest.mark.parametrize("objective", ["ppo", "ta-lpo"])
     def test_a_loss_is_one_graph_of_torch_compile(self, torch, objective):
