@@ -7,7 +7,7 @@ are trained at a time, and --out is saved after each few: the same command goes 
 `--seeds` or `--objectives` adds to it. With `--tuning-agents` a clip is chosen for each environment first, by agents
 that report nothing, and compared like the others. (As jobs, the same command once more trains it.) With `--rates` as
 many agents that report nothing are trained at other learning rates too; with `--learning-rate` those that report are,
-and stand apart as "hopper at 0.0005".
+and stand apart as "hopper at 0.0005"; with `--annealed` these rates fall to zero.
 """
 
 import math
@@ -65,6 +65,15 @@ class Options(Keeping):
     """learning rates at which the objectives are trained on those seeds as well"""
     learning_rate: float | None = None
     """of the agents that report; None for the environment's own"""
+    annealed: bool = False
+    """whether that one, and those of --rates, fall linearly to zero over the training"""
+
+    def setting(self, learning_rate: float | None) -> dict[str, Any]:
+        """What of PPO's hyperparameters is other than the environment's."""
+        if learning_rate is None:
+            return {}
+        falling = {"anneal_learning_rate": True} if self.annealed else {}
+        return {"learning_rate": learning_rate, **falling}
 
     def __post_init__(self) -> None:
         at_least(1, self, "seeds", "together")
@@ -83,6 +92,13 @@ class Options(Keeping):
                 ("validated", "rates"),
                 "give tuning_agents",
             )
+        if self.learning_rate is None and not self.rates:
+            unused(
+                self,
+                "the environment's own learning rate stays as it is",
+                ("annealed",),
+                "give learning_rate or rates",
+            )
 
 
 def parts(options: Options, report: dict[str, Any]) -> Iterator[Part]:
@@ -90,8 +106,11 @@ def parts(options: Options, report: dict[str, Any]) -> Iterator[Part]:
     objectives = tuple(dict.fromkeys((REFERENCE, *options.objectives)))
     # That nobody waits for a name that is none, or for a rate.
     same_objectives(report, map(load_objective, (*objectives, *options.validated)))
-    given = options.learning_rate
-    for rate in (*options.rates, *([] if given is None else [given])):
+    given = options.setting(options.learning_rate)
+    for rate in (
+        *options.rates,
+        *([] if options.learning_rate is None else [options.learning_rate]),
+    ):
         check_value("learning_rate", rate)
     for environment in options.environments:
         names = objectives
@@ -101,7 +120,8 @@ def parts(options: Options, report: dict[str, Any]) -> Iterator[Part]:
             yield from _of(environment, judged, seeds, options, report, ("sweep",))
             for rate in options.rates:
                 at_rate = partial(_of, environment, objectives, seeds, options, report)
-                yield from at_rate(("rates", str(rate)), {"learning_rate": rate})
+                setting = options.setting(rate)
+                yield from at_rate(("rates", _label(setting)), setting)
             best = tuned(swept(report.get("environments", {}).get(environment, {})))
             names = (*names, best) if best and best not in names else names
         yield from _of(
@@ -111,17 +131,23 @@ def parts(options: Options, report: dict[str, Any]) -> Iterator[Part]:
             options,
             report,
             ("agents",),
-            {} if given is None else {"learning_rate": given},
+            given,
             named(environment, given),
         )
 
 
-def named(environment: str, learning_rate: float | None) -> str:
-    """The entry of what reports there, at the environment's own learning rate or another."""
-    its_own = ppo_spec(environment).hyperparameters.learning_rate
-    if learning_rate is None or learning_rate == its_own:
-        return environment
-    return f"{environment} at {learning_rate}"
+ANNEALED = "annealed"
+
+
+def _label(setting: Mapping[str, Any]) -> str:
+    """ "0.001", or "0.001, annealed"."""
+    return f"{setting['learning_rate']}" + (f", {ANNEALED}" if len(setting) > 1 else "")
+
+
+def named(environment: str, setting: Mapping[str, Any]) -> str:
+    """The entry of what reports there: "hopper", "hopper at 0.001", "hopper at 0.001, annealed"."""
+    own = {"learning_rate": float(ppo_spec(environment).hyperparameters.learning_rate)}
+    return environment if setting in ({}, own) else f"{environment} at {_label(setting)}"
 
 
 def _of(
@@ -131,7 +157,7 @@ def _of(
     options: Options,
     report: Report,
     place: Keys,
-    hyperparameters: Mapping[str, float] = MappingProxyType({}),
+    hyperparameters: Mapping[str, Any] = MappingProxyType({}),
     entry: str | None = None,
 ) -> Iterator[Part]:
     spec = ppo_spec(environment, hyperparameters=hyperparameters)
@@ -158,20 +184,19 @@ def swept(entry: Report) -> dict[str, float]:
     return {curve.objective: float(iqm(curve.late)) for curve in curves}
 
 
-def at_rates(environment: str, entry: Report) -> dict[float, dict[str, tuple[float, float, int]]]:
+def at_rates(environment: str, entry: Report) -> dict[str, dict[str, tuple[float, float, int]]]:
     """{learning rate: {objective: (over the training, over the last quarter, agents)}} of those that report nothing."""
     if not (rates := entry.get("rates")):
         return {}
-    own = float(ppo_spec(environment).hyperparameters.learning_rate)
+    own = str(float(ppo_spec(environment).hyperparameters.learning_rate))
     there = {name for of_it in rates.values() for name in of_it}
-    found = {own: {k: x for k, x in entry.get("sweep", {}).items() if k in there}}
-    found |= {float(rate): of_it for rate, of_it in rates.items()}
+    found = {own: {k: x for k, x in entry.get("sweep", {}).items() if k in there}, **rates}
     return {
         rate: {
             curve.objective: (float(iqm(curve.area)), float(iqm(curve.late)), len(curve.seeds))
             for curve in as_comparison(environment, entry, found[rate]).curves
         }
-        for rate in sorted(found)
+        for rate in sorted(found, key=lambda rate: (float(rate.partition(",")[0]), rate))
     }
 
 
@@ -255,7 +280,7 @@ def facts(report: Report) -> dict[str, Any]:
         "confirmations": [
             (
                 asked,
-                STATED[asked.of].beside(asked.reference),
+                STATED[asked.of].beside(asked.reference, asked.reference_in),
                 pairs,
                 judged,
                 judged and since(report, asked),

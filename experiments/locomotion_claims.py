@@ -1,8 +1,9 @@
 """What is asked of objectives on locomotion, and what became of the claims that were stated first."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -24,9 +25,9 @@ class Asked:
     measure: str
     margin: float = 0.0
 
-    def beside(self, reference: str = REFERENCE) -> str:
-        """In words, beside that reference."""
-        return self.words.format(_called(reference))
+    def beside(self, reference: str = REFERENCE, where: str = "") -> str:
+        """In words, beside that reference, whose agents may have been trained elsewhere."""
+        return self.words.format(_called(reference) + (f" on {where}" if where else ""))
 
 
 # What is asked of every objective.
@@ -75,35 +76,41 @@ def confirmed(report: Report) -> list[tuple[Confirmation, int, Judged | None]]:
     for asked, seeds in with_pairs(report):
         judged = None
         if len(seeds) == len(asked.seeds):
-            entry = report["environments"][asked.environment]
-            names = (asked.reference, asked.objective)
-            fresh = {name: {s: entry["agents"][name][s] for s in seeds} for name in names}
-            curves = as_comparison(asked.environment, entry, fresh).by_name
-            both = curves[asked.objective], curves[asked.reference]
-            (judged,) = judge([_claim(asked.environment, *both, asked.of)])
+            reference, ours = (
+                _curves(report["environments"], *of_it, seeds) for of_it in asked.both
+            )
+            (judged,) = judge(
+                [_claim(asked.environment, ours, reference, asked.of, asked.reference_in)]
+            )
         found.append((asked, len(seeds), judged))
     return found
 
 
 def since(report: Report, asked: Confirmation) -> tuple[list[int], Estimate] | None:
     """(seeds, difference) of the pairs that were trained after those of a confirmation; None where they are few."""
-    entry = looked_at(report).get(asked.environment)
-    if entry is None:
-        return None
-    last = max(asked.seeds)
-    later = {
-        name: {
-            seed: agent for seed, agent in entry["agents"].get(name, {}).items() if int(seed) > last
-        }
-        for name in (asked.reference, asked.objective)
-    }
-    shared = sorted(set.intersection(*map(set, later.values())), key=int)
+    entries, last = looked_at(report), max(asked.seeds)
+    later = [
+        {s for s in entries.get(entry, {}).get("agents", {}).get(name, {}) if int(s) > last}
+        for entry, name in asked.both
+    ]
+    shared = sorted(set.intersection(*later), key=int)
     if len(shared) < DECIDING:
         return None
-    curves = as_comparison(asked.environment, entry, later).by_name
-    found = paired(curves[asked.objective], curves[asked.reference], asked.of)
+    reference, ours = (_curves(entries, *of_it, shared) for of_it in asked.both)
+    found = paired(ours, reference, asked.of)
     assert callable(found)
     return [int(seed) for seed in shared], found()
+
+
+def _curves(
+    entries: Mapping[str, Any], entry: str, objective: str, seeds: Sequence[str]
+) -> LearningCurves:
+    """Of these seeds alone."""
+    agents = entries[entry]["agents"][objective]
+    (curves,) = as_comparison(
+        entry, entries[entry], {objective: {seed: agents[seed] for seed in seeds}}
+    ).curves
+    return curves
 
 
 def leading(curves: Sequence[LearningCurves]) -> tuple[int, dict[str, dict[str, list[int]]]]:
@@ -129,13 +136,15 @@ def leading(curves: Sequence[LearningCurves]) -> tuple[int, dict[str, dict[str, 
     return number, found
 
 
-def _text(entry: str, objective: str, of: str, reference: str = REFERENCE) -> str:
-    return f"{entry}: {objective} {STATED[of].beside(reference)}"
+def _text(entry: str, objective: str, of: str, reference: str = REFERENCE, where: str = "") -> str:
+    return f"{entry}: {objective} {STATED[of].beside(reference, where)}"
 
 
-def _claim(entry: str, curves: LearningCurves, reference: LearningCurves, of: str) -> Claim:
+def _claim(
+    entry: str, curves: LearningCurves, reference: LearningCurves, of: str, where: str = ""
+) -> Claim:
     asked, evidence = STATED[of], paired(curves, reference, of)
-    text = _text(entry, curves.objective, of, reference.objective)
+    text = _text(entry, curves.objective, of, reference.objective, where)
     if not asked.margin:
         return Claim(text, evidence, places=0)
     margin = float(f"{asked.margin * abs(float(getattr(reference, asked.measure).mean())):.4g}")

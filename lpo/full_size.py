@@ -26,13 +26,15 @@ class Confirmation:
     """One claim, stated before agents of its seeds were trained, and decided when all have been.
 
     Attributes:
-      environment, objective: whose it is; "hopper at 0.0005" is Hopper with that learning rate.
+      environment, objective: whose it is; "hopper at 0.0005" is Hopper with that learning rate, and "hopper at 0.001,
+        annealed" with one that falls from there to zero.
       seeds: of its pairs of agents, none of which suggested the claim.
       of: what is said of them: "final" (no lower at the end, within a margin), "late" (no less over the last quarter,
         within a margin), "late lead" (more over it), "early" (more over the first half) or "area" (more over all).
       reference: which objective its agents are compared with.
       known: the one of both whose agents of these seeds had been trained, and seen, before.
       suggested: what earlier pairs said of it, in words.
+      reference_in: where the reference's agents are trained; "" for the same environment and learning rate.
     """
 
     environment: str
@@ -42,15 +44,24 @@ class Confirmation:
     reference: str = REFERENCE
     known: str | None = None
     suggested: str = ""
+    reference_in: str = ""
 
     def __post_init__(self) -> None:
         if self.known not in (None, self.reference, self.objective):
             raise ValueError(f"known is one of both objectives, or None: {self}.")
 
     @property
-    def trained(self) -> list[str]:
-        """Of which objectives agents are trained for it."""
-        return [name for name in (self.reference, self.objective) if name != self.known]
+    def both(self) -> tuple[tuple[str, str], tuple[str, str]]:
+        """(entry, objective) of what is compared, the reference first."""
+        return (self.reference_in or self.environment, self.reference), (
+            self.environment,
+            self.objective,
+        )
+
+    @property
+    def trained(self) -> list[tuple[str, str]]:
+        """Those of which agents are trained for it."""
+        return [(entry, name) for entry, name in self.both if name != self.known]
 
 
 CONFIRMATIONS = (
@@ -142,10 +153,12 @@ def validated(environment: str) -> dict[str, LearningCurves]:
 def with_pairs(report: Mapping[str, Any]) -> Iterator[tuple[Confirmation, list[str]]]:
     """Every confirmation of what a report has agents of, and its seeds of which both agents are there."""
     for asked in CONFIRMATIONS:
-        agents = report["environments"].get(asked.environment, {}).get("agents", {})
-        if asked.reference in agents and asked.objective in agents:
-            both = agents[asked.reference].keys() & agents[asked.objective].keys()
-            yield asked, [str(s) for s in asked.seeds if str(s) in both]
+        reference, ours = (
+            report["environments"].get(entry, {}).get("agents", {}).get(name, {})
+            for entry, name in asked.both
+        )
+        if reference and ours:
+            yield asked, [str(s) for s in asked.seeds if str(s) in reference.keys() & ours.keys()]
 
 
 def looked_at(report: Mapping[str, Any]) -> dict[str, Any]:
@@ -159,7 +172,7 @@ def looked_at(report: Mapping[str, Any]) -> dict[str, Any]:
     for environment, entry in report["environments"].items():
         agents = {name: dict(of_it) for name, of_it in entry.get("agents", {}).items()}
         for asked in pending:
-            for name in asked.trained if asked.environment == environment else ():
+            for name in (name for place, name in asked.trained if place == environment):
                 for seed in asked.seeds:
                     agents[name].pop(str(seed), None)
         found[environment] = {**entry, "agents": {k: of_it for k, of_it in agents.items() if of_it}}

@@ -235,8 +235,8 @@ def test_objectives_are_trained_at_other_rates_by_agents_that_report_nothing(
     assert entry["rates"]["0.001"].keys() == {"ppo", "dpo"} and "ppo" in entry["sweep"]
     assert {*entry["agents"]["ppo"]}.isdisjoint(map(str, seeds))
     rates = module.at_rates("hopper", entry)
-    assert [*rates] == [0.00025, 0.001] and [*rates[0.001]] == ["ppo", "dpo"]
-    area, late, agents = rates[0.001]["dpo"]
+    assert [*rates] == ["0.00025", "0.001"] and [*rates["0.001"]] == ["ppo", "dpo"]
+    area, late, agents = rates["0.001"]["dpo"]
     assert (area, late, agents) == (275.25, 500.5, 2)
     page = module.EXPERIMENT.page(json.loads(out.read_text()))
     assert "| 0.001 | 30, 10 | 275, 500 |" in page and "| 0.00025 | 30, 10 |  |" in page
@@ -291,6 +291,52 @@ def test_agents_that_report_at_another_rate_stand_apart(tmp_path, trained_at):
     assert "**On hopper at 0.0005 nothing is shown.**" in pages["locomotion_elsewhere"]
     assert "(figures/locomotion_hopper_at_0.0005.png)" in pages["locomotion_elsewhere"]
     assert "--environments hopper`" in page and "`--learning-rate` for those" in page
+
+
+def test_agents_whose_learning_rate_falls_to_zero_stand_apart(tmp_path, compared, monkeypatch):
+    settings, stub = [], module.compare
+
+    def compare(environment, objectives, seeds, spec, *others, **named):
+        settings.append(
+            (spec.hyperparameters.learning_rate, spec.config.anneal_learning_rate, seeds[0])
+        )
+        return stub(environment, objectives, seeds, spec, *others, **named)
+
+    monkeypatch.setattr(module, "compare", compare)
+    out = tmp_path / "report.json"
+    flags = ["--objectives", "ppo", "dpo", "--seeds", "2", f"--out={out}"]
+    assert module.EXPERIMENT.main(flags) == 0
+    at_rate = [*flags, "--learning-rate", "0.001", "--annealed"]
+    assert module.EXPERIMENT.main(at_rate) == 0
+    first = REPORTING[0]
+    assert settings == [(0.00025, False, first)] * 2 + [(0.001, True, first)] * 2
+    # Of those that report nothing the rates fall, and of those that report there is no other.
+    settings.clear()
+    swept = [*flags, "--tuning-agents", "1", "--rates", "0.001", "0.0005", "--annealed"]
+    assert module.EXPERIMENT.main(swept) == 0
+    assert [x for x in settings if x[1]] == [
+        (rate, True, VALIDATING[0]) for rate in (0.001, 0.001, 0.0005, 0.0005)
+    ]
+    assert all(seed == VALIDATING[0] for rate, _, seed in settings)
+    entries = json.loads(out.read_text())["environments"]
+    assert [*entries] == ["hopper", "hopper at 0.001, annealed"]
+    assert entries["hopper at 0.001, annealed"]["hyperparameters"] == {
+        "learning_rate": 0.001,
+        "anneal_learning_rate": True,
+    }
+    assert [*module.at_rates("hopper", entries["hopper"])] == [
+        "0.00025",
+        "0.0005, annealed",
+        "0.001, annealed",
+    ]
+    page = module.EXPERIMENT.page(json.loads(out.read_text()))
+    assert (
+        "*Hopper at 0.001, annealed* is hopper with a learning rate that falls linearly from 0.001 to zero."
+        in page
+    )
+    assert "| 0.001, annealed |" in page
+    with pytest.raises(UserError, match=r"annealed is .*give learning_rate or rates"):
+        module.Options(annealed=True)
 
 
 def test_the_shipped_curves_are_of_the_full_size_and_stand_beside_shorter_trainings():

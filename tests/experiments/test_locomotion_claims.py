@@ -169,3 +169,44 @@ def test_a_lead_that_is_asked_of_one_objective_alone_has_no_margin_and_stands_be
     )
     texts = {claim.text for claim in locomotion_claims.claims(made)}
     assert not any("more over the last quarter" in text for text in texts)
+
+
+def test_a_confirmation_may_ask_of_agents_that_were_trained_otherwise(monkeypatch):
+    other = "hopper at 0.001, annealed"
+    asked = full_size.Confirmation(
+        "hopper", "dpo", range(4, 14), "area", known="dpo", reference_in=other
+    )
+    assert asked.trained == [(other, "ppo")]
+    monkeypatch.setattr(full_size, "CONFIRMATIONS", (asked,))
+    made = report(20)
+    assert locomotion_claims.confirmed(made) == []  # nothing there to hold it against
+    entry = {**report(13)["environments"]["hopper"], "environment": "hopper"}
+    made["environments"][other] = {**entry, "hyperparameters": {"learning_rate": 0.001}}
+    assert [pairs for _, pairs, _ in locomotion_claims.confirmed(made)] == [9]
+    # The agents that wait are those of the reference, where it is trained, and no others.
+    left = full_size.looked_at(made)
+    counts = {
+        name: {objective: len(agents) for objective, agents in x["agents"].items()}
+        for name, x in left.items()
+    }
+    assert counts["hopper"] == {"ppo": 20, "dpo": 20, "lpo-pendulum": 20}
+    assert counts[other] == {"ppo": 4, "dpo": 13, "lpo-pendulum": 13}
+    for agent in entry["agents"]["ppo"].values():
+        agent["returns"] = "0 50 190"
+    entry["agents"]["ppo"]["13"] = entry["agents"]["ppo"]["12"]
+    ((_, pairs, judged),) = locomotion_claims.confirmed(made)
+    # dpo's end at 200 and the seed's last digit, in the second of two evaluations.
+    expected = np.mean([(200 + seed % 10 - 190) / 2 for seed in asked.seeds])
+    assert pairs == 10 and judged.estimate.value == pytest.approx(expected)
+    assert judged.claim.text == f"hopper: dpo earns more over the training than PPO on {other}"
+    assert f"| hopper: dpo earns more over the training than PPO on {other} |" in (
+        module.EXPERIMENT.page(made)
+    )
+    assert locomotion_claims.since(made, asked) is None  # of the reference there are no more
+    entry["agents"]["ppo"] |= {str(s): entry["agents"]["ppo"]["12"] for s in range(14, 24)}
+    assert locomotion_claims.since(made, asked) is None  # nor of six both
+    made["environments"]["hopper"]["agents"]["dpo"] |= {
+        str(s): made["environments"]["hopper"]["agents"]["dpo"]["12"] for s in range(20, 24)
+    }
+    seeds, later = locomotion_claims.since(made, asked)
+    assert seeds == list(range(14, 24)) and later.value > 0
