@@ -70,7 +70,7 @@ TASKS = {
 
 
 def spec_of(task: Task, steps: int) -> Any:
-
+    """The paper's inner-loop configuration at its fixed hyperparameters."""
     return bandit_agent(task.algorithm, task.environment, sampled=False).with_steps(steps)
 
 
@@ -79,7 +79,6 @@ def measure_this_project(task: Task, steps: int) -> dict[str, list[float]]:
 
     Runs in a process of its own.
     """
-
     bandit, _ = bandit_of(task.environment)
     params = bandit.default_params
     spec = spec_of(task, steps)
@@ -261,12 +260,19 @@ class Options:
 
 def measure(options: Options, report: dict[str, Any], save: Save) -> None:
     """An algorithm at a time, here and there."""
+    settled(report, steps=options.steps, episodes=EPISODES)
+    results = report.setdefault("algorithms", {})
+    names = options.algorithms.split(",")
+    beside = [name for name in names if "ratio" in results.get(name, {})]
+    if beside and options.rejax_python is None:
+        raise UserError(
+            f"the report has rejax's times of {', '.join(beside)}, taken in one go with ours: give --rejax-python, or "
+            "another --out."
+        )
     print(f"Training for {options.steps} steps in the bandit; median seconds an agent.")
     print(f"Return in the real environment: IQM [95 %] of agents, {EPISODES} episodes each.\n")
     print(line("algorithm", THIS, PEER, "ratio", f"return, {THIS}", f"return, {PEER}"), flush=True)
-    settled(report, steps=options.steps, episodes=EPISODES)
-    results = report.setdefault("algorithms", {})
-    for name in options.algorithms.split(","):
+    for name in names:
         own = f"from experiments import benchmark; benchmark.print_measured({name!r}, {options.steps})"
         measured = {THIS: last_line([sys.executable, "-c", own])}
         if options.rejax_python is not None:
