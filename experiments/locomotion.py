@@ -203,14 +203,28 @@ def at_rates(environment: str, entry: Report) -> dict[str, dict[str, tuple[float
 def leads_at_rates(
     environment: str, entry: Report
 ) -> list[tuple[str, str, int, Estimate, Estimate]]:
-    """Of objectives with enough agents at another rate: (rate, name, pairs, more than PPO over the training, late)."""
+    """Of objectives with enough agents at another rate: (rate, name, pairs, more than PPO over the training, late).
+
+    Where the rate falls in others, they are beside PPO with it too, as "0.001 beside PPO at 0.001, annealed".
+    """
     found = []
-    for rate, agents in entry.get("rates", {}).items():
-        if REFERENCE in agents:
-            comparison = as_comparison(environment, entry, agents)
+    rates = entry.get("rates", {})
+    for rate, agents in rates.items():
+        falling = f"{rate}, {ANNEALED}"
+        for other in (rate, falling) if falling in rates else (rate,):
+            if REFERENCE not in rates[other]:
+                continue
+            where = rate if other == rate else f"{rate} beside PPO at {other}"
+            (reference,) = as_comparison(
+                environment, entry, {REFERENCE: rates[other][REFERENCE]}
+            ).curves
+            ours = as_comparison(environment, entry, agents).curves
+            comparison = Comparison(
+                [reference, *(x for x in ours if other != rate or x.objective != REFERENCE)]
+            )
             area, late = (comparison.differences(of) for of in ("area", "late"))
             enough = {name: x.n for name, x in area.items() if x.n >= DECIDING}
-            found += [(rate, name, n, area[name], late[name]) for name, n in enough.items()]
+            found += [(where, name, n, area[name], late[name]) for name, n in enough.items()]
     return found
 
 

@@ -259,6 +259,24 @@ def test_enough_pairs_at_another_rate_are_told_with_their_intervals():
     assert late == paired_difference(ours.late, theirs.late)
     page = module.EXPERIMENT.page(made)
     assert "| dpo at 0.001 | 10 | " in page and "dpo at 0.002" not in page
+    # Beside PPO whose rate falls stand the others with a rate that does not, and PPO itself.
+    falling = {"ppo": {s: x | {"returns": "0 50 160"} for s, x in entry["agents"]["ppo"].items()}}
+    entry["rates"] = {"0.001": entry["agents"], "0.001, annealed": falling}
+    leads = {
+        (rate, name): area.value
+        for rate, name, _, area, _ in module.leads_at_rates("hopper", entry)
+    }
+    beside = "0.001 beside PPO at 0.001, annealed"
+    assert leads == pytest.approx(
+        {
+            ("0.001", "dpo"): 50.0,
+            ("0.001", "lpo-pendulum"): -25.0,
+            (beside, "ppo"): (104.5 - 160) / 2,
+            (beside, "dpo"): (204.5 - 160) / 2,
+            (beside, "lpo-pendulum"): (54.5 - 160) / 2,
+        }
+    )
+    assert f"| dpo at {beside} | 10 | " in module.EXPERIMENT.page(made)
     assert (
         "locomotion_elsewhere.md" not in page
         and "locomotion_elsewhere" not in module.EXPERIMENT.pages(made)
