@@ -76,7 +76,7 @@ def make_train(objective: str, total_steps: int) -> Any:
     space = env.action_space(params)
     network = ActorCritic(space.shape[0])
     objective_loss = lpo.loss_function(objective)  # objective
-    batches = total_steps // (ENVS * STEPS)
+    batches = -(-total_steps // (ENVS * STEPS))
     reset = jax.vmap(env.reset, in_axes=(0, None))
     step_env = jax.vmap(env.step, in_axes=(0, 0, 0, None))
 
@@ -172,7 +172,7 @@ def main(
     Args:
       objective: ppo, ppo-0.3, dpo, dpo-4-1.2, a name of the zoo (lpo-pendulum) or path/to/objective.npz.
       agents: that train side by side.
-      steps: of each agent's training.
+      steps: of each agent's training, rounded up to whole batches of 10 000.
       seed: of all of them.
     """
     keys = jax.random.split(jax.random.key(seed), agents)

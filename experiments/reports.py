@@ -124,6 +124,6 @@ def lost(report: Any, of_them: bool = False) -> int:
 
 
 def finite(returns: Any, place: Place) -> tuple[list[float], int]:
-    """([N] returns to two digits, how many were no number): those count as random actions there."""
+    """([N] returns to six digits, how many were no number): those count as random actions there."""
     values, failed = as_random(np.asarray(returns, np.float64), place)
-    return np.round(values, 2).tolist(), int(failed.sum())
+    return [float(f"{x:.6g}") for x in values], int(failed.sum())

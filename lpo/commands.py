@@ -14,7 +14,7 @@ import tyro
 from lpo import search_figures
 from lpo.certificate import certify
 from lpo.distill import distill
-from lpo.drifts import LearnedDrift, learned_drift
+from lpo.drifts import Drift, LearnedDrift, learned_drift
 from lpo.formula_search import DistillConfig
 from lpo.inner_loop import MetaTrainingConfig
 from lpo.meta_training import (
@@ -25,7 +25,7 @@ from lpo.meta_training import (
 )
 from lpo.objectives import Objective, load_objective, save_objective
 from scb import plotting, processes
-from scb.command_line import GENERATIONS, LongRun, SharedOutput, flags, listed
+from scb.command_line import GENERATIONS, LongRun, SharedOutput, flag_names, flags, listed
 from scb.console import console
 from scb.errors import UserError
 from scb.files import make_folder
@@ -46,9 +46,16 @@ def _meta_training(
         )
     tasks = listed(names.pop(), "tasks") if names else MetaTrainingConfig.tasks
     temporal = {"temporal": True} if "temporal" in given else {}
+    drift = learned_drift(given.get("drift", LearnedDrift.name), **temporal)
+    taken = {*drift.settings()}.intersection(flag_names(MetaTrain(), Drift))
+    if taken:
+        raise UserError(
+            f"the drift {drift.family()} has a field {min(taken)}, and --{min(taken)} is something else here: give the "
+            "field another name."
+        )
     default = MetaTrainingConfig(
         tasks=tasks,
-        drift=learned_drift(given.get("drift", LearnedDrift.name), **temporal),
+        drift=drift,
         horizons=TEMPORAL_HORIZONS if temporal else (),
         validation="validate" in given,
     )

@@ -19,6 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from lpo.drifts.contract import check_static
 from lpo.inner_loop import MetaTrainingConfig, TaskTraining
 from lpo.objectives import Objective, load_objective, save_objective
 from scb import processes
@@ -47,7 +48,9 @@ class MetaTraining:
             raise UserError(
                 f"the drift is of the family {config.drift.name}, which has nothing to learn: take a LearnedDrift."
             )
-        config.drift.shapes()  # what could not be saved is refused before it is learned
+        # What could not be loaded or saved is refused before it is learned.
+        check_static(config.drift)
+        config.drift.shapes()
         self.config = config
         self.tasks = {name: TaskTraining(config, name) for name in config.tasks}
         self.judges = self.tasks

@@ -2,7 +2,7 @@
 
 import contextlib
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence, Set
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
@@ -13,6 +13,7 @@ import jax.numpy as jnp
 
 from lpo.certificate import Certificate, certify
 from lpo.drifts import ClipDrift, DPODrift, Drift, NoDrift, drift_from_config
+from lpo.drifts.contract import check_static
 from lpo.drifts.surrogate import SurrogateDrift
 from scb import artefacts, own
 from scb.environments.registry import environment_spec
@@ -46,7 +47,7 @@ class Objective:
       metadata: of a learned objective, what its artefact says.
 
     Raises:
-      UserError: the drift is of no family, or of one that is no frozen dataclass.
+      UserError: the drift is of no family, or of one that is no frozen dataclass of hashable settings.
     """
 
     name: str
@@ -60,12 +61,7 @@ class Objective:
                 f"the drift of the objective {self.name} is of the class {type(self.drift).__name__}: give an "
                 "lpo.Drift, or a function of ratio and advantage to lpo.load_objective."
             )
-        settings = getattr(self.drift, "__dataclass_params__", None)
-        if settings is None or not settings.frozen:
-            raise UserError(
-                f"the drift {type(self.drift).__name__} is no frozen dataclass, as which programs are told apart: "
-                "write @dataclasses.dataclass(frozen=True) above it."
-            )
+        check_static(self.drift)
 
     def __repr__(self) -> str:
         drift = self.drift
@@ -183,10 +179,16 @@ def same_drift(one: Objective, other: Objective) -> bool:
     )
 
 
-def load_apart(names: Iterable[Named] | Mapping[str, Named]) -> list[Objective]:
+def load_apart(
+    names: Iterable[Named] | Mapping[str, Named], kept: Collection[str] = ()
+) -> list[Objective]:
     """Objectives by what `load_objective` takes, with names of their own.
 
     Files of one name go by what was typed, and those of a mapping by its keys.
+
+    Args:
+      names: what to load.
+      kept: names by which there are results of files already: the first file of such a name keeps it.
 
     Raises:
       UserError: as for `load_objective`, or one stands there twice.
@@ -208,14 +210,14 @@ def load_apart(names: Iterable[Named] | Mapping[str, Named]) -> list[Objective]:
     names = list(names)
     loaded = [load_objective(name) for name in names]
     known = [objective.name for objective in loaded]
-    loaded = [
-        objective
-        if known.count(objective.name) == 1 or not isinstance(typed, str | Path)
-        else replace(objective, name=str(typed))
-        for objective, typed in zip(loaded, names, strict=True)
-    ]
-    check_names(loaded)
-    return loaded
+    apart: list[Objective] = []
+    for objective, typed in zip(loaded, names, strict=True):
+        first = objective.name in kept and objective.name not in (x.name for x in apart)
+        if known.count(objective.name) > 1 and isinstance(typed, str | Path) and not first:
+            objective = replace(objective, name=str(typed))
+        apart.append(objective)
+    check_names(apart)
+    return apart
 
 
 def learned_in(objectives: Sequence[Objective]) -> list[str]:
@@ -237,7 +239,8 @@ def closed_form(name: str, drift: Drift) -> Objective:
 
 def _family(drift: Drift) -> Drift:
     """The drift with default settings where parameters say all that settings do: one program then trains all such."""
-    return type(drift)() if isinstance(drift, ClipDrift | DPODrift) else drift
+    # Of a subclass there may be settings that its parameters do not say.
+    return type(drift)() if type(drift) in (ClipDrift, DPODrift) else drift
 
 
 def _from_file(path: Path) -> Objective:

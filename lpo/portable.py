@@ -236,7 +236,8 @@ def _mapped(function: Callable[[Any], Any], tree: Any) -> Any:
     if isinstance(tree, Mapping):
         return {name: _mapped(function, x) for name, x in tree.items()}
     if isinstance(tree, list | tuple):
-        return type(tree)(_mapped(function, x) for x in tree)
+        made = [_mapped(function, x) for x in tree]
+        return type(tree)(*made) if hasattr(tree, "_fields") else type(tree)(made)
     return function(tree)
 
 

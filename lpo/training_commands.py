@@ -31,6 +31,7 @@ from scb.files import write_json
 from scb.lists import read_settings, write_settings
 from scb.machine import package_versions
 from scb.measurement import Place, check_seeds
+from scb.runs import read_config
 from scb.statistics import correlation_text, estimate, few_agents
 
 
@@ -133,9 +134,15 @@ class OfObjectives(Measuring):
     def inputs(self) -> dict[str, str]:
         environment = self.config.environment
         told = digests([] if environment is None else [environment])
-        for objective in load_apart(self.config.objectives):
+        for objective in self.loaded():
             told |= objective.digests
         return told
+
+    def loaded(self) -> list[Objective]:
+        """The objectives, those of a resumed run by the names under which their agents are kept."""
+        resumed = self.output.resume
+        kept = {} if resumed is None else read_config(resumed).get("inputs", {})
+        return load_apart(self.config.objectives, kept)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -218,7 +225,7 @@ class Evaluate(Comparing):
         return replace(command, output=replace(kept, resume=resume))
 
     def run(self) -> None:
-        objectives = load_apart(self.config.objectives)
+        objectives = self.loaded()
         if self.config.suite is not None:
             self.run_suite(self.config.suite, objectives)
             return
@@ -355,7 +362,7 @@ class Align(OfObjectives):
 
     def run(self) -> None:
         config: AlignConfig = self.config
-        known, more = known_drifts(), load_apart(config.objectives)
+        known, more = known_drifts(), self.loaded()
         for objective in more:
             if twins := [x.name for x in known if same_drift(objective, x)]:
                 raise UserError(

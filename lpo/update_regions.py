@@ -99,7 +99,7 @@ def analyze(
       advantages: [A] evenly spaced; 240 midpoints between `ADVANTAGES` if left out.
 
     Raises:
-      UserError: a grid holds a zero, or the fraction is outside [0, 1].
+      UserError: a grid holds a zero, the fraction is outside [0, 1], or the objective has no gradient somewhere.
     """
     if not 0.0 <= progress <= 1.0:
         raise UserError(f"progress is {progress}: it is a fraction of training, from 0 to 1.")
@@ -111,6 +111,14 @@ def analyze(
             raise UserError(f"the {name} hold a 0, where no direction can be judged: leave it out.")
     drift, gradient = surface(objective, x, a, progress)
     relative = gradient / (np.exp(x) * a[:, None])
+    without = ~np.isfinite(relative) | ~np.isfinite(drift)
+    if without.any():
+        row, column = np.argwhere(without)[0]
+        raise UserError(
+            f"{objective.name} is no number on {without.mean():.0%} of the grid, such as at a ratio of "
+            f"{np.exp(x[column]):.3g} with an advantage of {a[row]:.3g}: there is nothing to show there, nor to "
+            "train with."
+        )
     regions = classify(relative, x, a)
     weights = np.broadcast_to(np.exp(-0.5 * a**2)[:, None], regions.shape)
     past = (x * a[:, None] > 0.0) & (np.abs(np.expm1(x)) > USUAL_CLIP)

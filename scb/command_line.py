@@ -91,6 +91,17 @@ def flags(config: Any, default: Any) -> Iterator[str]:
             yield f"--{name}={written[0].str_from_instance(value)[0] if written else value}"
 
 
+def flag_names(config: Any, without: type) -> Iterator[str]:
+    """Names of the flags of a dataclass and those in it, but for one of that type."""
+    hints = get_type_hints(type(config), include_extras=True)
+    for entry in fields(config):
+        value = getattr(config, entry.name)
+        if is_dataclass(value) and not isinstance(value, without):
+            yield from flag_names(value, without)
+        elif not isinstance(value, without):
+            yield flag_name(hints[entry.name], entry.name)
+
+
 @dataclass(frozen=True)
 class Output:
     """What the run writes, and where.

@@ -11,15 +11,16 @@ from that.
 """
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
-from lpo.drifts.contract import Drift
+from lpo.drifts.contract import Drift, check_static
 from lpo.drifts.formula import ClosedFormDrift
 from lpo.drifts.known import ClipDrift, DPODrift, NoDrift
 from lpo.drifts.mirror import MirrorDrift
 from lpo.drifts.network import LearnedDrift
 from scb import own
-from scb.errors import UserError, one_of
+from scb.errors import UserError, first_line, one_of
 
 DRIFTS: dict[str, type[Drift]] = {
     drift.name: drift
@@ -55,7 +56,8 @@ def learned_drift(name: str, **settings: Any) -> Drift:
       settings: of its fields, which are its flags on the command line; the rest keep their defaults.
 
     Raises:
-      UserError: the family is unknown, does not learn, or has no such setting.
+      UserError: the family is unknown, does not learn, has no such setting, or one without a default, or tells no
+        programs apart.
     """
     learned = {family: drift for family, drift in DRIFTS.items() if drift.learned}
     if own.is_own(name):
@@ -65,13 +67,21 @@ def learned_drift(name: str, **settings: Any) -> Drift:
                 f"the drift {name} does not learn: give its class learned = True, and parameters to init."
             )
     one_of("learned drift", name, learned)
+    try:
+        default = learned[name]()
+    except TypeError as error:
+        raise UserError(
+            f"the drift {name} cannot be made as it is ({first_line(error)}): give each of its fields a default, which "
+            "a flag may change."
+        ) from error
+    check_static(default)
     for setting in settings:
         if setting not in learned[name].settings():
             having = [family for family, drift in learned.items() if setting in drift.settings()]
             raise UserError(
                 f"the drift {name} has no {setting}, which is a setting of {', '.join(having)}: leave it out."
             )
-    return learned[name](**settings)
+    return replace(default, **settings)
 
 
 def drift_from_config(config: Mapping[str, Any]) -> Drift:

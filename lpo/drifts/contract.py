@@ -13,7 +13,7 @@ import numpy as np
 from lpo.drifts.bases import BASES
 from scb import artefacts, own
 from scb.agents.drift import USUAL_CLIP, relu
-from scb.errors import UserError, at_least, one_of, positive
+from scb.errors import UserError, at_least, first_line, one_of, positive
 
 # Any: an array of JAX, NumPy or PyTorch; `xp` below is its library.
 Array: TypeAlias = Any
@@ -113,6 +113,23 @@ class Drift(ABC):
     def with_parameters(self, parameters: Any) -> Self:
         """The same drift with settings that say these parameters, where settings say any."""
         return self
+
+
+def check_static(drift: Drift) -> None:
+    """A UserError for a drift by which programs cannot be told apart: no frozen dataclass, or not to be hashed."""
+    name, settings = type(drift).__name__, getattr(drift, "__dataclass_params__", None)
+    if settings is None or not settings.frozen:
+        raise UserError(
+            f"the drift {name} is no frozen dataclass, as which programs are told apart: "
+            "write @dataclasses.dataclass(frozen=True) above it."
+        )
+    try:
+        hash(drift)
+    except TypeError as error:
+        raise UserError(
+            f"the drift {name} cannot be told from others ({first_line(error)}): its settings must be hashable, tuples "
+            "in place of lists and arrays; a function of a class of one's own is a frozen dataclass."
+        ) from error
 
 
 @dataclass(frozen=True, kw_only=True)

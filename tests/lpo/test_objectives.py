@@ -231,6 +231,21 @@ def test_what_a_run_learned_has_its_name_whatever_it_is_compared_with(file, tmp_
     assert [x.name for x in load_apart(["ppo", *paths])] == ["ppo", "first", "second"]
 
 
+def test_the_first_file_of_a_name_of_which_there_are_results_keeps_it(tmp_path, file):
+    paths = []
+    for name in ("first", "second"):
+        (tmp_path / name).mkdir()
+        for suffix in (".npz", ".json"):
+            kept = tmp_path / name / f"mine{suffix}"
+            kept.write_bytes(file.with_suffix(suffix).read_bytes())
+        paths.append(str(kept.with_suffix(".npz")))
+    assert [x.name for x in load_apart(paths)] == paths
+    assert [x.name for x in load_apart(paths, kept=["ppo", "mine"])] == ["mine", paths[1]]
+    assert [x.name for x in load_apart(paths, kept=paths)] == paths
+    with pytest.raises(UserError, match="is there twice"):
+        load_apart(paths[:1] * 2)
+
+
 def test_metadata_of_the_meta_training_is_kept(tmp_path, tiny_drift):
     given = {"config": {"meta_training": {"fitness": "transfer"}}, "seeds": {"a": 7}}
     parameters = tiny_drift.init(jax.random.key(0))

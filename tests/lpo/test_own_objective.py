@@ -3,7 +3,9 @@
 import importlib
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -14,12 +16,14 @@ import lpo
 from lpo import cli
 from lpo.drifts import learned_drift
 from lpo.drifts.surrogate import SurrogateDrift
+from lpo.meta_training import MetaTraining
 from lpo.objectives import load_apart, load_objective, save_objective
 from scb.errors import UserError
 from scb.own import code_of
 
 MODULE = '''
 from dataclasses import dataclass
+from typing import Any
 import jax
 import jax.numpy as jnp
 import lpo
@@ -268,6 +272,90 @@ def test_a_family_inside_of_another_has_a_name_of_its_own():
 
     with pytest.raises(UserError, match="Thawed is no frozen dataclass"):
         load_objective(Thawed)
+
+
+def test_a_subclass_of_the_clip_keeps_settings_that_its_parameters_do_not_say():
+    @dataclass(frozen=True)
+    class Asymmetric(lpo.ClipDrift):
+        lower: float = 0.1
+
+        def __call__(self, parameters, log_ratio, advantage, progress, xp=jnp):
+            ratio = xp.exp(log_ratio)
+            inside = xp.clip(ratio, 1 - self.lower, 1 + parameters)
+            return xp.maximum((ratio - inside) * advantage, xp.zeros_like(ratio))
+
+    objective = load_objective(Asymmetric(0.2, lower=0.5))
+    assert objective.drift.lower == 0.5
+    below = np.log(0.7), -1.0
+    assert lpo.numpy_drift(objective)(*below) == pytest.approx(0.0)
+    assert lpo.numpy_drift(Asymmetric(0.2))(*below) == pytest.approx(0.2)
+    # Of the clip itself one program trains all.
+    assert load_objective("ppo-0.3").drift == load_objective("ppo").drift
+
+
+def test_what_cannot_be_told_apart_is_told():
+    @dataclass
+    class Strength:
+        strength: float = 0.5
+
+        def __call__(self, ratio, advantage):
+            return ratio * advantage - self.strength * (ratio - 1) ** 2
+
+    @dataclass(frozen=True)
+    class Table(lpo.NoDrift):
+        weights: Any = field(default_factory=lambda: [1.0])
+
+    for unhashable in (Strength(), Table(), Table(np.ones(2))):
+        with pytest.raises(UserError, match=r"cannot be told from others \(unhashable type"):
+            load_objective(unhashable)
+    assert load_objective(Table((1.0,))).drift.weights == (1.0,)
+
+
+def test_parameters_may_be_of_any_tree():
+    class Parts(NamedTuple):
+        width: Any
+        rest: Any
+
+    @dataclass(frozen=True)
+    class OfTree(lpo.NoDrift):
+        def init(self, key, scale=1.0):
+            return Parts(jnp.full(1, 2.0), [jnp.full(2, 3.0)])
+
+        def __call__(self, parameters, log_ratio, advantage, progress, xp=jnp):
+            return parameters.width[0] * parameters.rest[0][1] * log_ratio**2
+
+    drift = OfTree()
+    assert lpo.numpy_drift(drift)(LOG_RATIO, ADVANTAGE) == pytest.approx(6 * LOG_RATIO**2)
+    in_jax = lpo.drift_function(drift)(LOG_RATIO, ADVANTAGE)
+    assert np.asarray(in_jax) == pytest.approx(6 * LOG_RATIO**2, rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "told"),
+    [
+        ("frozen=True)\nclass Power", "frozen=False)\nclass Power", "is no frozen dataclass"),
+        ("power: int = 2", "power: int", "own_module:Power cannot be made as it is"),
+        ("power", "sigma", "has a field sigma, and --sigma is something else here"),
+        ("power: int = 2", "power: Any = (jnp.ones(2),)", "cannot be told from others"),
+    ],
+)
+def test_a_family_that_cannot_be_learned_is_told_before(module, old, new, told, capsys):
+    module(old, new)
+    assert cli.main(["meta-train", "--drift", "own_module:Power", "--out", "run"]) == 2
+    assert told in capsys.readouterr().err and not Path("run").exists()
+
+
+def test_a_family_that_is_not_frozen_is_not_learned():
+    @dataclass
+    class Thawed(lpo.Drift):
+        def init(self, key, scale=1.0):
+            return {"w": jnp.ones(1)}
+
+        def __call__(self, parameters, log_ratio, advantage, progress, xp=jnp):
+            return parameters["w"][0] * log_ratio**2
+
+    with pytest.raises(UserError, match="Thawed is no frozen dataclass"):
+        MetaTraining(lpo.MetaTrainingConfig(drift=Thawed()))
 
 
 def test_certificates_are_of_drifts_and_objectives():

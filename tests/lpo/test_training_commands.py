@@ -193,6 +193,21 @@ def test_files_of_one_name_are_told_apart_by_what_was_typed(
     assert differences == {"a/tiny.npz": -700.0, "bb/tiny.npz": -800.0}
 
 
+def test_a_file_keeps_its_name_in_a_resumed_comparison_that_another_of_that_name_joins(
+    trained, working_folder, objective_file
+):
+    for folder in ("a", "bb"):
+        (working_folder / folder).mkdir()
+        for path in (objective_file, objective_file.with_suffix(".json")):
+            (working_folder / folder / path.name).write_bytes(path.read_bytes())
+    assert cli.main(["evaluate", "--objectives", "ppo", "a/tiny.npz", "--out", "o"]) == 0
+    more = ["evaluate", "--resume", "o", "--objectives", "ppo", "a/tiny.npz", "bb/tiny.npz"]
+    for _ in range(2):
+        assert cli.main(more) == 0
+        stored = json.loads((working_folder / "o" / "comparison.json").read_text())
+        assert stored["paired_differences"].keys() == {"tiny", "bb/tiny.npz"}
+
+
 def test_align_measures_every_combination_and_stores_it(monkeypatch, working_folder, capsys):
     asked, told = [], []
 

@@ -203,3 +203,13 @@ def test_the_page_has_the_numbers():
 def test_a_figure_of_nothing_is_refused():
     with pytest.raises(UserError, match="there are no objectives to draw"):
         drift_figures.drift_and_gradient([])
+
+
+def test_an_objective_that_is_no_number_somewhere_has_no_regions_there():
+    below = objective(lambda x, advantage, progress: jnp.sqrt(jnp.exp(x) - 0.8))
+    with pytest.raises(UserError, match=r"toy is no number on 25% .* a ratio of 0\.6 with an adv"):
+        analyze(below, **GRID)
+    # A gradient without a number is none either.
+    kinked = objective(lambda x, advantage, progress: jnp.sqrt(jnp.maximum(jnp.exp(x) - 0.8, 0.0)))
+    with pytest.raises(UserError, match="toy is no number on 25%"):
+        analyze(kinked, **GRID)
