@@ -11,7 +11,7 @@ from that.
 """
 
 from collections.abc import Mapping
-from dataclasses import replace
+
 from typing import Any
 
 from lpo.drifts.contract import Drift, check_static
@@ -81,7 +81,7 @@ def learned_drift(name: str, **settings: Any) -> Drift:
             raise UserError(
                 f"the drift {name} has no {setting}, which is a setting of {', '.join(having)}: leave it out."
             )
-    return replace(default, **settings)
+    return type(default)(**settings)
 
 
 def drift_from_config(config: Mapping[str, Any]) -> Drift:
