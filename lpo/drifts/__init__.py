@@ -11,7 +11,6 @@ from that.
 """
 
 from collections.abc import Mapping
-
 from typing import Any
 
 from lpo.drifts.contract import Drift, check_static
