@@ -134,6 +134,29 @@ CONFIRMATIONS = (
         "late lead",
         suggested="12 that report nothing, +348 [107, 604]",
     ),
+    Confirmation(
+        "hopper at 0.001, annealed",
+        "ta-lpo",
+        reporting(60),
+        "late lead",
+        suggested="12 that report nothing, +307 [53, 619]",
+    ),
+    Confirmation(
+        "hopper at 0.001, annealed",
+        "ta-lpo",
+        reporting(60),
+        "area",
+        suggested="the same twelve, +112 [\u221292, 302]",
+    ),
+    Confirmation(
+        "hopper at 0.001",
+        "ta-lpo",
+        reporting(60),
+        "late",
+        known="ta-lpo",
+        suggested="the same twelve, +57 [\u2212201, 377]",
+        reference_in="hopper at 0.001, annealed",
+    ),
 )
 
 
