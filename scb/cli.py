@@ -30,8 +30,10 @@ def configure_jax() -> None:
         with contextlib.suppress(RuntimeError):
             jax.config.update("jax_num_cpu_devices", usable_cores())
     if jax.config.values["jax_compilation_cache_dir"] is None:
-        base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-        jax.config.update("jax_compilation_cache_dir", str(base / "lpo" / "jax"))
+        # Without a home, as of a user whom a container does not know, there is no cache.
+        with contextlib.suppress(RuntimeError):
+            base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+            jax.config.update("jax_compilation_cache_dir", str(base / "lpo" / "jax"))
 
 
 def run_program(

@@ -152,6 +152,9 @@ def labelled(
     total = visited.observation.shape[0] * visited.observation.shape[1]
     chosen = jax.random.choice(key_pick, total, (number,), replace=number > total)
     states = jax.tree.map(lambda x: jnp.reshape(x, (-1, *x.shape[2:]))[chosen], visited)
+    # Of bools, or of whole numbers, a fit asks for means too.
+    floats = jnp.promote_types(states.observation.dtype, jnp.float32)
+    states = states._replace(observation=states.observation.astype(floats))
 
     def expert_policy(observation: jax.Array) -> jax.Array:
         return expert.policy(jnp.ravel(observation))

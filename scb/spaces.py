@@ -16,13 +16,30 @@ def kind_of_actions(space: spaces.Box | spaces.Discrete) -> str:
     return "discrete" if isinstance(space, spaces.Discrete) else "continuous"
 
 
+def understood(space: Any) -> bool:
+    """Whether it is one `Box` or `Discrete` of gymnax's."""
+    return isinstance(space, spaces.Box | spaces.Discrete)
+
+
+def not_understood(space: Any, of: str) -> str:
+    """What is said of a space that is not."""
+    return (
+        f"has a {type(space).__module__}.{type(space).__name__} of {of}: one Box or Discrete of "
+        "gymnax.environments.spaces is understood"
+    )
+
+
 def action_size(space: spaces.Box | spaces.Discrete) -> int:
     """How many discrete actions there are, or how many numbers a flattened action has."""
+    if not understood(space):
+        raise UserError(f"the environment {not_understood(space, 'actions')}.")
     return int(space.n) if isinstance(space, spaces.Discrete) else math.prod(space.shape)
 
 
 def flat_size(space: spaces.Box | spaces.Discrete) -> int:
     """How many numbers a flattened observation has; a discrete one is a single number."""
+    if not understood(space):
+        raise UserError(f"the environment {not_understood(space, 'observations')}.")
     return math.prod(space.shape)
 
 

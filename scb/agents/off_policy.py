@@ -177,6 +177,9 @@ class OffPolicyAgent(Agent):
         if not self.one_step:
             standing = self._reset(key_reset, config.num_envs, env_params)
         action = jax.eval_shape(space.sample, key)
+        if not isinstance(space, spaces.Discrete):
+            # Whatever its own type is, actions between its bounds are taken.
+            action = jax.ShapeDtypeStruct(action.shape, jnp.float32)
         observation, number = jnp.zeros(size), jnp.zeros(())
         example = Transition(observation, action, number, number, observation)
         state = OffPolicyState(

@@ -126,6 +126,10 @@ class BraxEnvironment(environment.Environment[BraxState, BraxParams]):
     def __hash__(self) -> int:
         return hash(self._made_from)
 
+    def __reduce__(self) -> Any:
+        # The physics, which hold functions, are loaded where it is unpickled.
+        return type(self), self._made_from
+
     def __repr__(self) -> str:
         return f"BraxEnvironment({self._name!r}, backend={self.backend!r})"
 

@@ -6,12 +6,13 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from gymnax.environments import environment, spaces
+from gymnax.environments import environment
 
 from scb import own
 from scb.environments.spec import Family, Made
 from scb.errors import UserError, first_line
 from scb.keys import root_key
+from scb.spaces import not_understood, understood
 
 
 class CustomFamily(Family):
@@ -86,11 +87,8 @@ def _check(name: str, env: environment.Environment[Any, Any], params: Any) -> No
         )
     observations, actions = env.observation_space(params), env.action_space(params)
     for kind, space in {"observations": observations, "actions": actions}.items():
-        if not isinstance(space, spaces.Box | spaces.Discrete):
-            raise wrong(
-                f"has a {type(space).__module__}.{type(space).__name__} of {kind}: one Box or Discrete of "
-                "gymnax.environments.spaces is understood"
-            )
+        if not understood(space):
+            raise wrong(not_understood(space, kind))
 
     def check_values(of: str, found: Any, values: str) -> None:
         number = len(found) if isinstance(found, tuple) else 1
@@ -115,6 +113,10 @@ def _check(name: str, env: environment.Environment[Any, Any], params: Any) -> No
         if not jnp.issubdtype(jnp.result_type(inner[3]), jnp.bool_):
             raise wrong(
                 f"returns a terminated of the type {jnp.result_type(inner[3])} from step_env: return a bool"
+            )
+        if jnp.shape(inner[3]) != ():
+            raise wrong(
+                f"returns a terminated of shape {jnp.shape(inner[3])} from step_env: return one bool, of shape ()"
             )
         if selects:
             check_same("a state", state, inner[1])

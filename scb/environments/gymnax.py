@@ -6,6 +6,7 @@ from typing import Any
 import gymnax
 
 from scb.environments.spec import Family, Made, Reference
+from scb.errors import UserError, first_line
 
 # Liesen et al. (2024), table of SAC experts: interquartile mean and 95 % interval of 200 evaluations.
 _SAC_EXPERTS = {
@@ -26,7 +27,12 @@ class GymnaxFamily(Family):
         return gymnax.registered_envs
 
     def make(self, name: str, **arguments: Any) -> Made:
-        return gymnax.make(name, **arguments)
+        try:
+            return gymnax.make(name, **arguments)
+        except OSError as error:
+            raise UserError(
+                f"{name} cannot be made ({first_line(error)}): its data are fetched from the network."
+            ) from error
 
 
 class MinAtarFamily(GymnaxFamily):

@@ -93,6 +93,21 @@ def test_a_caller_that_has_used_jax_keeps_its_devices(monkeypatch):
     assert jax.device_count() == before
 
 
+def test_without_a_home_there_is_no_cache(monkeypatch):
+    def home():
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.setattr(Path, "home", home)
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    before = jax.config.values["jax_compilation_cache_dir"]
+    jax.config.update("jax_compilation_cache_dir", None)
+    try:
+        scb.cli.configure_jax()
+        assert jax.config.values["jax_compilation_cache_dir"] is None
+    finally:
+        jax.config.update("jax_compilation_cache_dir", before)
+
+
 def test_every_public_name_is_there():
     for name in lpo.__all__:
         assert getattr(lpo, name).__name__ == name

@@ -25,6 +25,7 @@ from scb.environments.registry import make
 from scb.environments.returns import random_return
 from scb.environments.synthetic import BanditConfig
 from scb.errors import UserError
+from scb.spaces import action_size
 from scb.warm_start import WarmStartConfig
 from tests.scb.probes import ContinuousCorridor, Corridor, CorridorParams, small_agents
 
@@ -73,6 +74,22 @@ def test_a_wrapper_is_refused_whose_step_an_evaluation_would_go_round():
 def test_settings_that_no_agent_can_have_are_told(setting, message):
     with pytest.raises(UserError, match=message):
         TD3Config(**setting)
+
+
+class Several(ContinuousCorridor):
+    """Observations of several parts."""
+
+    def observation_space(self, params=None):
+        return spaces.Dict({"cell": spaces.Discrete(3)})
+
+
+def test_spaces_of_several_parts_are_told():
+    with pytest.raises(
+        UserError, match=r"has a gymnax\S*Dict of observations: one Box or Discrete"
+    ):
+        PPO(Several(), PPOConfig()).init(jax.random.key(0), PPOHyperparameters(), CorridorParams())
+    with pytest.raises(UserError, match=r"has a gymnax\S*Tuple of actions: one Box or Discrete"):
+        action_size(spaces.Tuple([spaces.Discrete(2)]))
 
 
 class Unbounded(ContinuousCorridor):

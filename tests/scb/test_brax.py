@@ -1,4 +1,5 @@
 import os
+import pickle
 import subprocess
 import sys
 import warnings
@@ -369,6 +370,13 @@ def test_environments_made_alike_share_a_compiled_program(env):
     count(BraxEnvironment(NAME, "positional"), 1.0)
     count(BraxEnvironment(NAME, BACKEND, num_start_states=2), 1.0)
     assert len(traces) == 3
+
+
+def test_an_environment_may_be_pickled(env):
+    again = pickle.loads(pickle.dumps(env))
+    assert again == env and again.brax_env is env.brax_env  # loaded once
+    without = BraxEnvironment(NAME, BACKEND, num_start_states=None)
+    assert pickle.loads(pickle.dumps(without)) == without != env
 
 
 def test_an_environment_made_inside_a_traced_function_leaks_no_tracer():

@@ -58,6 +58,11 @@ class OlderReset(Pendulum):
     def reset(self, *arguments):
         return *super().reset(*arguments), {}
 
+class FlatTerminated(Pendulum):
+    def step_env(self, *arguments):
+        observation, state, reward, terminated, info = super().step_env(*arguments)
+        return observation, state, reward, jnp.reshape(terminated, (1,)), info
+
 class NoStep(Pendulum):
     def step(self, *arguments):
         pass
@@ -343,6 +348,10 @@ def test_the_physics_that_a_factory_takes_is_part_of_the_place(module):
         ),
         ("{}:NoParts", "lacks reset_env or step_env, which gymnax's own reset and step call"),
         ("{}:FloatTerminated", "returns a terminated of the type float32 from step_env: return a"),
+        (
+            "{}:FlatTerminated",
+            r"returns a terminated of shape \(1,\) from step_env: return one bool",
+        ),
         ("{}:AsksForValues", "asks for a value where JAX only has a shape .*jax.lax.cond"),
         ("{}:AsNumpy", "asks for a value where JAX only has a shape .*jnp in place of numpy"),
         (

@@ -794,6 +794,15 @@ def test_actions_have_the_spaces_dtype_and_shape_and_stay_within_its_bounds(name
 
 
 @pytest.mark.parametrize("name", ["continuous sac", "td3"])
+@pytest.mark.parametrize("dtype", [jnp.int32, jnp.float16, jnp.float32])
+def test_actions_are_stored_as_they_were_taken_whatever_type_the_space_has(name, dtype):
+    agent = CASES[name].make(bandit(spaces.Box(0, 3, (2,), dtype)))
+    given = CASES[name].hyperparameters, agent.env.default_params
+    stored = jax.eval_shape(agent.init, jax.random.key(0), *given).buffer.transitions.action
+    assert (stored.dtype, stored.shape[1:]) == (jnp.float32, (2,))
+
+
+@pytest.mark.parametrize("name", ["continuous sac", "td3"])
 def test_every_dimension_of_an_action_has_its_own_bounds(name):
     # A 2 x 2 action. Observations beyond any that was seen drive the networks to their extremes.
     low, high = np.float32([[-1.0, 0.0], [5.0, -9.0]]), np.float32([[1.0, 0.5], [6.0, 9.0]])

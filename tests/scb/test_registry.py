@@ -1,3 +1,5 @@
+from urllib.error import URLError
+
 import gymnax
 import pytest
 from gymnax.environments import environment
@@ -14,6 +16,17 @@ def test_every_gymnax_environment_is_made_by_name(name):
     env, params = make(name)
     assert isinstance(env, environment.Environment)
     assert type(params) is type(env.default_params)
+
+
+def test_what_cannot_be_fetched_is_told(monkeypatch):
+    def make_of_gymnax(name, **arguments):
+        raise URLError("no network")
+
+    monkeypatch.setattr(gymnax, "make", make_of_gymnax)
+    with pytest.raises(
+        UserError, match=r"MNISTBandit-bsuite cannot be made .*no network.* fetched"
+    ):
+        make("MNISTBandit-bsuite")
 
 
 def test_brax_environments_are_made_by_name_with_their_backend():

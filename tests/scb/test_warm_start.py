@@ -11,14 +11,15 @@ from scb.agents.dqn import DQNConfig
 from scb.agents.ppo import PPOConfig, PPOHyperparameters
 from scb.agents.spec import ALGORITHMS, AgentSpec, environment_agent
 from scb.agents.td3 import TD3Config
+from scb.aggregation import Visited
 from scb.curriculum import CurriculumConfig
 from scb.environments.registry import make
 from scb.environments.spec import EnvironmentSpec
 from scb.environments.synthetic import BanditConfig, BanditParams, SyntheticBandit, bandit_for
 from scb.errors import UserError
-from scb.expert_data import DatasetConfig, _stretched, expert_dataset
+from scb.expert_data import DatasetConfig, _stretched, expert_dataset, labelled
 from scb.experts import Expert, judged, train_expert
-from scb.fitting import ExpertDataset, energy_distance, fit_bandit, reward_targets
+from scb.fitting import ExpertDataset, energy_distance, fit_bandit, reward_targets, unchanging
 from scb.keys import root_key
 from scb.linear_expert import erring, noisy
 from scb.measurement import Place
@@ -306,6 +307,20 @@ def contexts(min_spread, **more):
     expert = judged(follow_the_context, bandit, bandit.default_params, jax.random.key(0))
     key = jax.random.key(2)
     return expert_dataset(expert, Place(bandit.name, bandit, bandit.default_params), key, config)[0]
+
+
+@pytest.mark.parametrize("dtype", [jnp.bool_, jnp.uint8])
+def test_observations_that_are_no_floats_become_such(dtype):
+    bandit = context_bandit()
+    place = Place(bandit.name, bandit, bandit.default_params)
+    expert = judged(follow_the_context, bandit, bandit.default_params, jax.random.key(0))
+    seen = jnp.tile(jnp.arange(2), 50).reshape(10, 10, 1).astype(dtype)
+    visited = Visited(jnp.zeros((10, 10)), seen)
+    keys = jax.random.split(jax.random.key(1))
+    dataset, _ = labelled(expert, place, visited, *keys, DatasetConfig(num_states=100, jitter=0.5))
+    assert dataset.observation.dtype == jnp.float32
+    assert len(np.unique(dataset.observation)) > 2  # jittered about 0 and 1
+    assert not unchanging(dataset.observation).any()
 
 
 @pytest.mark.parametrize("min_spread", [1.0, 3.0])
