@@ -107,11 +107,9 @@ def parts(options: Options, report: dict[str, Any]) -> Iterator[Part]:
     # That nobody waits for a name that is none, or for a rate.
     same_objectives(report, map(load_objective, (*objectives, *options.validated)))
     given = options.setting(options.learning_rate)
-    for rate in (
-        *options.rates,
-        *([] if options.learning_rate is None else [options.learning_rate]),
-    ):
-        check_value("learning_rate", rate)
+    for rate in (*options.rates, options.learning_rate):
+        if rate is not None:
+            check_value("learning_rate", rate)
     for environment in options.environments:
         names = objectives
         if options.tuning_agents:
@@ -140,7 +138,7 @@ ANNEALED = "annealed"
 
 
 def _label(setting: Mapping[str, Any]) -> str:
-    """ "0.001", or "0.001, annealed"."""
+    """What it is called, such as "0.001" or "0.001, annealed"."""
     return f"{setting['learning_rate']}" + (f", {ANNEALED}" if len(setting) > 1 else "")
 
 
