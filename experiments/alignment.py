@@ -69,7 +69,7 @@ def recommendation(report: Mapping[str, Any]) -> dict[str, Any]:
         for name in CHOICES
         if name in stages
     ]
-    if len({len(regimes) for regimes in chosen}) != 1 or not chosen[0]:
+    if len(chosen) != len(CHOICES) or len({*map(len, chosen)}) != 1 or not chosen[0]:
         raise UserError(
             "the regimes to choose among are not all measured: the same command goes on."
         )

@@ -74,8 +74,9 @@ def parts(options: Options, report: dict[str, Any]) -> Iterator[Part]:
     # All of them before the first is measured.
     named = {name: load_objective(name) for name in (REFERENCE, *options.objectives)}
     bandit = bandit_metadata(TASK)["sha256"]
-    for name, objective in named.items():
+    for name in list(entries):  # also of what is not asked for, which is compared with what is
         forget_other(entries, name, bandit)
+    for name, objective in named.items():
         forget_other(entries, name, objective.sha256, "objective_sha256")
         yield Part(("objectives", name), partial(measured, name, options))
 

@@ -17,7 +17,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from experiments.claims import FAILS, HOLDS, Claim, Judged, judge, of_agents
+from experiments.claims import FAILS, HOLDS, UNTESTED, Claim, Judged, judge, of_agents
 from experiments.harness import Experiment, Keeping
 from experiments.parts import InParts, Part
 from experiments.reports import Report, lost, rows_in, same_objectives, settled
@@ -278,7 +278,9 @@ def _shown(
     pairs: Sequence[tuple[tuple[str, str, str, Claim], Judged]], outcome: str
 ) -> dict[str, list[str]]:
     """{at which rates, in words: objectives} of the comparisons with PPO's clip that end so."""
-    found: dict[str, list[str]] = {words: [] for (_, _, words, _), _ in pairs}
+    found: dict[str, list[str]] = {
+        words: [] for (_, _, words, _), judged in pairs if judged.outcome != UNTESTED
+    }
     for (name, other, words, _), judged in pairs:
         if other == REFERENCE and judged.outcome == outcome:
             found[words].append(name)

@@ -124,6 +124,7 @@ def lost(report: Any, of_them: bool = False) -> int:
 
 
 def finite(returns: Any, place: Place) -> tuple[list[float], int]:
-    """([N] returns to six digits, how many were no number): those count as random actions there."""
+    """([N] returns to two digits, of less than 1 to six, how many were no number): those count as random actions."""
     values, failed = as_random(np.asarray(returns, np.float64), place)
-    return [float(f"{x:.6g}") for x in values], int(failed.sum())
+    rounded = [round(x, 2) if abs(x) >= 1 else float(f"{x:.6g}") for x in values.tolist()]
+    return rounded, int(failed.sum())

@@ -20,7 +20,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from experiments.claims import TENTH, Claim, Judged, judge
+from experiments.claims import TENTH, Claim, Judged, judge, of_agents
 from experiments.harness import Experiment, Keeping, plan_of
 from experiments.parts import InParts, Keys, Part
 from experiments.reports import Report, finite, rows_in, same_objectives, settled
@@ -72,6 +72,8 @@ class Options(Keeping):
 
     def __post_init__(self) -> None:
         at_least(2, self, "draws")
+        if not self.environments:
+            raise UserError("no environments: give at least one.")
         if self.validation and self.confirmation:
             raise UserError(
                 "seeds either choose or confirm: leave out --validation or --confirmation."
@@ -109,7 +111,8 @@ def parts(options: Options, report: dict[str, Any]) -> Iterator[Part]:
         check_stated(load_objective(STATED["objective"]))
         path, report = ("confirmation",), report.setdefault("confirmation", {})
     options, first = options.asked, options.first_seed
-    settled(report, first_seed=first, lists=_PLAN["lists"])
+    # Draws of more are others, of which intervals could not take the same in every environment.
+    settled(report, first_seed=first, lists=_PLAN["lists"], draws=options.draws)
     # Without PPO's clip there is nothing to compare with.
     names = dict.fromkeys([REFERENCE, *options.objectives])
     loaded = [None if x == DRAWN else load_objective(x) for x in names]
@@ -176,7 +179,8 @@ Scores = dict[str, dict[str, NDArray[np.floating]]]  # {environment: {objective:
 def scores(report: Report) -> Scores:
     """Of what has as many draws as PPO's clip: 0 for random actions, 1 for a published expert.
 
-    Where nobody published one, 1 is what a twentieth of all agents here earn more than.
+    Where nobody published one, 1 is what a twentieth of all agents here earn more than; where that is no more than
+    random actions earn, there are none.
     """
     found = {}
     for environment, entry in report["environments"].items():
@@ -191,9 +195,12 @@ def scores(report: Report) -> Scores:
             every = np.concatenate(list(returns.values()))
             spec = environment_spec(environment)
             published = spec.reference()
+            random = spec.random_return()
             best = np.percentile(every, 95) if published is None else published.value
+            if best <= random:
+                continue  # nothing was learned there, of which a score could be a share
             found[environment] = {
-                name: normalized_score(x, spec.random_return(), best) for name, x in returns.items()
+                name: normalized_score(x, random, best) for name, x in returns.items()
             }
     return found
 
@@ -219,7 +226,8 @@ def claims(report: Report) -> list[Claim]:
                 continue
             for what, statistic in STATISTICS.items():
                 better = partial(over_environments, ours, theirs, statistic=statistic)
-                found.append(Claim(f"{name}: a higher {what} than {other}", better))
+                evidence = of_agents(better, min(map(len, ours)))
+                found.append(Claim(f"{name}: a higher {what} than {other}", evidence))
     return found
 
 

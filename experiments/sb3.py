@@ -86,6 +86,11 @@ class Options:
             one_of("environment", name, ALGORITHMS)
         for name in self.algorithms:
             one_of("algorithm", name, STEPS)
+        if not any(cells(self)):
+            raise UserError(
+                f"of the environments {', '.join(self.environments)} none allows what is asked for "
+                f"({', '.join(self.algorithms)}): give another of --algorithms."
+            )
         if self.bandit is not None and len(self.environments) != 1:
             raise UserError(
                 f"the bandit {self.bandit} is for one environment, and there are {len(self.environments)}: name it by "

@@ -63,7 +63,7 @@ class Options:
 
 def parts(options: Options, report: dict[str, Any]) -> Iterator[Part]:
     """Numbers of processes, then what is not divided among them."""
-    settled(report, candidates=options.candidates, devices=DEVICES)
+    settled(report, candidates=options.candidates, devices=DEVICES, searched=options.generations)
     for number in options.processes:
         yield Part(("generations", str(number)), partial(_generations, number, options))
     for number in options.processes:
@@ -166,12 +166,14 @@ def _strategy(kind: str, population: int) -> dict[str, Any]:
 
 
 def grown(points: Sequence[tuple[float, float]]) -> tuple[float, float]:
-    """(slope, intercept) of the line through points, neither of them negative; nothing grows where there are none."""
+    """(slope, intercept) of the line through points, level at their mean where it would fall, or without any."""
     if not points:
         return 0.0, 0.0
     x, y = np.transpose(points)
     slope, intercept = np.polyfit(x, y, 1) if len(x) > 1 else (0.0, y[0])
-    return max(0.0, float(slope)), max(0.0, float(intercept))
+    if slope < 0.0:
+        return 0.0, float(y.mean())
+    return float(slope), max(0.0, float(intercept))
 
 
 def facts(report: Report) -> dict[str, Any]:
@@ -212,7 +214,7 @@ def facts(report: Report) -> dict[str, Any]:
         "slope": slope,
         "share": gathering / 1000 / alone,
         "costly": SHARE,
-        "from": (1000 * alone * SHARE - intercept) / slope if slope > 1e-9 else None,
+        "from": max(1.0, (1000 * alone * SHARE - intercept) / slope) if slope > 1e-9 else None,
         "kinds": strategy,
         "largest": largest,
     }

@@ -83,7 +83,8 @@ class Options:
     skip_brax: bool = False
 
     def __post_init__(self) -> None:
-        at_least(1, self, "agents", "episodes", "brax_episodes")
+        at_least(2, self, "agents")  # of one there is no spread
+        at_least(1, self, "episodes", "brax_episodes")
 
 
 def candidates(

@@ -78,5 +78,7 @@ def test_what_was_interrupted_is_not_recommended_from():
     report = {"stages": {"pendulum": whole, "pendulum_small_last_layer": half}}
     with pytest.raises(UserError, match="are not all measured: the same command goes on"):
         alignment.recommendation(report)
+    with pytest.raises(UserError, match="are not all measured: the same command goes on"):
+        alignment.recommendation({"stages": {"pendulum": whole}})
     report["stages"] |= {"pendulum_small_last_layer": whole, "CartPole-v1": half}
     assert alignment.recommendation(report)["confirmed"] == {}

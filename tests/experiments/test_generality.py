@@ -47,10 +47,10 @@ def report(**returns):
     kinds = [f"{name}{kind}" for kind in ("", f", {WIDE}", f", {SWISH}") for name in ("ppo", "sac")]
     entry = {}
     for source in SOURCES:
-        earned = {kind: [float(returns.get(source.split()[-1], 400.0))] * 4 for kind in kinds}
-        earned[EVOLVED] = [395.0, 405.0, 400.0, 400.0]
+        earned = {kind: [float(returns.get(source.split()[-1], 400.0))] * 12 for kind in kinds}
+        earned[EVOLVED] = [395.0, 405.0, 400.0, 400.0] * 3
         if source != ENVIRONMENT:
-            earned[OPTIMAL] = [500.0] * 4
+            earned[OPTIMAL] = [500.0] * 12
         entry[source] = {"returns": earned, "failed": {}}
     entry[ZOO]["sha256"] = bandit_metadata("Synthetic-CartPole-v1")["sha256"]
     entry[DRAWN]["generation"], entry[FIXED]["generation"] = 15, 0
@@ -209,13 +209,23 @@ def test_claims_follow_the_figures():
     entry = changed["environments"]["CartPole-v1"]
     for source, value in ((DRAWN, 450.0), (FIXED, 300.0)):
         for agent in ("ppo", "sac"):
-            entry[source]["returns"][agent] = [value] * 4
-    entry[ZOO]["returns"][EVOLVED] = [100.0] * 4
+            entry[source]["returns"][agent] = [value] * 12
+    entry[ZOO]["returns"][EVOLVED] = [100.0] * 12
     # However far apart two searches are, they are two.
     assert outcomes(changed)[2:] == ["undecided", "holds", "holds", "does not hold", "holds"]
     entry[DRAWN]["generation"] = 0
     said = generality.EXPERIMENT.block("body", changed)
     assert "| CartPole-v1 | +150.0 [150.0, 150.0] | 0 | " in said
+
+
+def test_fewer_than_ten_agents_decide_nothing():
+    found = report(itself=50.0)
+    entry = found["environments"]["CartPole-v1"]
+    assert outcomes(found)[-1] == "holds"
+    entry[ZOO]["returns"][OPTIMAL] = [500.0] * 9
+    *others, optimal = generality.EXPERIMENT.judged(found)
+    assert {x.outcome for x in others[:2]} == {"holds"}
+    assert optimal.outcome == "undecided" and optimal.estimate.low is None
 
 
 def test_robustness_is_not_scored_by_what_drops_the_worst():
@@ -241,10 +251,10 @@ def test_another_network_is_compared_agent_by_agent():
     found = report()
     entry = found["environments"]["CartPole-v1"][ZOO]["returns"]
     for algorithm in ("ppo", "sac"):
-        entry[algorithm] = [500.0, 400.0, 300.0, 200.0]
-        entry[f"{algorithm}, {SWISH}"] = [440.0, 340.0, 240.0, 140.0]
-        entry[f"{algorithm}, {WIDE}"] = [490.0, 390.0, 290.0, 190.0]
-    entry[EVOLVED] = [340.0, 440.0, 240.0, 340.0]
+        entry[algorithm] = [500.0, 400.0, 300.0, 200.0] * 3
+        entry[f"{algorithm}, {SWISH}"] = [440.0, 340.0, 240.0, 140.0] * 3
+        entry[f"{algorithm}, {WIDE}"] = [490.0, 390.0, 290.0, 190.0] * 3
+    entry[EVOLVED] = [340.0, 440.0, 240.0, 340.0] * 3
     assert outcomes(found)[3:6] == ["holds", "does not hold", "undecided"]
 
 

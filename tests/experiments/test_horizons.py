@@ -92,3 +92,11 @@ def test_all_names_are_read_before_the_first_is_measured():
     with pytest.raises(UserError, match="unknown objective 'nope'"):
         next(module.parts(module.Options(("dpo", "nope")), report))
     assert not report.get("objectives")
+
+
+def test_all_that_another_bandit_taught_is_forgotten_also_of_what_is_not_asked_for(report):
+    report["objectives"]["dpo"]["sha256"] = module.bandit_metadata(module.TASK)["sha256"]
+    report["horizons"] = [1.0, 8.0]
+    asked = module.Options(("dpo",), agents=40, horizons=(1.0, 8.0))
+    next(module.parts(asked, report))
+    assert [*report["objectives"]] == ["dpo"]

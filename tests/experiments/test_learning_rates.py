@@ -156,6 +156,16 @@ def test_where_an_objective_was_learned_its_lead_is_told_at_each_rate_that_ppo_h
     assert list(module.at_home(report)["lpo-pendulum", "Pendulum-v1"]) == [0.0003, 0.003]
 
 
+def test_rates_that_nobody_was_trained_at_are_not_said_to_show_nothing(report):
+    everywhere = module.facts(report)["more"]
+    for place in report["environments"].values():
+        for part in (module.CHOOSING, module.REPORTED):
+            for name, of_it in place[part].items():
+                place[part][name] = {rate: x for rate, x in of_it.items() if rate == "0.003"}
+    asked = module.facts(report)["more"]
+    assert asked.keys() < everywhere.keys()
+
+
 def test_few_agents_decide_nothing(report):
     for place in report["environments"]:
         report["environments"][place] = entry(place, CHOOSING, REPORTED, number=9)

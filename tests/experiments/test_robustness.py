@@ -10,12 +10,12 @@ import pytest
 
 import lpo
 from experiments import robustness as module
-from experiments.claims import FAILS, HOLDS
+from experiments.claims import FAILS, HOLDS, UNDECIDED
 from lpo.comparison import ppo_spec
 from lpo.objectives import load_objective
 from scb.environments.registry import environment_spec
 from scb.errors import UserError
-from scb.files import packed_row
+from scb.files import packed_row, unpacked_row
 from scb.measurement import Agents
 from scb.seeds import REPORTING, VALIDATING
 
@@ -101,6 +101,33 @@ def test_without_a_published_expert_the_best_agents_are_the_scale(report):
     found = module.scores(report)["Asterix-MinAtar"]["ppo"]
     random = environment_spec("Asterix-MinAtar").random_return()
     assert found.max() == pytest.approx((100 - random) / (95 - random))
+
+
+def test_where_nothing_was_learned_there_are_no_scores(report):
+    random = environment_spec("Asterix-MinAtar").random_return()
+    games = {"returns": {"ppo": {KEY: packed_row(np.full(20, random / 2))}}, "learned_on": {}}
+    games["failed"] = games["draws"] = {}
+    report["environments"]["Asterix-MinAtar"] = games
+    assert [*module.scores(report)] == ["Pendulum-v1", "Acrobot-v1"]
+    assert "Asterix" not in module.EXPERIMENT.page(report)
+
+
+def test_few_draws_decide_nothing(report):
+    for environment in report["environments"].values():
+        for lines in environment["returns"].values():
+            lines[KEY] = packed_row(unpacked_row(lines[KEY])[:9])
+    judged = module.EXPERIMENT.judged(report)
+    assert {x.outcome for x in judged} == {UNDECIDED}
+    assert all(x.estimate.low is None for x in judged)
+
+
+def test_draws_of_another_number_are_not_added(report):
+    options = module.Options(draws=17, environments=("Acrobot-v1",))
+    next(module.parts(options, report))
+    with pytest.raises(UserError, match="measured with draws 17, and 34 is asked for"):
+        next(module.parts(replace(options, draws=34), report))
+    with pytest.raises(UserError, match="no environments: give at least one"):
+        module.Options(environments=())
 
 
 def test_all_objectives_meet_the_same_draws(tmp_path, monkeypatch):

@@ -120,6 +120,7 @@ def test_a_bandit_of_ones_own_is_trained_in_alone_and_has_a_report_of_its_own(
         (["--python", "no/python"], "run `make sb3`"),
         (["--algorithms", "trpo"], "algorithm"),
         (["--environments", "Ant-v5"], "environment"),
+        (["--environments", "Pendulum-v1", "--algorithms", "dqn"], "none allows what is asked for"),
         (["--longest", "9999"], "longest is 9999: it must be at least 10000"),
         (
             ["--bandit", "b.npz", "--environments", "Pendulum-v1", "CartPole-v1"],

@@ -69,3 +69,18 @@ def test_processes_that_cannot_be_compared_are_refused(processes, capsys):
     assert (
         "give 1, which the others are compared with, and larger numbers" in capsys.readouterr().err
     )
+
+
+def test_gathering_that_falls_is_level_and_costs_from_one_process_on():
+    assert scaling.grown([(2, 5.0), (3, 4.0), (4, 3.0)]) == (0.0, 4.0)
+    assert scaling.grown([(2, 5.0), (4, 9.0)]) == pytest.approx((2.0, 1.0))
+    # A twentieth of 2 s is less than it takes anywhere.
+    page = scaling.EXPERIMENT.page(report({"2": 130.0, "4": 132.0}))
+    assert "5 % from 1 on" in page
+
+
+def test_generations_of_another_number_are_not_among_these():
+    found = {}
+    next(scaling.parts(scaling.Options(generations=8), found))
+    with pytest.raises(UserError, match="measured with searched 8, and 20 is asked for"):
+        next(scaling.parts(scaling.Options(generations=20), found))

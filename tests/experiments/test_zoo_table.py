@@ -152,6 +152,17 @@ def test_brax_is_scored_between_random_actions_and_the_papers_best():
     assert "zoo_table_brax" not in zoo_table.EXPERIMENT.figures(PENDULUM)
 
 
+def test_agents_that_all_ended_without_a_number_count_as_random_actions():
+    brax = {"backend": "generalized"}
+    best = [3325.8] * 3
+    agents = {"ppo": best, "td3": [None] * 3}
+    entries = [entry("hopper", name, "ours", x, x, **brax) for name, x in agents.items()]
+    (ours,) = zoo_table_page.brax_scores(entries)["hopper"].values()
+    assert ours.n == 6 and ours.value == pytest.approx(0.5)
+    with pytest.raises(UserError, match="agents is 1: it must be at least 2"):
+        zoo_table.Options(agents=1)
+
+
 def test_an_algorithm_that_is_not_registered_has_its_place_after_the_others():
     entry = {"environment": "CartPole-v1", "backend": None, "bandit": "ours"}
     names = ("mpo", "td3", "ppo", "ddqn", "dqn")
