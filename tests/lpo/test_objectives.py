@@ -219,26 +219,26 @@ def test_a_copy_goes_by_the_name_of_its_own_file(file):
     assert load_objective(file.with_name("another.npz")).name == "another"
 
 
-def test_what_a_run_learned_has_its_name_whatever_it_is_compared_with(file, tmp_path):
+def in_two_folders(file: Path, where: Path, stem: str) -> list[str]:
+    """The paths of copies of an objective that bear one name."""
     paths = []
-    for name in ("first", "second"):
-        (tmp_path / name).mkdir()
+    for folder in ("first", "second"):
+        (where / folder).mkdir()
         for suffix in (".npz", ".json"):
-            kept = tmp_path / name / f"objective{suffix}"
+            kept = where / folder / f"{stem}{suffix}"
             kept.write_bytes(file.with_suffix(suffix).read_bytes())
         paths.append(str(kept.with_suffix(".npz")))
+    return paths
+
+
+def test_what_a_run_learned_has_its_name_whatever_it_is_compared_with(file, tmp_path):
+    paths = in_two_folders(file, tmp_path, "objective")
     assert [x.name for x in load_apart(paths[:1])] == ["first"]
     assert [x.name for x in load_apart(["ppo", *paths])] == ["ppo", "first", "second"]
 
 
 def test_the_first_file_of_a_name_of_which_there_are_results_keeps_it(tmp_path, file):
-    paths = []
-    for name in ("first", "second"):
-        (tmp_path / name).mkdir()
-        for suffix in (".npz", ".json"):
-            kept = tmp_path / name / f"mine{suffix}"
-            kept.write_bytes(file.with_suffix(suffix).read_bytes())
-        paths.append(str(kept.with_suffix(".npz")))
+    paths = in_two_folders(file, tmp_path, "mine")
     assert [x.name for x in load_apart(paths)] == paths
     assert [x.name for x in load_apart(paths, kept=["ppo", "mine"])] == ["mine", paths[1]]
     assert [x.name for x in load_apart(paths, kept=paths)] == paths
