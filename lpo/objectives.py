@@ -13,11 +13,11 @@ import jax.numpy as jnp
 
 from lpo.certificate import Certificate, certify
 from lpo.drifts import ClipDrift, DPODrift, Drift, NoDrift, drift_from_config
-from lpo.drifts.contract import check_static
+from lpo.drifts.contract import check_static, with_defaults
 from lpo.drifts.surrogate import SurrogateDrift
 from scb import artefacts, own
 from scb.environments.registry import environment_spec
-from scb.errors import UserError, first_line
+from scb.errors import UserError
 from scb.keys import root_key
 from scb.own import code_of
 
@@ -125,14 +125,7 @@ def load_objective(name: Named) -> Objective:
     if isinstance(name, Objective):
         return name
     if isinstance(name, type) and issubclass(name, Drift):
-        family = name
-        try:
-            name = family()
-        except TypeError as error:
-            raise UserError(
-                f"the drift {family.__name__} cannot be made as it is ({first_line(error)}): give an instance with its "
-                "settings."
-            ) from error
+        name = with_defaults(name, name.__name__, "give an instance with its settings")
     if isinstance(name, Drift):
         return closed_form(name.name, name)
     if callable(name) and not isinstance(name, type):

@@ -13,13 +13,13 @@ from that.
 from collections.abc import Mapping
 from typing import Any
 
-from lpo.drifts.contract import Drift, check_static
+from lpo.drifts.contract import Drift, check_static, with_defaults
 from lpo.drifts.formula import ClosedFormDrift
 from lpo.drifts.known import ClipDrift, DPODrift, NoDrift
 from lpo.drifts.mirror import MirrorDrift
 from lpo.drifts.network import LearnedDrift
 from scb import own
-from scb.errors import UserError, first_line, one_of
+from scb.errors import UserError, one_of
 
 DRIFTS: dict[str, type[Drift]] = {
     drift.name: drift
@@ -66,21 +66,15 @@ def learned_drift(name: str, **settings: Any) -> Drift:
                 f"the drift {name} does not learn: give its class learned = True, and parameters to init."
             )
     one_of("learned drift", name, learned)
-    try:
-        default = learned[name]()
-    except TypeError as error:
-        raise UserError(
-            f"the drift {name} cannot be made as it is ({first_line(error)}): give each of its fields a default, which "
-            "a flag may change."
-        ) from error
-    check_static(default)
+    advice = "give each of its fields a default, which a flag may change"
+    check_static(with_defaults(learned[name], name, advice))
     for setting in settings:
         if setting not in learned[name].settings():
             having = [family for family, drift in learned.items() if setting in drift.settings()]
             raise UserError(
                 f"the drift {name} has no {setting}, which is a setting of {', '.join(having)}: leave it out."
             )
-    return type(default)(**settings)
+    return learned[name](**settings)
 
 
 def drift_from_config(config: Mapping[str, Any]) -> Drift:

@@ -115,6 +115,16 @@ class Drift(ABC):
         return self
 
 
+def with_defaults(family: type[Drift], name: str, advice: str) -> Drift:
+    """The drift that a family starts with; a UserError, which ends with the advice, where a setting has no default."""
+    try:
+        return family()
+    except TypeError as error:
+        raise UserError(
+            f"the drift {name} cannot be made as it is ({first_line(error)}): {advice}."
+        ) from error
+
+
 def check_static(drift: Drift) -> None:
     """A UserError for a drift by which programs cannot be told apart: no frozen dataclass, or not to be hashed."""
     name, settings = type(drift).__name__, getattr(drift, "__dataclass_params__", None)
