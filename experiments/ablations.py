@@ -190,15 +190,6 @@ def facts(report: Report) -> dict[str, Any]:
 
 def draw(report: Mapping[str, Any]) -> Figure:
     """The paper's panels, and Acrobot's, of which something moves; a line is left out where a search's mean failed."""
-    colors = (
-        plotting.BLACK,
-        plotting.ORANGE,
-        plotting.BLUE,
-        plotting.VERMILLION,
-        plotting.GREEN,
-        plotting.PURPLE,
-    )
-    styles = ("-", "--", "-.", ":", (0, (3, 1, 1, 1)), (0, (5, 1)))
     made = planned(report)
     found = {
         f"{environment}:\n{row}": {
@@ -212,8 +203,8 @@ def draw(report: Mapping[str, Any]) -> Figure:
     for axes, (title, lines) in zip(
         plotting.panels(figure, len(moving)), moving.items(), strict=True
     ):
-        for (label, curves), color, style in zip(lines.items(), colors, styles, strict=False):
-            plotting.search_curve(axes, curves, label, color, style)
+        for (label, curves), look in zip(lines.items(), plotting.LINES, strict=False):
+            plotting.search_curve(axes, curves, label, look)
         axes.set_title(title, fontsize=10)
         axes.set(xlabel="generation", ylabel="return of agents")
         axes.legend(fontsize=7, handlelength=1.8)

@@ -33,7 +33,7 @@ from lpo.fitness import LABELS
 from lpo.objectives import Objective, load_objective, same_drift
 from scb.environments.registry import environment_spec
 from scb.errors import UserError
-from scb.statistics import correlation_text
+from scb.statistics import correlation_text, typeset
 
 PENDULUM = "Synthetic-Pendulum-v1"
 # One thing changed at a time.
@@ -104,7 +104,7 @@ def facts(report: Mapping[str, Any]) -> dict[str, Any]:
         name: [
             [
                 figures.regime_label(row, stage["environment"]),
-                *(correlation_text(row["alignment"][f]).replace("-", "\u2212") for f in LABELS),
+                *(typeset(correlation_text(row["alignment"][f])) for f in LABELS),
             ]
             for row in stage["regimes"]
         ]

@@ -88,18 +88,10 @@ def facts(report: Report) -> dict[str, Any]:
 
 def draw(report: Mapping[str, Any]) -> Figure:
     """Left the curricula, right what the search distribution's mean is worth."""
-    looks = (
-        (plotting.BLACK, "-"),
-        (plotting.BLUE, "--"),
-        (plotting.ORANGE, "-."),
-        (plotting.GREEN, ":"),
-        (plotting.PURPLE, (0, (3, 1, 1, 1))),
-        (plotting.VERMILLION, (0, (5, 1))),
-    )
     generations = report["plan"]["generations"]
     figure = Figure(figsize=(plotting.WIDTH, 3.8))
     left, right = figure.subplots(1, 2)
-    for (shape, curves), (color, style) in zip(report["curves"].items(), looks, strict=False):
+    for (shape, curves), look in zip(report["curves"].items(), plotting.LINES, strict=False):
         curriculum = curriculum_of(ENVIRONMENT, shape, generations)
         times = np.arange(generations + 1)
         lengths: Any = (
@@ -107,10 +99,10 @@ def draw(report: Mapping[str, Any]) -> Figure:
             if curriculum is None
             else np.asarray(horizon(curriculum)(times))
         )
-        left.plot(times, lengths, color=color, linestyle=style, label=shape)
+        left.plot(times, lengths, label=shape, **vars(look))
         number = len(curves)
         label = f"{shape} ({number} {'search' if number == 1 else 'searches'})"
-        plotting.search_curve(right, list(curves.values()), label, color, style, iqm)
+        plotting.search_curve(right, list(curves.values()), label, look, iqm)
     left.set(title="Evaluation episodes' length", xlabel="generation", ylabel="steps")
     right.set(title="Meta-training on Hopper", xlabel="generation", ylabel="return of agents")
     right.legend(fontsize=8)

@@ -32,10 +32,10 @@ from scb.seeds import REPORTING
 from scb.statistics import DECIDING, estimate, median
 
 OURS, PUBLISHED = BANDITS
-LOOKS: dict[str, dict[str, Any]] = {
-    OURS: {"color": plotting.BLUE, "linestyle": "-"},
-    PUBLISHED: {"color": plotting.PURPLE, "linestyle": "-."},
-    "environment": {"color": plotting.VERMILLION, "linestyle": "--"},
+LOOKS = {
+    OURS: plotting.Look(plotting.BLUE),
+    PUBLISHED: plotting.Look(plotting.PURPLE, "-."),
+    "environment": plotting.Look(plotting.VERMILLION, "--"),
 }
 WORDS = {OURS: "our bandit", PUBLISHED: "the published bandit", "environment": "the environment"}
 _PAPER_LINE = "the environment, in the paper (at the end)"
@@ -289,7 +289,7 @@ def draw(report: Mapping[str, Any]) -> Figure:
                 shown = np.asarray(curve["steps"]) > 0
                 steps = np.asarray(curve["steps"])[shown]
                 estimates = [estimate(x) for x in np.transpose(curve["returns"])[shown]]
-                plotting.estimate_curve(axes, steps, estimates, **look)
+                plotting.estimate_curve(axes, steps, estimates, look)
             paper = paper_return(place_name, algorithm, backend)
             if algorithm not in found["environment"] and paper:
                 axes.axhline(paper, color=plotting.GREY, linestyle=":")
@@ -300,7 +300,7 @@ def draw(report: Mapping[str, Any]) -> Figure:
     for axes in panels[-1]:
         axes.set_xlabel("training steps")
     legend = {WORDS[place]: look for place, look in LOOKS.items()}
-    legend[_PAPER_LINE] = {"color": plotting.GREY, "linestyle": ":"}
+    legend[_PAPER_LINE] = plotting.Look(plotting.GREY, ":")
     plotting.legend_of(figure, legend, 4)
     plotting.figure_title(figure, "Agents by where they trained: interquartile mean, 95 % interval")
     return figure

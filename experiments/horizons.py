@@ -125,10 +125,8 @@ def draw(report: Mapping[str, Any]) -> Figure:
     found = leads(report)
     looks = figures.looks(list(found))
     for name, of_it in found.items():
-        look, lengths = looks[name], [float(h) for h in of_it]
-        plotting.estimate_curve(
-            axes, lengths, list(of_it.values()), look.color, look.linestyle, name, look.marker
-        )
+        lengths = [float(h) for h in of_it]
+        plotting.estimate_curve(axes, lengths, list(of_it.values()), looks[name], name)
     axes.axhline(0, color=plotting.GREY, linewidth=1)
     axes.set_xscale("log", base=2)
     ticks = report["horizons"]

@@ -305,11 +305,9 @@ def draw(report: Mapping[str, Any]) -> Figure:
                 )
                 for rate in rates
             ]
-            plotting.estimate_curve(
-                axes, rates, found, look.color, look.linestyle, marker=look.marker
-            )
+            plotting.estimate_curve(axes, rates, found, look)
         axes.set(title=title, xscale="log", xlabel="learning rate", ylabel="score")
-    plotting.legend_of(figure, {name: vars(look) for name, look in style.items()}, len(style))
+    plotting.legend_of(figure, style, len(style))
     return figure
 
 

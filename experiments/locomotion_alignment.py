@@ -34,7 +34,7 @@ from scb.environments.registry import environment_spec
 from scb.environments.zoo import bandit_metadata
 from scb.errors import UserError, at_least
 from scb.files import packed, unpacked_row
-from scb.statistics import correlation_text, halves_agree, iqm
+from scb.statistics import correlation_text, halves_agree, iqm, typeset
 
 PENDULUM, CARTPOLE = "Pendulum-v1", "CartPole-v1"
 FIRST_SEED = CONFIRMATION_SEED  # on which no regime was chosen
@@ -218,7 +218,7 @@ def ranked_elsewhere(report: Report) -> dict[str, dict[str, dict[str, Alignment]
 def reporting_there(report: Report, environment: str) -> dict[str, LearningCurves]:
     """{objective: its agents that report in an environment} of those that were trained in all others as well."""
     whole = full_size(environment)
-    curves = {} if whole is None else {curve.objective: curve for curve in whole.curves}
+    curves = {} if whole is None else whole.by_name
     known = ranked(environment, report["environments"][environment])
     return _everywhere(report, {name: curve for name, curve in curves.items() if name in known})
 
@@ -317,7 +317,7 @@ def _agree(curves: Mapping[str, LearningCurves], outcome: str) -> float | None:
 
 
 def _text(found: Alignment) -> str:
-    return correlation_text(asdict(found)).replace("-", "\N{MINUS SIGN}")
+    return typeset(correlation_text(asdict(found)))
 
 
 def draw(report: Mapping[str, Any]) -> dict[str, Figure]:

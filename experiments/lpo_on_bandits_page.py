@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -71,7 +72,7 @@ def on_hopper() -> dict[str, LearningCurves]:
     """{name of this figure: curves at full size}, as far as they were measured; PPO's are."""
     whole = full_size("hopper")
     assert whole is not None
-    measured = {curves.objective: curves for curves in whole.curves}
+    measured = whole.by_name
     return {name: measured[of] for name, of in HOPPER.items() if of in measured}
 
 
@@ -225,9 +226,7 @@ def _draw_searches(panels: Any, report: Mapping[str, Any]) -> None:
             (panels[2], 1, minutes, name),
         ):
             x, found = generations[first:] * each, returns[first:]
-            plotting.estimate_curve(
-                panel, x, found, look.color, look.linestyle, label, marker=look.marker
-            )
+            plotting.estimate_curve(panel, x, found, look, label)
         # Training takes nearly all.
         panels[1].plot(
             generations[1:] * per["evaluation"],
@@ -269,7 +268,7 @@ def _draw_hopper(panel: Any) -> None:
         look = own[name] if name in own else figures.looks([name])[name]
         found = [estimate(column) for column in curves.returns.T]
         label = f"{name}, n = {len(curves.seeds)}"
-        plotting.estimate_curve(panel, curves.steps, found, look.color, look.linestyle, label)
+        plotting.estimate_curve(panel, curves.steps, found, replace(look, marker=""), label)
     panel.legend(fontsize=8)
     panel.xaxis.set_major_formatter(EngFormatter(sep=""))
     panel.set(xlabel="environment steps", ylabel="return")

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 from scb import termination
-from scb.errors import UserError, at_least, first_line, unused
+from scb.errors import UserError, at_least, first_line, needed_for, unused
 from scb.files import make_folder, write_json
 
 # Only what is measured elsewhere needs it, which the package's own requirements leave out.
@@ -156,12 +156,8 @@ class Jobs:
         Raises:
           UserError: submitit is not installed, or SLURM is not here.
         """
-        try:
+        with needed_for(f"--executor {self.executor} needs", "submitit"):
             import submitit
-        except ImportError as error:
-            raise UserError(
-                f"--executor {self.executor} needs the package submitit: install it."
-            ) from error
         kinds = {"local": submitit.LocalExecutor, "slurm": submitit.SlurmExecutor}
         try:
             made: submitit.Executor = kinds[self.executor](folder)
@@ -282,7 +278,7 @@ def elsewhere(
     if failed:
         part, reason = next(iter(failed.items()))
         raise UserError(
-            f"{len(failed)} of {len(kept)} parts were not measured, {part.name} among them ({reason.rstrip('.')}): "
+            f"{len(failed)} of {len(kept)} parts were not measured, {part.name} among them ({reason}): "
             f"the .err files in {folder / 'jobs'} say more, and the same command tries again."
         )
 

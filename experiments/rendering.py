@@ -10,14 +10,14 @@ from numpy.typing import NDArray
 
 from experiments.claims import FAILS, HOLDS, OUTCOMES, UNDECIDED, UNTESTED, Judged
 from scb.plotting import thousands
-from scb.statistics import Estimate, estimate, places_apart
+from scb.statistics import Estimate, estimate, places_apart, typeset
 
 TEMPLATES = Path(__file__).with_name("templates")
 
 
 def number(value: float, places: int = 0, sign: bool = False) -> str:
     """With a real minus sign."""
-    return f"{value:{'+' if sign else ''}z.{places}f}".replace("-", "\N{MINUS SIGN}")
+    return typeset(f"{value:{'+' if sign else ''}z.{places}f}")
 
 
 def plain(value: float | None) -> str:
@@ -53,7 +53,7 @@ def digits(interval: Mapping[str, Any] | None, sign: bool = False) -> str:
     """An estimate with four digits of its largest number: −194.2 [−262.8, −167.9]."""
     if interval is None:
         return "none"
-    found = str(Estimate(**interval)).rsplit(" (n=", 1)[0].replace("-", "\N{MINUS SIGN}")
+    found = typeset(str(Estimate(**interval)).rsplit(" (n=", 1)[0])
     return f"+{found}" if sign and interval["value"] > 0 else found
 
 
@@ -158,7 +158,7 @@ ENVIRONMENT.filters |= {
     "percent": percent,
     "plain": plain,
     "said": said,
-    "short": lambda x: f"{x:g}".replace("-", "\N{MINUS SIGN}"),
+    "short": lambda x: typeset(f"{x:g}"),
     "spaced": lambda x: f"{x:,}".replace(",", " "),
     "span": span,
     "text": text,

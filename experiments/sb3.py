@@ -12,7 +12,7 @@ it), in which every agent is a process. What --out holds already is not trained 
 import json
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -58,8 +58,10 @@ COLORS = {
     "td3": plotting.GREEN,
     "ddpg": plotting.ORANGE,
 }
-LINES = {BANDIT: "-", ENVIRONMENT: ":"}
-MARKERS = {BANDIT: "o", ENVIRONMENT: "x"}
+LOOKS = {
+    BANDIT: plotting.Look(plotting.GREY, marker="o"),
+    ENVIRONMENT: plotting.Look(plotting.GREY, ":", "x"),
+}
 
 
 @dataclass(frozen=True)
@@ -246,9 +248,8 @@ def draw(report: Mapping[str, Any]) -> Figure:
         curves, once = next(panels), short[name]
         for algorithm, places in algorithms.items():
             for place, found in places.items() if algorithm not in once else ():
-                steps, color = report["steps"][algorithm], COLORS[algorithm]
-                line, marker = LINES[place], MARKERS[place]
-                plotting.estimate_curve(curves, steps, found, color, line, marker=marker)
+                look = replace(LOOKS[place], color=COLORS[algorithm])
+                plotting.estimate_curve(curves, report["steps"][algorithm], found, look)
         for label, level in (
             ("expert", shown["expert"][name].value),
             ("random", shown["random"][name]),
@@ -260,13 +261,8 @@ def draw(report: Mapping[str, Any]) -> Figure:
         if once:
             _draw_once(next(panels), name, once, report, tables[name])
     used = [x for x in COLORS if any(x in algorithms for algorithms in tables.values())]
-    looks: dict[str, Mapping[str, Any]] = {x.upper(): {"color": COLORS[x]} for x in used}
-    for place, line in LINES.items():
-        looks[f"trained in the {place}"] = {
-            "color": plotting.GREY,
-            "linestyle": line,
-            "marker": MARKERS[place],
-        }
+    looks = {x.upper(): plotting.Look(COLORS[x]) for x in used}
+    looks |= {f"trained in the {place}": look for place, look in LOOKS.items()}
     plotting.legend_of(figure, looks, columns=4)
     return figure
 

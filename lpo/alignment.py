@@ -18,7 +18,7 @@ import numpy as np
 from lpo.comparison import compare, ppo_spec
 from lpo.drifts import Drift
 from lpo.fitness import FITNESSES, LABELS
-from lpo.inner_loop import MetaTrainingConfig, TaskTraining, task_agent
+from lpo.inner_loop import EPISODES_AT_HOME, MetaTrainingConfig, TaskTraining, task_agent
 from lpo.objectives import Objective, check_names, load_objective
 from scb.agents.ppo import PPOHyperparameters
 from scb.agents.spec import AgentSpec
@@ -191,7 +191,7 @@ def _program(regime: Regime, drift: Drift, size: int, backend: str | None) -> Ca
         def judge(kind: tuple[bool, bool]) -> Judge:
             at_home, mode = kind
             if at_home:
-                return Judge(home, home_params, 20, mode)
+                return Judge(home, home_params, EPISODES_AT_HOME, mode)
             return Judge(task.env, env_params, task.evaluation_episodes, mode)
 
         key_train, key_end = split_key(root_key(seed))

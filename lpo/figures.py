@@ -8,6 +8,7 @@ a grey print.
 
 import textwrap
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -37,7 +38,7 @@ from scb.plotting import (
     name_rows,
     panels,
 )
-from scb.statistics import correlation_text, estimate, paired_difference
+from scb.statistics import correlation_text, estimate, paired_difference, typeset
 
 if TYPE_CHECKING:
     from lpo.comparison import LearningCurves
@@ -121,8 +122,7 @@ def learning_curves(curves: "Sequence[LearningCurves]") -> Figure:
         for position, curve in enumerate(curves):
             look = style[curve.objective]
             points = [estimate(column) for column in curve.returns.T]
-            drawn = (look.color, look.linestyle, curve.objective, look.marker)
-            estimate_curve(training, curve.steps, points, *drawn)
+            estimate_curve(training, curve.steps, points, look, curve.objective)
             _final(final, position, curve, look)
         training.set_xlabel("environment steps")
         training.xaxis.set_major_formatter(EngFormatter(sep=""))
@@ -166,9 +166,7 @@ def leads(curves: "Sequence[LearningCurves]") -> Figure:
         for axes, curve in zip(panels, others, strict=True):
             look, (ours, theirs) = style[curve.objective], curve.paired(reference, "returns")
             points = [paired_difference(*both) for both in zip(ours.T, theirs.T, strict=True)]
-            estimate_curve(
-                axes, curve.steps, points, look.color, look.linestyle, marker=look.marker
-            )
+            estimate_curve(axes, curve.steps, points, look)
             axes.axhline(0.0, color=BLACK, linewidth=1)
             axes.set_title(f"{curve.objective}\n{len(ours)} pairs", fontsize=10, weight="normal")
             axes.xaxis.set_major_formatter(EngFormatter(sep=""))
@@ -202,10 +200,8 @@ def diagnosis(curves: "Sequence[LearningCurves]") -> Figure:
                     )
                 values = curve.diagnosis[name] if curve.diagnosis else np.empty((0, 0))
                 known = values[~np.isnan(values).any(axis=1)]
-                look = style[curve.objective]
                 points = [estimate(column, np.mean) for column in known.T]
-                drawn = (look.color, look.linestyle, curve.objective, look.marker)
-                estimate_curve(axes, curve.steps, points, *drawn)
+                estimate_curve(axes, curve.steps, points, style[curve.objective], curve.objective)
             axes.set_title(label, fontsize=10, weight="normal")
             axes.xaxis.set_major_formatter(EngFormatter(sep=""))
             axes.margins(x=0.02)
@@ -231,8 +227,8 @@ def suite_scores(scores: "SuiteScores", suite: str) -> Figure:
         figure = Figure(figsize=(WIDTH, 4.0))
         profile, aggregate = figure.subplots(1, 2, width_ratios=(2.0, 1))
         for i, name in enumerate(scores.objectives):
-            look = style[name]
-            estimate_curve(profile, thresholds, profiles[i], look.color, look.linestyle, name)
+            look = replace(style[name], marker="")
+            estimate_curve(profile, thresholds, profiles[i], look, name)
             estimate_row(aggregate, i, np.empty(0), aggregates[i], look.color)
         profile.set_xlabel("normalised score \u03c4 (0: random actions, 1: reference)")
         profile.set_ylabel("share of runs with a score above \u03c4")
@@ -277,7 +273,7 @@ def alignment_heatmap(report: Mapping[str, Any]) -> Figure:
                 axes.text(
                     j,
                     i,
-                    text.replace("-", "\u2212"),
+                    typeset(text),
                     ha="center",
                     va="center",
                     fontsize=8,

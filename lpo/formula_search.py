@@ -30,7 +30,7 @@ from lpo.drifts.sums import (
     value_of,
     with_numbers,
 )
-from scb.errors import UserError, at_least
+from scb.errors import UserError, at_least, needed_for
 from scb.seeds import searching
 
 if TYPE_CHECKING:
@@ -132,14 +132,10 @@ def programs_of(
     data: Points, config: DistillConfig, terminals: Sequence[tuple[str, ...]]
 ) -> list[list[Any]]:
     """The programs of all of gplearn's generations, best first, as lists in prefix notation."""
-    try:
+    with needed_for("distilling needs", "gplearn", "distill"):
         from gplearn.fitness import make_fitness
         from gplearn.functions import make_function
         from gplearn.genetic import SymbolicRegressor
-    except ImportError as error:
-        raise UserError(
-            "distilling needs the package gplearn: install the extra `distill`."
-        ) from error
     inputs = np.stack(
         [np.prod([data.variables[name] for name in terminal], axis=0) for terminal in terminals],
         axis=-1,

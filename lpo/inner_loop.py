@@ -29,6 +29,7 @@ from scb.strategies import check_memory
 
 _OF_BANDITS = ("contexts", "reward_noise")
 POINTS = 5  # of the curve that the area is under
+EPISODES_AT_HOME = 20  # in an environment, of an agent that learned in a bandit or there
 
 
 def _read_horizons(words: str) -> tuple[float, ...]:
@@ -231,7 +232,9 @@ class TaskTraining:
         )
         self.every = spaced(self.spec.config.num_iterations, POINTS)
         self.agent = self.spec.agent(self.env, config.drift)
-        self.evaluation_episodes = config.evaluation_episodes or (50 if judged_in.is_bandit else 20)
+        self.evaluation_episodes = config.evaluation_episodes or (
+            50 if judged_in.is_bandit else EPISODES_AT_HOME
+        )
         self.training_params = self.spec.training_params(self.env_params)
         if spec.is_bandit and config.reward_noise:
             scale = self.env.reward_scale(

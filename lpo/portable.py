@@ -22,7 +22,7 @@ from jax.typing import ArrayLike
 from lpo.drifts import Drift
 from lpo.objectives import Named, Objective, load_objective
 from scb.agents.drift import MAX_LOG_RATIO
-from scb.errors import UserError
+from scb.errors import UserError, needed_for
 
 if TYPE_CHECKING:
     import torch
@@ -109,12 +109,8 @@ def _policy_loss(xp: Any, penalty: Any, log_ratio: Any, advantage: Any) -> Any:
 
 
 def _for_torch(function: "TorchFunction", objective: Named) -> "TorchFunction":
-    try:
+    with needed_for("a drift for PyTorch needs", "torch", "torch"):
         importlib.import_module("torch")
-    except ImportError as error:
-        raise UserError(
-            "a drift for PyTorch needs the package torch: install the extra `torch`."
-        ) from error
     objective = load_objective(objective)
     return partial(function, objective.drift, _host_parameters(objective))
 

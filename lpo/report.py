@@ -5,7 +5,6 @@ goes on to what is needed to doubt it: protocol, cost, certificate, seeds, versi
 """
 
 import base64
-import math
 import struct
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -16,7 +15,7 @@ import jinja2
 
 from lpo.certificate import LARGEST_KINK, Certificate
 from scb.plotting import ratio_text, thousands
-from scb.statistics import DECIDING, places_apart
+from scb.statistics import DECIDING, places_apart, places_of, typeset
 
 Verdict = Literal["better", "worse", "undecided", "few seeds", "not compared"]
 
@@ -151,24 +150,19 @@ def _interval(estimate: Mapping[str, Any], signed: bool = False) -> str:
     # -147 [-162, -126]: as many places as the width of the interval gives meaning to.
     value, low, high = estimate["value"], estimate["low"], estimate["high"]
     if low is None or high is None:
-        return f"{_number(value, _places(abs(value), 4), signed)} [no interval]"
-    places = _places((high - low) / 2, 2) if high > low else _places(abs(value), 4)
+        return f"{_number(value, places_of(abs(value), 4), signed)} [no interval]"
+    places = places_of((high - low) / 2, 2) if high > low else places_of(abs(value), 4)
     places = places_apart(places, low, high)
     value, low, high = (_number(x, places, signed) for x in (value, low, high))
     return f"{value} [{low}, {high}]"
 
 
-def _places(size: float, digits: int) -> int:
-    return max(0, digits - 1 - math.floor(math.log10(size))) if size > 0 else 1
-
-
 def _number(x: float, places: int, signed: bool = False) -> str:
     text = f"{x:+.{places}f}" if signed else f"{x:.{places}f}"
-    # A sign before nothing but zeros is noise; the minus is the typographic one, which no line
-    # break separates from its number.
+    # A sign before nothing but zeros is noise.
     if not any(digit in text for digit in "123456789"):
         text = text.lstrip("+-")
-    return text.replace("-", "−")
+    return typeset(text)
 
 
 def _duration(seconds: float) -> str:

@@ -195,7 +195,7 @@ def described(path: str | Path, what: str, entry: str = "a config entry") -> Ite
         ) from error
     except Exception as error:
         raise UserError(
-            f"{path} does not describe a {what}: its .json garbles {entry} ({first_line(error).rstrip('.')})."
+            f"{path} does not describe a {what}: its .json garbles {entry} ({first_line(error)})."
         ) from error
 
 

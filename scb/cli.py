@@ -103,7 +103,7 @@ def exit_code(program: str, act: Callable[[], int | None], again: str = "") -> i
     except (MemoryError, JaxRuntimeError) as error:
         if isinstance(error, JaxRuntimeError) and "RESOURCE_EXHAUSTED" not in str(error):
             raise
-        reason = f" ({first_line(error).rstrip('.')})" if str(error) else ""
+        reason = f" ({first_line(error)})" if str(error) else ""
         tell(
             f"out of memory{reason}: begin anew with fewer agents, candidates, episodes or environments."
         )

@@ -1,7 +1,8 @@
 """The one exception that means "the input was wrong", so that a command line can tell it from a bug."""
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import fields, is_dataclass
 from difflib import get_close_matches
 from typing import Any, get_args
@@ -131,8 +132,23 @@ def of_class(classes: Any, **values: Any) -> None:
 
 
 def first_line(error: Exception) -> str:
-    """What an error says in its first line; its type's name where it says nothing."""
-    return next(iter(str(error).strip().splitlines()), type(error).__name__)
+    """What an error says in its first line, without the full stop; its type's name where it says nothing."""
+    return next(iter(str(error).strip().splitlines()), type(error).__name__).rstrip(".")
+
+
+@contextmanager
+def needed_for(what: str, package: str, extra: str | None = None) -> Iterator[None]:
+    """A UserError of an ImportError in it: a package is not installed that something needs.
+
+    Args:
+      what: needs it, with its verb.
+      extra: of this project that installs it.
+    """
+    try:
+        yield
+    except ImportError as error:
+        how = f"the extra `{extra}`" if extra else "it"
+        raise UserError(f"{what} the package {package}: install {how}.") from error
 
 
 def unused(config: Any, because: str, names: Iterable[str], otherwise: str) -> None:

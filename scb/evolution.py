@@ -95,10 +95,8 @@ class EvolutionConfig:
         at_least(1, self, "averaging", "evaluate_mean_every", "checkpoint_every")
         agents_at_least(1, self, "mean_evaluations")
         if self.averaging > 1 and self.strategy not in DISTRIBUTIONS:
-            raise UserError(
-                f"averaging is {self.averaging}, and {self.strategy} keeps a population and no mean: leave it out, or "
-                "choose a strategy such as SNES."
-            )
+            because = f"{self.strategy} keeps a population and no mean"
+            unused(self, because, ("averaging",), "choose a strategy such as SNES")
         searching(self.seed)
         positive(self, "sigma", "sigma_decay", "learning_rate", "learning_rate_decay")
         at_least(0, self, "sigma_limit", "learning_rate_limit")

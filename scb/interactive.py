@@ -9,7 +9,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from scb.errors import UserError
+from scb.errors import needed_for
 from scb.files import write_text
 
 _STYLE = """
@@ -27,12 +27,8 @@ def plotly() -> ModuleType:
     Raises:
       UserError: it is not installed.
     """
-    try:
+    with needed_for("a page with figures to turn needs", "plotly", "html"):
         import plotly.graph_objects
-    except ImportError as error:
-        raise UserError(
-            "a page with figures to turn needs the package plotly: install the extra `html`."
-        ) from error
     return plotly.graph_objects
 
 

@@ -57,8 +57,19 @@ class Look:
     """How one thing is drawn wherever it appears; marker and line style tell it apart in grey too."""
 
     color: str
-    linestyle: Any
-    marker: str
+    linestyle: Any = "-"
+    marker: str = ""
+
+
+# Lines of one figure, of which no two are alike in grey either.
+LINES = (
+    Look(BLACK, "-"),
+    Look(ORANGE, "--"),
+    Look(BLUE, "-."),
+    Look(VERMILLION, ":"),
+    Look(GREEN, (0, (3, 1, 1, 1))),
+    Look(PURPLE, (0, (5, 1))),
+)
 
 
 def estimate_row(
@@ -106,8 +117,7 @@ def search_curve(
     axes: Axes,
     curves: Sequence[Mapping[str, Any]],
     label: str,
-    color: str,
-    linestyle: Any = "-",
+    look: Look,
     statistic: Statistic = np.mean,
 ) -> None:
     """Several searches over their generations: a statistic of them, with its interval over searches.
@@ -120,7 +130,7 @@ def search_curve(
     if not curves:
         return
     found = over_searches([c["fitness"] for c in curves], statistic)
-    estimate_curve(axes, curves[0]["generation"], found, color, linestyle, label)
+    estimate_curve(axes, curves[0]["generation"], found, look, label)
 
 
 def over_searches(
@@ -140,17 +150,17 @@ def estimate_curve(
     axes: Axes,
     x: ArrayLike,
     found: Sequence[Estimate],
-    color: str,
-    linestyle: Any = "-",
+    look: Look,
     label: str | None = None,
-    marker: str = "",
 ) -> None:
     """A line through estimates, their intervals a band where there are any."""
     middle = np.array([e.value for e in found])
     below, above = error_bar(*found)
-    axes.plot(x, middle, color=color, linestyle=linestyle, label=label, marker=marker)
+    axes.plot(x, middle, label=label, **vars(look))
     if any(e.low is not None for e in found):
-        axes.fill_between(x, middle - below, middle + above, color=color, alpha=0.15, linewidth=0)
+        axes.fill_between(
+            x, middle - below, middle + above, color=look.color, alpha=0.15, linewidth=0
+        )
 
 
 @contextmanager
@@ -172,9 +182,10 @@ def legend_below(figure: Figure, entries: tuple[list[Any], list[Any]], columns: 
     figure.legend(*entries, loc="outside lower center", ncols=columns, columnspacing=1.5)
 
 
-def legend_of(figure: Figure, looks: Mapping[str, Mapping[str, Any]], columns: int) -> None:
-    """`legend_below` of lines, given by label as what `Line2D` takes."""
-    handles = [Line2D([], [], **look) for look in looks.values()]
+def legend_of(figure: Figure, looks: Mapping[str, Look | Mapping[str, Any]], columns: int) -> None:
+    """`legend_below` of lines, given by label, or as what `Line2D` takes."""
+    drawn = [vars(look) if isinstance(look, Look) else look for look in looks.values()]
+    handles = [Line2D([], [], **look) for look in drawn]
     legend_below(figure, (handles, list(looks)), columns)
 
 

@@ -216,7 +216,7 @@ def _all(tree: Any, tiled: bool) -> Any:
         return jax.tree.map(np.asarray, multihost_utils.process_allgather(tree, tiled=tiled))
     # The second where it is noticed as the gathering is begun.
     except (jax.errors.JaxRuntimeError, ValueError) as error:
-        reason = first_line(error).rsplit("] ", 1)[-1].rstrip(".")
+        reason = first_line(error).rsplit("] ", 1)[-1]
         raise LostProcess(
             f"one of the {jax.process_count()} processes has ended, and process {jax.process_index()} cannot go on "
             f"without it ({reason}): see what it says, and start all of them again with --resume."

@@ -29,7 +29,7 @@ from tensorboardX.summary import scalar
 
 from scb import termination
 from scb.configurations import as_if_shorter, config_dict, first_difference, with_defaults
-from scb.errors import UserError, of_class
+from scb.errors import UserError, needed_for, of_class
 from scb.files import as_json, cannot_write, make_folder, plain, refusing, write_json, write_text
 from scb.machine import machine_description
 
@@ -377,12 +377,8 @@ class Stopwatch:
 
 
 def _wandb() -> Any:
-    try:
+    with needed_for("logging to Weights & Biases needs", "wandb", "wandb"):
         import wandb
-    except ImportError as error:
-        raise UserError(
-            "logging to Weights & Biases needs the package wandb: install the extra `wandb`."
-        ) from error
     return wandb
 
 

@@ -37,8 +37,7 @@ class Estimate:
         known = [end for end in (self.value, self.low, self.high) if end is not None]
         # Four digits for the largest number, and the same places for all: the eye compares columns.
         largest = max(abs(end) for end in known)
-        places = max(0, 3 - math.floor(math.log10(largest))) if largest > 0 else 1
-        places = places_apart(places, self.low, self.high)
+        places = places_apart(places_of(largest, 4), self.low, self.high)
         if self.low is None or self.high is None:
             return f"{self.value:.{places}f} [no interval] (n={self.n})"
         return (
@@ -52,6 +51,16 @@ class Estimate:
     def as_dict(self) -> dict[str, float | int | None]:
         """{"value", "low", "high", "n"}, ready for JSON: an unknown end is None, never NaN."""
         return asdict(self)
+
+
+def places_of(size: float, digits: int) -> int:
+    """Decimal places with which a size has so many digits, none of a whole number's cut."""
+    return max(0, digits - 1 - math.floor(math.log10(size))) if size > 0 else 1
+
+
+def typeset(text: str) -> str:
+    """Numbers with the typographic minus, which no line break separates from its number."""
+    return text.replace("-", "\N{MINUS SIGN}")
 
 
 def places_apart(places: int, *ends: float | None, most: int = 6) -> int:

@@ -163,7 +163,7 @@ class Strategy:
         return self._algorithm.ask(key, state, self._params)
 
     def tell(self, key: jax.Array, population: Any, fitness: np.ndarray, state: Any) -> Any:
-        # The one negation of the project: fitness is maximised everywhere, evosax minimises.
+        # The negation of a population's fitness: fitness is maximised everywhere, evosax minimises.
         state, _ = self._algorithm.tell(key, population, -jnp.asarray(fitness), state, self._params)
         return state
 

@@ -67,7 +67,7 @@ class SurrogateDrift(Drift):
 
     def _refused(self, error: Exception, xp: Any) -> UserError:
         where = {"jax.numpy": "in JAX", "numpy": "with NumPy", "torch": "with PyTorch"}[xp.__name__]
-        said = first_line(error).rstrip(".")
+        said = first_line(error)
         advice = ""
         if isinstance(error, _TRACED) or "truth value" in said:
             advice = ": use xp.where in place of if, and xp in place of numpy"

@@ -67,7 +67,7 @@ def check_drift(
     except Exception as error:  # what a drift raises for parameters of another kind is its own
         raise UserError(
             f"{drift_name} cannot take {parameters_name}: {advice}; a drift of your own takes (parameters, log_ratio "
-            f"[B], advantage [B], progress [B]), and says here: {first_line(error).rstrip('.')}."
+            f"[B], advantage [B], progress [B]), and says here: {first_line(error)}."
         ) from error
     if getattr(penalty, "shape", None) != one.shape:
         raise UserError(

@@ -17,13 +17,11 @@ class Trajectories(NamedTuple):
 
     Attributes:
       observations: [E, T, O] flattened, before each step.
-      actions: [E, T, ...].
       rewards: [E, T].
       active: [E, T].
     """
 
     observations: np.ndarray
-    actions: np.ndarray
     rewards: np.ndarray
     active: np.ndarray
 
@@ -75,7 +73,7 @@ def record_episode(
         action = policy(observation, key_act)
         after, state, reward, terminated, _ = env.step_env(key_step, before, action, env_params)
         ended = terminated | env.is_truncated(state, env_params)
-        record = Trajectories(jnp.ravel(observation), action, jnp.reshape(reward, ()), active)  # type: ignore[arg-type]
+        record = Trajectories(jnp.ravel(observation), jnp.reshape(reward, ()), active)  # type: ignore[arg-type]
         return (after, state, active & ~ended), (record, before)
 
     start = (observation, state, jnp.bool_(True))

@@ -97,9 +97,9 @@ def test_a_line_is_the_mean_over_searches_and_leaves_gaps():
         {"generation": [0, 1, 2], "fitness": [1.0, None, 3.0]},
         {"generation": [0, 1, 2], "fitness": [3.0, None, 3.0]},
     ]
-    plotting.search_curve(axes, curves, "two", plotting.BLUE)
+    plotting.search_curve(axes, curves, "two", plotting.LINES[0])
     np.testing.assert_array_equal(axes.lines[0].get_ydata(), [2.0, np.nan, 3.0])
-    plotting.search_curve(axes, [], "none", plotting.BLUE)
+    plotting.search_curve(axes, [], "none", plotting.LINES[0])
     assert len(axes.lines) == 1
 
 

@@ -128,7 +128,7 @@ def test_reward_variance_draws_entries_apart_from_each_other():
 
 def test_what_comes_after_an_episodes_end_is_no_part_of_its_return():
     rewards, active = np.array([[1.0, 2.0, np.nan]]), np.array([[True, True, False]])
-    followed = Trajectories(np.zeros((1, 3, 1)), np.zeros((1, 3)), rewards, active)
+    followed = Trajectories(np.zeros((1, 3, 1)), rewards, active)
     np.testing.assert_array_equal(followed.returns(), [3.0])
 
 
