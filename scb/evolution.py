@@ -48,7 +48,7 @@ class EvolutionConfig:
       population_size: candidates a generation.
       num_generations: how many of them; with 0 a search for a bandit, which alone takes that, ends with its start.
       sigma: initial standard deviation of the search distribution.
-      sigma_decay: factor on it a generation, for strategies with a schedule (Open_ES).
+      sigma_decay: factor on it a generation, from the second on, for strategies with a schedule (Open_ES).
       sigma_limit: what it decays down to.
       learning_rate: of Adam, for Open_ES and its relatives; SNES steps by its own rule.
       learning_rate_decay: factor on it a generation.

@@ -80,8 +80,8 @@ class TD3(OffPolicyAgent):
         space = self.env.action_space(env_params)
         require_actions("ddpg" if self.config.num_critics == 1 else "td3", space, "continuous")
         shape = (self.config.hidden_sizes, self.config.activation)
-        # The policy follows the first critic; the second only ever lowers a bootstrapped target,
-        # and without bootstrapping it has no effect on anything.
+        # The policy follows the first critic; the second lowers a bootstrapped target, and without bootstrapping it
+        # would only count in the norm that gradients are clipped to.
         number = 1 if self.one_step else self.config.num_critics
         critics = networks.stacked(networks.Critic, number)(*shape)
         return networks.DeterministicPolicy(action_size(space), *shape), critics
