@@ -6,7 +6,6 @@ Random actions in many environments; both are timed in turn, several times over.
 the machine's.
 """
 
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -21,6 +20,7 @@ from scb.environments.brax_physics import CHUNK
 from scb.environments.registry import environment_spec, families
 from scb.errors import at_least
 from scb.keys import named_key, root_key, split_key
+from scb.stopwatch import Stopwatch
 
 PEER = "brax"
 BACKEND = "generalized"
@@ -64,9 +64,9 @@ def rollout(env: Any, options: Options) -> Callable[[], jax.Array]:
 
 def seconds(call: Callable[[], Any]) -> float:
     """That a call takes."""
-    start = time.perf_counter()
+    watch = Stopwatch()
     call()
-    return time.perf_counter() - start
+    return watch.lap()
 
 
 def measure(options: Options, report: dict[str, Any], save: Save) -> None:

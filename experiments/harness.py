@@ -33,8 +33,8 @@ from scb.configurations import grown
 from scb.environments.registry import families
 from scb.errors import UserError
 from scb.files import as_json, make_folder, write_json
+from scb.locks import held
 from scb.machine import machine_description, package_versions
-from scb.runs import held
 
 CLASSIC_CONTROL = tuple(sorted(families()["classic"].suite))
 DATA = Path("docs/data")

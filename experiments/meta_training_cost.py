@@ -19,7 +19,7 @@ from lpo.meta_training import MetaTraining, environment_problem
 from scb.errors import at_least
 from scb.keys import root_key
 from scb.population import map_population
-from scb.runs import Stopwatch
+from scb.stopwatch import Stopwatch
 
 
 @dataclass(frozen=True)

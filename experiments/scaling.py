@@ -32,7 +32,8 @@ from scb.discovery import BanditDiscovery, DiscoveryConfig
 from scb.errors import UserError, at_least
 from scb.evolution import EvolutionConfig
 from scb.keys import root_key
-from scb.runs import Stopwatch, log_lines
+from scb.runs import log_lines
+from scb.stopwatch import Stopwatch
 from scb.strategies import strategy_for
 
 # The strategies' work by the number of candidates; the largest is a thousand devices' with sixteen each.

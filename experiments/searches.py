@@ -19,7 +19,8 @@ from scb.curriculum import CurriculumConfig, paper_curriculum
 from scb.discovery import DiscoveryConfig, discover
 from scb.errors import UserError
 from scb.evolution import EvolutionConfig, judgements
-from scb.runs import log_lines, released
+from scb.locks import released
+from scb.runs import log_lines
 from scb.statistics import Estimate, Statistic, estimate, stratified_estimate
 
 NONE = "none"  # the curriculum that is none

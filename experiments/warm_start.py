@@ -9,7 +9,6 @@ the environment itself says which construction trains best. No evolution is invo
 that --out holds already are kept, so that they can be measured one at a time.
 """
 
-import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,6 +28,7 @@ from scb.judgement import counted, judge, told
 from scb.keys import root_key, split_key
 from scb.measurement import Place
 from scb.statistics import estimate
+from scb.stopwatch import Stopwatch
 from scb.warm_start import WarmStartConfig, find_expert
 
 # Not the seeds that results are reported on.
@@ -98,9 +98,9 @@ def measure(options: Options, report: dict[str, Any], save: Save) -> None:
         env, env_params = judge_in.env, judge_in.params
         space = env.action_space(env_params)
         key_expert, key_data, key_fit = split_key(root_key(SEED), 3)
-        start = time.perf_counter()
+        watch = Stopwatch()
         expert = find_expert(judge_in, key_expert, WarmStartConfig())
-        seconds = time.perf_counter() - start
+        seconds = watch.lap()
         print(
             f"{name}: the expert's return is {expert.mean_return:.1f} ({seconds:.0f} s)", flush=True
         )
@@ -113,12 +113,12 @@ def measure(options: Options, report: dict[str, Any], save: Save) -> None:
         bandit = bandit_for(env, env_params, BanditConfig(), name)
         for arm, fields in ARMS.items():
             config = WarmStartConfig(**fields)
-            start = time.perf_counter()
+            watch.lap()
             dataset, _ = expert_dataset(expert, judge_in, key_data, config)
             weights, fit = fit_bandit(
                 bandit, dataset, key_fit, config.construction, config.fit_steps
             )
-            row: dict[str, Any] = {"fit": fit, "fit_seconds": round(time.perf_counter() - start, 1)}
+            row: dict[str, Any] = {"fit": fit, "fit_seconds": round(watch.lap(), 1)}
             for algorithm in options.algorithms or algorithms_for(space):
                 spec = bandit_agent(algorithm, name)
                 size = options.agents, options.episodes

@@ -14,7 +14,6 @@ the same command continues an interrupted one. The table and the figure are made
 """
 
 import json
-import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -46,6 +45,7 @@ from scb.judgement import BRAX_EPISODES, EPISODES, check_fits, judge
 from scb.measurement import Place, as_random
 from scb.seeds import REPORTING
 from scb.statistics import estimate, paired_difference
+from scb.stopwatch import Stopwatch
 
 
 @dataclass(frozen=True)
@@ -174,7 +174,7 @@ def measure_bandits(
             }
             if any(row.items() <= _comparable(entry).items() for entry in entries):
                 continue
-            start = time.perf_counter()
+            watch = Stopwatch()
             returns = judge(
                 spec,
                 bandits.setdefault(candidate.bandit.config, candidate.bandit),
@@ -185,7 +185,7 @@ def measure_bandits(
                 row["episodes"],
             )
             row["activation"] = candidate.bandit.config.activation
-            row["seconds"] = round(time.perf_counter() - start, 1)
+            row["seconds"] = round(watch.lap(), 1)
             row |= {actions: summary(x, judge_in) for actions, x in returns.items()}
             entries[:] = [entry for entry in entries if place(entry) != place(row)] + [row]
             entries.sort(key=place)

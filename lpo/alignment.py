@@ -31,8 +31,8 @@ from scb.measurement import Judge, check_seeds, train_and_judge
 from scb.objectives import families
 from scb.population import map_population, rank_failed_last
 from scb.rows import Rows
-from scb.runs import Stopwatch
 from scb.statistics import correlation_text, iqm, rank_correlations, spearman
+from scb.stopwatch import Stopwatch
 
 RESAMPLES = 1000
 

@@ -21,9 +21,9 @@ from scb.agents.spec import AgentSpec, environment_agent
 from scb.environments.registry import environment_spec
 from scb.errors import UserError, one_of
 from scb.files import make_folder, plain
+from scb.locks import held
 from scb.measurement import MODE, SAMPLED, Place, as_random, check_seeds, measure
 from scb.rows import Rows, pivot
-from scb.runs import held
 from scb.statistics import Estimate, estimate, few_agents, paired_difference
 
 if TYPE_CHECKING:

@@ -5,7 +5,6 @@ al., 2022); here genetic programming does the reading (gplearn, the extra `disti
 sets the numbers, and what comes out is a `lpo.drifts.ClosedFormDrift`.
 """
 
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
@@ -32,6 +31,7 @@ from lpo.formula_search import (
 )
 from scb.errors import UserError
 from scb.keys import root_key
+from scb.stopwatch import Stopwatch
 
 if TYPE_CHECKING:
     from lpo.objectives import Objective
@@ -75,7 +75,7 @@ def distill(objective: "Objective", config: DistillConfig | None = None) -> Dist
     Raises:
       UserError: gplearn is not installed, or the drift charges nothing anywhere.
     """
-    start = time.perf_counter()
+    watch = Stopwatch()
     config = config or DistillConfig()
     drift = objective.drift
     nothing = ClosedFormDrift("0*d")
@@ -104,7 +104,7 @@ def distill(objective: "Objective", config: DistillConfig | None = None) -> Dist
         r2=fit_quality(objective, closed, parameters, held_out),
         base_r2=fit_quality(objective, nothing, nothing.init(root_key(0)), held_out),
         front=[{"size": size, "r2": score, "expression": text} for text, score, size in front],
-        seconds=time.perf_counter() - start,
+        seconds=watch.lap(),
     )
 
 

@@ -34,8 +34,9 @@ from scb.evolution import EnvironmentSteps
 from scb.files import write_json
 from scb.machine import machine_description, package_versions
 from scb.rows import Rows
-from scb.runs import Run, Stopwatch
+from scb.runs import Run
 from scb.seeds import reporting
+from scb.stopwatch import Stopwatch
 
 
 @dataclass(frozen=True)

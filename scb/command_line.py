@@ -19,9 +19,10 @@ from tyro.constructors import PrimitiveConstructorSpec
 from scb import processes
 from scb.configurations import config_dict
 from scb.errors import UserError, flag_name, one_of
+from scb.locks import released
 from scb.machine import package_versions
 from scb.rows import Rows
-from scb.runs import Run, read_config, released
+from scb.runs import Run, read_config
 
 T = TypeVar("T")
 GENERATIONS = ("evolution.num_generations",)

@@ -24,9 +24,10 @@ from scb.files import plain
 from scb.keys import key_at, root_key, split_key
 from scb.machine import machine_description
 from scb.population import combine_tasks, map_population, rank_failed_last
-from scb.runs import Run, Stopwatch
+from scb.runs import Run
 from scb.seeds import VALIDATING, searching
 from scb.statistics import iqm
+from scb.stopwatch import Stopwatch
 from scb.strategies import (
     DISTRIBUTIONS,
     GRADIENT_ESTIMATING,

@@ -31,8 +31,8 @@ from scb.evaluation import Episodes, Policy, evaluate
 from scb.experts import EPISODES, Expert, judged
 from scb.keys import key_at, named_key, split_key
 from scb.population import map_population
-from scb.runs import Stopwatch
 from scb.spaces import action_size, clip_to_space, flat_size, scale_to_space
+from scb.stopwatch import Stopwatch
 
 START_GENERATIONS = 20  # after which one of several searches goes on
 

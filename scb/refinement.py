@@ -29,7 +29,7 @@ from scb.keys import key_at, split_key
 from scb.linear_expert import noisy
 from scb.measurement import Place
 from scb.population import map_population
-from scb.runs import Stopwatch
+from scb.stopwatch import Stopwatch
 
 DIRECTIONS = 32  # perturbations of a generation, each tried both ways for one episode
 SIGMA = 0.1  # of the perturbations, in the weights' units

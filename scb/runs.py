@@ -10,31 +10,24 @@ runs/NAME/.lock             held by the process that writes here
 
 import contextlib
 import json
-import os
 import secrets
 import socket
 import time
 from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
-from typing import IO, Any
-
-try:
-    import fcntl
-except ImportError:  # Windows has none, and there nobody is kept out of a run
-    fcntl = None  # type: ignore[assignment]
+from typing import Any
 
 from tensorboardX.proto.event_pb2 import Event, SessionLog
 from tensorboardX.record_writer import RecordWriter
 from tensorboardX.summary import scalar
 
-from scb import termination
 from scb.configurations import as_if_shorter, config_dict, first_difference, with_defaults
 from scb.errors import UserError, needed_for, of_class
-from scb.files import as_json, cannot_write, make_folder, plain, refusing, write_json, write_text
+from scb.files import as_json, cannot_write, make_folder, plain, write_json, write_text
+from scb.locks import lock, release
 from scb.machine import machine_description
 
 _LOCK = ".lock"
-_held: dict[Path, IO[str]] = {}  # open as long as the process holds them
 
 
 class Run:
@@ -99,7 +92,7 @@ class Run:
                     "started with, or start a new folder."
                 )
             make_folder(folder, "--resume")
-            _lock(folder / _LOCK, folder)
+            lock(folder / _LOCK, folder)
             if stored != asked:
                 write_json(folder / "config.json", config)
             return cls(folder, resumed=True, wandb_project=wandb_project)
@@ -110,7 +103,7 @@ class Run:
                 f"{folder} already exists and is not empty: choose another --out, or continue it with --resume."
             )
         make_folder(folder)
-        _lock(folder / _LOCK, folder)
+        lock(folder / _LOCK, folder)
         try:
             write_json(folder / "config.json", config)
         except OSError as error:
@@ -186,7 +179,7 @@ class Run:
     def close(self) -> None:
         """Ends the log, and lets go of the folder."""
         self.end_log()
-        _release(self.folder / _LOCK)
+        release(self.folder / _LOCK)
 
 
 def log_lines(path: Path, *needed: str) -> list[dict[str, Any]]:
@@ -242,79 +235,6 @@ def _has_room(folder: Path) -> bool:
         return False
 
 
-@contextlib.contextmanager
-def released() -> Iterator[None]:
-    """Lets go afterwards of the run folders that were opened within it, and not closed."""
-    before = {*_held}
-    try:
-        yield
-    finally:
-        for path in {*_held} - before:
-            _release(path)
-
-
-@contextlib.contextmanager
-def held(path: Path) -> Iterator[None]:
-    """Within it a file is this process's; a UserError where it is another's. A lock stands beside it meanwhile."""
-    lock = path.with_name(f".{path.name}{_LOCK}")
-    if not _lock(lock, path):  # whoever called this holds it
-        yield
-        return
-
-    def remove() -> str:
-        lock.unlink(missing_ok=True)
-        return ""
-
-    try:
-        with termination.saving(remove):
-            yield
-    finally:
-        remove()
-        _release(lock)
-
-
-def _release(path: Path) -> None:
-    if file := _held.pop(path.resolve(), None):
-        file.close()
-
-
-def _lock(path: Path, of: Path) -> bool:
-    """Holds a lock for this process; the system lets go of it, however the process ends.
-
-    Args:
-      of: what it is of, for the message.
-
-    Returns:
-      Whether this took it: False where the process held it already, or where there are no locks.
-    """
-    if fcntl is None or path.resolve() in _held:
-        return False
-    with refusing(path.parent):
-        file = path.open("a+")
-    try:
-        fcntl.lockf(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        # Whoever held it may have removed it after it was opened here; then a third one makes another.
-        if not (path.exists() and os.path.samestat(os.fstat(file.fileno()), path.stat())):
-            raise BlockingIOError
-    except (BlockingIOError, PermissionError) as error:
-        file.seek(0)
-        holder = file.read().strip() or "which has just begun"
-        file.close()
-        raise UserError(
-            f"{of} is in use by another command ({holder}): wait until that has ended, or name another folder or file."
-        ) from error
-    except OSError:
-        pass  # a file system without locks
-    try:
-        file.truncate(0)
-        file.write(f"process {os.getpid()} on {socket.gethostname()}\n")
-        file.flush()
-    except OSError as error:  # the disk is full
-        raise cannot_write(path.parent, reason=error.strerror) from error
-    _held[path.resolve()] = file
-    return True
-
-
 def read_config(folder: str | Path) -> dict[str, Any]:
     """The config that a run was started with; a UserError if the folder isn't a run."""
     path = Path(folder) / "config.json"
@@ -362,18 +282,6 @@ def run_of(
         yield run
     finally:
         run.close()
-
-
-class Stopwatch:
-    """Seconds since it was last read."""
-
-    def __init__(self) -> None:
-        self._last = time.perf_counter()
-
-    def lap(self) -> float:
-        now = time.perf_counter()
-        seconds, self._last = now - self._last, now
-        return seconds
 
 
 def _wandb() -> Any:

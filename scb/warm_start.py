@@ -35,8 +35,8 @@ from scb.fitting import fit_bandit
 from scb.keys import named_key, split_key
 from scb.linear_expert import LinearSearchConfig, Worth, search_linear_expert
 from scb.measurement import Place
-from scb.runs import Stopwatch
 from scb.spaces import kind_of_actions
+from scb.stopwatch import Stopwatch
 
 PUPILS_EPISODES = 3  # by which each of an expert's pupils is judged
 

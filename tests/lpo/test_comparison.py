@@ -311,7 +311,7 @@ def test_a_file_of_rows_is_one_process_es(tmp_path, tiny_agent):
     once = file.read_text()
     assert [path.name for path in sorted(file.parent.iterdir())] == ["rows.json", "rows.jsonl"]
     program = (
-        "import sys, time; from pathlib import Path; from scb.runs import held\n"
+        "import sys, time; from pathlib import Path; from scb.locks import held\n"
         "with held(Path(sys.argv[1])): print('held', flush=True); time.sleep(60)"
     )
     other = subprocess.Popen(

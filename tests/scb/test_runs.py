@@ -17,8 +17,10 @@ from scb.checkpoints import Checkpoints
 from scb.configurations import config_dict, first_difference
 from scb.errors import UserError
 from scb.files import write_json, write_text
+from scb.locks import held, released
 from scb.machine import machine_description
-from scb.runs import Run, Stopwatch, held, read_config, released, run_of
+from scb.runs import Run, read_config, run_of
+from scb.stopwatch import Stopwatch
 from tests.locking import is_locked
 
 CONFIG = {"seed": 0, "evolution": {"sigma": 0.05, "strategy": "SNES"}, "hidden_sizes": (8, 8)}
@@ -519,7 +521,7 @@ def test_json_is_replaced_whole(tmp_path):
 
 def test_a_stopwatch_counts_from_its_last_reading(monkeypatch):
     readings = iter([10.0, 12.5, 13.0])
-    monkeypatch.setattr("scb.runs.time.perf_counter", lambda: next(readings))
+    monkeypatch.setattr("scb.stopwatch.time.perf_counter", lambda: next(readings))
     watch = Stopwatch()
     assert (watch.lap(), watch.lap()) == (2.5, 0.5)
 
