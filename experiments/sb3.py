@@ -149,8 +149,7 @@ def _checksum(options: Options) -> str | None:
     if options.bandit is None:
         return None
     (name,) = options.environments
-    place = Place.named(name)
-    check_fits(load_bandit(str(options.bandit)), place.env, place.params, name)
+    check_fits(load_bandit(str(options.bandit)), Place.named(name))
     return str(bandit_metadata(str(options.bandit))["sha256"])
 
 

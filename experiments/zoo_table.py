@@ -156,9 +156,8 @@ def measure_bandits(
         if candidate.environment != environment:
             environment, bandits = candidate.environment, {}
             judge_in = Place.named(environment, backend)
-        env, env_params = judge_in.env, judge_in.params
-        check_fits(candidate.bandit, env, env_params, environment)
-        for algorithm in algorithms_for(env.action_space(env_params)):
+        check_fits(candidate.bandit, judge_in)
+        for algorithm in algorithms_for(judge_in.env.action_space(judge_in.params)):
             spec = bandit_agent(algorithm, environment)
             row: dict[str, Any] = {
                 "environment": environment,

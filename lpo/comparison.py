@@ -22,7 +22,7 @@ from scb.environments.registry import environment_spec
 from scb.errors import UserError, one_of
 from scb.files import make_folder, plain
 from scb.locks import held
-from scb.measurement import MODE, SAMPLED, Place, as_random, check_seeds, measure
+from scb.measurement import EARNED, MODE, SAMPLED, Place, as_random, check_seeds, measure
 from scb.rows import Rows, pivot
 from scb.statistics import Estimate, estimate, few_agents, paired_difference
 
@@ -306,7 +306,7 @@ def compare(
         )
     steps = np.asarray(list(dict.fromkeys(row["step"] for row in found)))
     other = changed(spec, environment)
-    columns = ("return", "length", "speed", *(DIAGNOSIS if diagnose else ()))
+    columns = (*EARNED, *(DIAGNOSIS if diagnose else ()))
     measured = {value: pivot(found, "objective", "seed", "step", value=value) for value in columns}
     measured["return"], failed = as_random(measured["return"], place)
     return Comparison(

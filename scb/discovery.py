@@ -148,7 +148,7 @@ class BanditDiscovery:
 
     def _weights_of(self, name: str) -> Weights:
         start = load_bandit(name)
-        check_fits(start, self.place.env, self.place.params, self.config.environment)
+        check_fits(start, self.place)
         networks = () if start.linear else ("hidden_size", "activation", "latent_size")
         for what in ("form", "latent", *networks):
             has, wanted = (

@@ -4,7 +4,6 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from gymnax.environments import environment
 
 from scb.agents.spec import AgentSpec, algorithms_for, bandit_agent
 from scb.console import console, progress_console
@@ -22,17 +21,12 @@ from scb.statistics import estimate
 EPISODES, BRAX_EPISODES = 50, 5  # of each agent that judges a bandit; Brax's physics are slow
 
 
-def check_fits(
-    bandit: SyntheticBandit | SyntheticMDP,
-    env: environment.Environment[Any, Any],
-    env_params: Any,
-    environment_name: str,
-) -> None:
+def check_fits(bandit: SyntheticBandit | SyntheticMDP, place: Place) -> None:
     """Raises a UserError where a bandit has other observation or action shapes than an environment."""
-    ours, theirs = shapes(bandit, None), shapes(env, env_params)
+    ours, theirs = shapes(bandit, None), shapes(place.env, place.params)
     if ours != theirs:
         raise UserError(
-            f"bandit {bandit.name} has {ours}, {environment_name} has {theirs}: take the bandit of that environment."
+            f"bandit {bandit.name} has {ours}, {place.name} has {theirs}: take the bandit of that environment."
         )
 
 
@@ -51,7 +45,7 @@ def evaluation_place(
     if backend is None and environment in (None, config.get("evaluation_environment")):
         backend = config.get("backend")
     place = Place.named(target, backend)
-    check_fits(bandit, place.env, place.params, target)
+    check_fits(bandit, place)
     return place
 
 

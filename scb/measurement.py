@@ -32,6 +32,8 @@ from scb.population import map_population
 from scb.rows import Row, Rows
 
 MODE, SAMPLED = "mode", "sampled"
+# What is measured of an agent's episodes, as columns of its rows.
+EARNED = ("return", "length", "speed")
 _DIAGNOSIS = "diagnosis"  # a judge's name, beside the kinds of actions
 # Steps of a training from which a CPU trains only as many agents at a time as it has devices.
 LONG = 250_000
@@ -333,6 +335,7 @@ def measure(
                 agent, params, judge_in.env, episodes, tuple(actions), diagnose, every, size
             )
             earned, diagnosis = program(hyperparameters, agents.keys[which], *arrays)
+            found = {x: dict(zip(EARNED, earned[x], strict=True)) | diagnosis for x in actions}
             for name, i in lacking:
                 position = batch.index((name, i))
                 # An objective takes the place of a drawn clip.
@@ -344,12 +347,9 @@ def measure(
                         {
                             "step": step,
                             "actions": kind,
-                            "return": plain(np.ravel(earned[kind][0][position])[point]),
-                            "length": plain(np.ravel(earned[kind][1][position])[point]),
-                            "speed": plain(np.ravel(earned[kind][2][position])[point]),
                             **{
-                                name: plain(np.ravel(values[position])[point])
-                                for name, values in diagnosis.items()
+                                what: plain(np.ravel(values[position])[point])
+                                for what, values in found[kind].items()
                             },
                             **drawn,
                         }

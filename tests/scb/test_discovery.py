@@ -169,7 +169,7 @@ def test_a_discovered_bandit_is_saved_and_loaded(discovered, tmp_path):
     path = save_bandit(tmp_path / "Synthetic-CartPole-v1", problem.bandit, outcome.mean)
     bandit = load_bandit(path)
     np.testing.assert_array_equal(flat(bandit.default_params.weights), flat(outcome.mean))
-    check_fits(bandit, problem.place.env, problem.place.params, "CartPole-v1")
+    check_fits(bandit, problem.place)
 
 
 @pytest.mark.parametrize("select", ["final", "best"])
@@ -540,7 +540,7 @@ def test_a_synthetic_mdp_is_discovered_and_opens_as_an_environment(parameterizat
     assert env.config.parameterization == parameterization
     assert env_params.max_steps_in_episode == 5
     np.testing.assert_array_equal(flat(env_params.weights), flat(outcome.mean))
-    check_fits(env, problem.place.env, problem.place.params, "CartPole-v1")
+    check_fits(env, problem.place)
 
 
 def test_a_synthetic_mdp_lasts_as_long_as_the_environment_where_nothing_is_said():
@@ -673,14 +673,14 @@ def test_a_start_of_another_form_is_refused_at_once(tmp_path, environment, other
 
 def test_a_bandit_fits_the_environments_of_its_shapes_only():
     cartpole = bandit_for(*make("CartPole-v1"), BanditConfig(), "a")
-    check_fits(cartpole, *make("CartPole-v1"), "CartPole-v1")
+    check_fits(cartpole, Place.named("CartPole-v1"))
     for other in ("Pendulum-v1", "Acrobot-v1", "MountainCar-v0"):
         with pytest.raises(UserError, match=f"bandit a has 4 observations .*, {other} has "):
-            check_fits(cartpole, *make(other), other)
+            check_fits(cartpole, Place.named(other))
     # Two numbers seen and three pushed: discrete or not, the number alone doesn't make it fit.
     box = SyntheticBandit(2, spaces.Box(-1.0, 1.0, (3,), jnp.float32), name="b")
     with pytest.raises(UserError, match="2 observations and 3 action dimensions, MountainCar-v0"):
-        check_fits(box, *make("MountainCar-v0"), "MountainCar-v0")
+        check_fits(box, Place.named("MountainCar-v0"))
 
 
 # -- configuration

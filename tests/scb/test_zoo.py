@@ -10,7 +10,6 @@ from gymnax.environments import spaces
 
 import scb
 from scb import artefacts
-from scb.environments.registry import make
 from scb.environments.synthetic import BanditConfig, BanditParams, SyntheticBandit
 from scb.environments.zoo import (
     PREFIX,
@@ -21,6 +20,7 @@ from scb.environments.zoo import (
 )
 from scb.errors import UserError
 from scb.judgement import check_fits
+from scb.measurement import Place
 from tests.scb.probes import context_bandit
 
 CONFIG = BanditConfig(hidden_size=4, activation="relu", latent="softmax_categorical", latent_size=2)
@@ -204,7 +204,7 @@ def test_every_bandit_of_the_zoo_is_a_gymnax_environment_for_its_namesake():
         env, params = gymnax.make(name)
         assert env.name == name
         target = name.removeprefix(PREFIX)
-        check_fits(env, *make(target), target)
+        check_fits(env, Place.named(target))
         key_reset, key_action, key_step = jax.random.split(jax.random.key(0), 3)
         observation, state = env.reset(key_reset, params)
         assert env.observation_space(params).contains(observation)
