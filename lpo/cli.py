@@ -8,14 +8,14 @@ from scb.cli import run_program
 
 
 def _commands() -> dict[str, Any]:
-    from lpo import commands, listing, pipeline, showing, training_commands
+    from lpo import align_command, commands, listing, pipeline, showing, training_commands
 
     return {
         "run": pipeline.RunAll,
         "meta-train": commands.MetaTrain,
         "train": training_commands.Train,
         "evaluate": training_commands.Evaluate,
-        "align": training_commands.Align,
+        "align": align_command.Align,
         "certify": commands.certify_command,
         "distill": commands.distill_command,
         "list": listing.list_command,

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from lpo import cli, training_commands
+from lpo import align_command, cli, training_commands
 from lpo.comparison import Comparison, LearningCurves
 from lpo.fitness import LABELS
 from scb.agents.ppo import PPOHyperparameters
@@ -116,8 +116,8 @@ def test_a_resumed_evaluation_keeps_its_settings(
 def test_a_refused_resume_leaves_the_folder_as_it_was(
     trained, working_folder, refused, monkeypatch, capsys, command, objectives, number
 ):
-    monkeypatch.setattr(training_commands, "measure_alignment", lambda *_, **__: {"regimes": []})
-    monkeypatch.setattr(training_commands.figures, "alignment_heatmap", lambda _: Figure())
+    monkeypatch.setattr(align_command, "measure_alignment", lambda *_, **__: {"regimes": []})
+    monkeypatch.setattr(align_command.figures, "alignment_heatmap", lambda _: Figure())
     for share in ("0.5", "0.25"):
         (working_folder / share).mkdir()
         text = f"def share(ratio, advantage):\n    return {share} * ratio * advantage\n"
@@ -132,9 +132,11 @@ def test_a_refused_resume_leaves_the_folder_as_it_was(
     assert "cannot resume o: shares:share is not what it was when the run was started" in message
 
 
-@pytest.mark.parametrize("command", ["Train", "Evaluate", "Align"])
+@pytest.mark.parametrize(
+    "command", [training_commands.Train, training_commands.Evaluate, align_command.Align]
+)
 def test_seeds_that_train_agents_are_those_that_search_where_no_others_are_named(command):
-    config = getattr(training_commands, command).parse([]).config
+    config = command.parse([]).config
     assert set(config.seed_list()) <= set(SEARCHING)
 
 
@@ -232,7 +234,7 @@ def test_align_measures_every_combination_and_stores_it(monkeypatch, working_fol
         told.append((len(known), rows.path.name))
         return report
 
-    monkeypatch.setattr(training_commands, "measure_alignment", measure)
+    monkeypatch.setattr(align_command, "measure_alignment", measure)
     flags = ["--objectives", "lpo-pendulum", "--agents=2", "--out=aligned"]
     flags += ["--policy-output-scale=0.01"]
     assert cli.main(["align", "--reward-noise", "0", "5", "--contexts", "50", "200", *flags]) == 0
