@@ -259,7 +259,7 @@ def evolve(
       The Outcome.
     """
     key = root_key(config.seed) if key is None else key
-    key_solution, key_strategy, key_generations, key_mean = split_key(key, 4)
+    key_solution, *keys = split_key(key, 4)
     solution = problem.initial_solution(key_solution)
     evaluate_mean = map_population(problem.evaluate_mean, config.mean_evaluations, (None, 0))
 
@@ -272,28 +272,15 @@ def evolve(
     if not config.num_generations:
         start = jax.device_get(solution)
         return Outcome(start, start, 0, [], 0.0, EnvironmentSteps(0, 0), validate)
-    strategy = strategy_for(config, solution)
-    state = {
-        "strategy": strategy.start(
-            key_strategy, solution, problem.units(solution) if isinstance(problem, Scaled) else None
-        ),
-        "best_mean": solution,
-        "best_mean_fitness": jnp.float32(-jnp.inf),
-        "best_mean_generation": jnp.int32(-1),
-    }
-    if config.averaging > 1:
-        state |= {"average": solution, "averaged": jnp.int32(0)}
-
-    def search_mean() -> Any:
-        return state["average"] if config.averaging > 1 else strategy.mean(state["strategy"])
-
+    search = _Search(problem, config, solution, judged, keys)
     console = progress_console(quiet)
-    checkpoints, first, state = continued(run.folder if run else None, state, console)
+    checkpoints, first, search.state = continued(run.folder if run else None, search.state, console)
     if run and checkpoints:
         run.rewind(first)
+    search.steps = evaluated(problem, config, first)
     saved = first
     # What is complete at any moment: steps into the next generation are not part of it.
-    latest = first, dict(state)
+    latest = first, dict(search.state)
 
     def save() -> str:
         """Writes a checkpoint after the latest generation, unless it is there."""
@@ -306,17 +293,87 @@ def evolve(
                 saved = generation
         return f"{run.folder} is saved after {generation} generations"
 
-    evaluate = map_population(problem.evaluate, config.population_size, (0, None, None))
-    steps = evaluated(problem, config, first)
     # Of several processes the first alone keeps the log.
     history, total_seconds = (run.metrics(), run.seconds()) if run and checkpoints else ([], 0.0)
     watch = Stopwatch()
+    with (
+        termination.saving(save) if checkpoints else nullcontext(),
+        Progress(console, config.num_generations, first) as advance,
+    ):
+        for generation in range(first, config.num_generations):
+            metrics = search.step(generation)
+            last = generation + 1 == config.num_generations
+            if last:
+                metrics |= {f"final_{k}": v for k, v in search.judge(generation + 1).items()}
+            seconds = watch.lap()
+            total_seconds += seconds
+            if run and checkpoints:
+                run.log(generation, metrics, seconds)
+            history.append({"generation": generation, **{k: plain(v) for k, v in metrics.items()}})
+            latest = generation + 1, dict(search.state)
+            if checkpoints and (last or (generation + 1) % config.checkpoint_every == 0):
+                save()
+            advance(metrics, seconds)
+    if checkpoints:
+        checkpoints.close()
+    return Outcome(
+        mean=jax.device_get(search.mean()),
+        best_mean=jax.device_get(search.state["best_mean"]),
+        best_mean_generation=int(search.state["best_mean_generation"]),
+        metrics=history,
+        seconds=total_seconds,
+        steps=search.steps,
+        validate=validate,
+    )
 
-    def judge_mean(generation: int) -> dict[str, float]:
-        mean = search_mean()
+
+class _Search:
+    """What generations do to a search.
+
+    Args:
+      judged: (solution, key) -> what agents earn with it, by name.
+      keys: of the strategy's start, of the generations and of the mean's judgements.
+
+    Attributes:
+      state: all of it that a checkpoint holds.
+      steps: in environments, of all generations so far.
+    """
+
+    def __init__(
+        self,
+        problem: Problem,
+        config: EvolutionConfig,
+        solution: Any,
+        judged: Callable[[Any, jax.Array], dict[str, np.ndarray]],
+        keys: Sequence[jax.Array],
+    ) -> None:
+        key_strategy, self._key_generations, self._key_mean = keys
+        self._problem, self._config, self._judged = problem, config, judged
+        self._strategy = strategy_for(config, solution)
+        self._evaluate = map_population(problem.evaluate, config.population_size, (0, None, None))
+        units = problem.units(solution) if isinstance(problem, Scaled) else None
+        self.steps = EnvironmentSteps(0, 0)
+        self.state: dict[str, Any] = {
+            "strategy": self._strategy.start(key_strategy, solution, units),
+            "best_mean": solution,
+            "best_mean_fitness": jnp.float32(-jnp.inf),
+            "best_mean_generation": jnp.int32(-1),
+        }
+        if config.averaging > 1:
+            self.state |= {"average": solution, "averaged": jnp.int32(0)}
+
+    def mean(self) -> Any:
+        """The search distribution's, or its average over the last generations."""
+        if self._config.averaging > 1:
+            return self.state["average"]
+        return self._strategy.mean(self.state["strategy"])
+
+    def judge(self, generation: int) -> dict[str, float]:
+        """What the mean is worth, for the log; kept where it is the best so far."""
+        mean = self.mean()
         # The same seeds at every judgement: means of different generations are then compared in
         # pairs.
-        returns = judged(mean, key_mean)
+        returns = self._judged(mean, self._key_mean)
         outcome = {name: float(np.mean(v)) for name, v in returns.items()}
         # The interquartile mean too: of agents with random hyperparameters a few fail far below the rest, and
         # those that diverged count as below the worst of the others.
@@ -329,85 +386,60 @@ def evolve(
         # Where those that diverged are more than the quarter that it drops, it is no measure beside others.
         if np.sum(~np.isfinite(returns["fitness"])) > returns["fitness"].size // 4:
             score = -np.inf
-        if score > float(state["best_mean_fitness"]):
-            state["best_mean"] = mean
-            state["best_mean_fitness"] = jnp.float32(score)
-            state["best_mean_generation"] = jnp.int32(generation)
+        if score > float(self.state["best_mean_fitness"]):
+            self.state["best_mean"] = mean
+            self.state["best_mean_fitness"] = jnp.float32(score)
+            self.state["best_mean_generation"] = jnp.int32(generation)
         return {f"mean/{name}": value for name, value in {**outcome, **middles}.items()}
 
-    with (
-        termination.saving(save) if checkpoints else nullcontext(),
-        Progress(console, config.num_generations, first) as advance,
-    ):
-        for generation in range(first, config.num_generations):
-            key_ask, key_evaluate, key_tell = split_key(key_at(key_generations, generation), 3)
-            metrics: dict[str, Any] = {}
-            if generation % config.evaluate_mean_every == 0 and (
-                strategy.has_mean or generation > 0
-            ):
-                metrics |= judge_mean(generation)
-            population, state["strategy"] = strategy.ask(key_ask, state["strategy"])
-            # One key for all: candidates are compared on the same seeds, hyperparameters and start
-            # states.
-            results = evaluate(population, key_evaluate, jnp.int32(generation))
-            tasks = np.asarray(results.pop("fitness"), np.float32).reshape(
-                config.population_size, -1
-            )
-            fitness = tasks.mean(axis=1)
-            # What failed has no fitness: it is counted, and the log's numbers are of the others.
-            finite = fitness[np.isfinite(fitness)]
-            if finite.size:
-                told = rank_failed_last(combine_tasks(tasks, config.combine))
-                state["strategy"] = strategy.tell(key_tell, population, told, state["strategy"])
-                if config.averaging > 1:
-                    # Of fewer generations at first, all alike, but those that failed.
-                    state["averaged"] = state["averaged"] + 1
-                    share = 1 / min(int(state["averaged"]), config.averaging)
-                    mean = strategy.mean(state["strategy"])
-                    state["average"] = jax.tree.map(
-                        lambda old, new, share=share: old + share * (new - old),
-                        state["average"],
-                        mean,
-                    )
-                metrics |= {
-                    "fitness/mean": finite.mean(),
-                    "fitness/std": finite.std(),
-                    "fitness/max": finite.max(),
-                    "fitness/min": finite.min(),
-                }
-            steps += problem.steps(generation) * config.population_size
+    def step(self, generation: int) -> dict[str, Any]:
+        """Asks for candidates, evaluates them, and tells what they are worth; returns what is logged of it."""
+        config, state = self._config, self.state
+        key_ask, key_evaluate, key_tell = split_key(key_at(self._key_generations, generation), 3)
+        metrics: dict[str, Any] = {}
+        due = generation % config.evaluate_mean_every == 0
+        if due and (self._strategy.has_mean or generation > 0):
+            metrics |= self.judge(generation)
+        population, state["strategy"] = self._strategy.ask(key_ask, state["strategy"])
+        # One key for all: candidates are compared on the same seeds, hyperparameters and start
+        # states.
+        results = self._evaluate(population, key_evaluate, jnp.int32(generation))
+        tasks = np.asarray(results.pop("fitness"), np.float32).reshape(config.population_size, -1)
+        fitness = tasks.mean(axis=1)
+        # What failed has no fitness: it is counted, and the log's numbers are of the others.
+        finite = fitness[np.isfinite(fitness)]
+        if finite.size:
+            told = rank_failed_last(combine_tasks(tasks, config.combine))
+            state["strategy"] = self._strategy.tell(key_tell, population, told, state["strategy"])
+            self._average()
             metrics |= {
-                "failed": config.population_size - finite.size,
-                "steps/training": steps.training,
-                "steps/evaluation": steps.evaluation,
-                "steps/total": steps.total,
-                # What has no number in this generation (an algorithm whose turn it wasn't) is left out.
-                **{
-                    f"candidates/{name}": np.nanmean(value)
-                    for name, value in results.items()
-                    if not np.all(np.isnan(value))
-                },
+                "fitness/mean": finite.mean(),
+                "fitness/std": finite.std(),
+                "fitness/max": finite.max(),
+                "fitness/min": finite.min(),
             }
-            last = generation + 1 == config.num_generations
-            if last:
-                metrics |= {f"final_{k}": v for k, v in judge_mean(generation + 1).items()}
-            seconds = watch.lap()
-            total_seconds += seconds
-            if run and checkpoints:
-                run.log(generation, metrics, seconds)
-            history.append({"generation": generation, **{k: plain(v) for k, v in metrics.items()}})
-            latest = generation + 1, dict(state)
-            if checkpoints and (last or (generation + 1) % config.checkpoint_every == 0):
-                save()
-            advance(metrics, seconds)
-    if checkpoints:
-        checkpoints.close()
-    return Outcome(
-        mean=jax.device_get(search_mean()),
-        best_mean=jax.device_get(state["best_mean"]),
-        best_mean_generation=int(state["best_mean_generation"]),
-        metrics=history,
-        seconds=total_seconds,
-        steps=steps,
-        validate=validate,
-    )
+        self.steps += self._problem.steps(generation) * config.population_size
+        return metrics | {
+            "failed": config.population_size - finite.size,
+            "steps/training": self.steps.training,
+            "steps/evaluation": self.steps.evaluation,
+            "steps/total": self.steps.total,
+            # What has no number in this generation (an algorithm whose turn it wasn't) is left out.
+            **{
+                f"candidates/{name}": np.nanmean(value)
+                for name, value in results.items()
+                if not np.all(np.isnan(value))
+            },
+        }
+
+    def _average(self) -> None:
+        if self._config.averaging <= 1:
+            return
+        # Of fewer generations at first, all alike, but those that failed.
+        self.state["averaged"] = self.state["averaged"] + 1
+        share = 1 / min(int(self.state["averaged"]), self._config.averaging)
+        self.state["average"] = jax.tree.map(
+            lambda old, new: old + share * (new - old),
+            self.state["average"],
+            self._strategy.mean(self.state["strategy"]),
+        )
