@@ -321,7 +321,8 @@ def _final(axes: Axes, position: int, curve: "LearningCurves", look: Look) -> No
 def _place(curve: "LearningCurves") -> str:
     physics = "" if curve.backend is None else f" ({curve.backend} physics)"
     words = {"policy_output_scale": "policy's last layer x"}
-    values = "".join(f", {words.get(k, k)} {value}" for k, value in curve.hyperparameters.items())
+    named = {words.get(k, k): value for k, value in curve.hyperparameters.items()}
+    values = "".join(f", {k}" if x is True else f", {k} {x}" for k, x in named.items())
     return f"{curve.environment}{physics}{values}"
 
 
