@@ -157,6 +157,15 @@ CONFIRMATIONS = (
         suggested="the same twelve, +57 [\u2212201, 377]",
         reference_in="hopper at 0.001, annealed",
     ),
+    Confirmation(
+        "hopper at 0.001, annealed",
+        "ta-lpo",
+        reporting(60),
+        "area",
+        "dpo",
+        known="ta-lpo",
+        suggested="60 beside the clip, +169 [104, 232]",
+    ),
 )
 
 
