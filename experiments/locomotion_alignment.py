@@ -218,7 +218,7 @@ def ranked_elsewhere(report: Report) -> dict[str, dict[str, dict[str, Alignment]
 def reporting_there(report: Report, environment: str) -> dict[str, LearningCurves]:
     """{objective: its agents that report in an environment} of those that were trained in all others as well."""
     whole = full_size(environment)
-    curves = {} if whole is None else whole.by_name
+    curves = {} if whole is None else {curve.objective: curve for curve in whole.curves}
     known = ranked(environment, report["environments"][environment])
     return _everywhere(report, {name: curve for name, curve in curves.items() if name in known})
 

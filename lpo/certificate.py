@@ -122,6 +122,10 @@ def certify(
                 f"something of the class {type(drift).__name__} is no drift: give one with its parameters, or what "
                 "lpo.load_objective returns."
             )
+        if parameters is not None:
+            raise UserError(
+                "an objective comes with its own parameters: leave them out, or give its drift with others."
+            )
         return certify(drift.drift, drift.parameters, num_ratios, num_advantages)
     parameters = drift.init(root_key(0)) if parameters is None else parameters
     advice = "it takes those of its own family, as objective.drift takes objective.parameters"

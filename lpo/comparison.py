@@ -339,8 +339,8 @@ def _kept(rows: str | Path | Rows | None) -> Iterator[Rows | None]:
         return
     if not isinstance(rows, str | Path):
         raise UserError(f"rows are {rows!r}: give the path of a .jsonl file, or None.")
-    file = Path(rows)
-    if not file.exists():
+    file = Path(rows).expanduser()
+    if not file.is_file():
         Rows(file)  # refuses a name before a folder is made
     elif not os.access(file.parent, os.W_OK):
         yield Rows(file)  # to read what is complete

@@ -202,6 +202,8 @@ def _evaluate(
                 "this drift depends on the fraction of training done: give progress, a number in [0, 1]."
             )
         progress = 0.0
+    if isinstance(progress, jax.Array) and xp is not jnp:
+        progress = np.asarray(progress)  # a tensor cannot be made of JAX's
     # A tensor's or a traced array's values are not looked at: that would wait for a device.
     inside = True
     # A number apart, for torch.compile cannot follow a branch on an array.

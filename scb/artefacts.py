@@ -113,7 +113,7 @@ def named(name: str | Path, folder: Path, what: str, others: Sequence[str] = ())
     Raises:
       UserError: neither, with near matches, or with the folder's files where it is a folder.
     """
-    text, names = str(name), names_in(folder)
+    text, names = os.path.expanduser(name), names_in(folder)
     if text in names:
         return folder / f"{text}.npz"
     if is_file(text):
@@ -301,7 +301,7 @@ def unflatten(path: Path, flat: Mapping[str, np.ndarray]) -> ArrayTree:
 
 
 def _paths(path: str | Path) -> tuple[Path, Path]:
-    path = Path(path)
+    path = Path(path).expanduser()
     # Not with_suffix: it would take the ".5" of "hopper-0.5" for a suffix.
     name = path.name.removesuffix(".npz").removesuffix(".json")
     if not name:

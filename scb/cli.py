@@ -60,7 +60,8 @@ def run_program(
     configure_jax()
     from scb.command_line import LongRun, call
 
-    given, known = sys.argv[1:] if arguments is None else arguments, commands()
+    words, known = sys.argv[1:] if arguments is None else arguments, commands()
+    given = [_at_home(word) for word in words]
     command = known.get(given[0]) if given else None
     again = ""
     if isinstance(command, type) and issubclass(command, LongRun):
@@ -71,6 +72,12 @@ def run_program(
     if arguments is None:
         processes.end(status)
     return status
+
+
+def _at_home(word: str) -> str:
+    # Shells expand --out ~/runs, and leave --out=~/runs as it is.
+    flag, equals, value = word.partition("=")
+    return f"{flag}={os.path.expanduser(value)}" if equals and flag.startswith("--") else word
 
 
 def exit_code(program: str, act: Callable[[], int | None], again: str = "") -> int:

@@ -30,7 +30,7 @@ def at_least(minimum: int, of: object = None, *names: str, **values: float | Non
 
 
 def counted(name: str, value: Any) -> int:
-    """The whole number that a value is; a UserError where it is none."""
+    """The whole number that a value is, Python's for NumPy's; a UserError where it is none."""
     if not isinstance(value, int | np.integer) or isinstance(value, bool):
         raise UserError(f"{name} is {value!r}: it must be a whole number.")
     return int(value)

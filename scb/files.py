@@ -67,7 +67,13 @@ def strict_json(text: str | bytes) -> Any:
 
 def as_json(content: Any) -> Any:
     """What comes back of it from a JSON file: lists for tuples."""
-    return json.loads(json.dumps(content))
+    return json.loads(json.dumps(content, default=_number))
+
+
+def _number(value: Any) -> Any:
+    if isinstance(value, np.generic):
+        return value.item()
+    raise TypeError(f"Object of type {type(value).__name__} is not JSON serializable")
 
 
 def plain(number: Any) -> float | int | None:

@@ -12,6 +12,16 @@ import jax
 _PACKAGES = ("jax", "jaxlib", "flax", "optax", "evosax", "gymnax", "brax", "numpy", "lpo")
 
 
+# What JAX is told about numbers, and how it is told nothing.
+_ARITHMETIC = {"jax_enable_x64": False, "jax_default_prng_impl": "threefry2x32"}
+
+
+def arithmetic() -> dict[str, str]:
+    """JAX's precision and random numbers where they are not its defaults: agents of one seed then differ."""
+    told = {name: getattr(jax.config, name) for name in _ARITHMETIC}
+    return {name: str(value) for name, value in told.items() if value != _ARITHMETIC[name]}
+
+
 def package_versions() -> dict[str, str]:
     """Versions of Python, of what decides the numbers, and of this project ("lpo")."""
     versions = {"python": platform.python_version()}

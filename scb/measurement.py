@@ -25,7 +25,7 @@ from scb.errors import UserError, count_at_least, one_of
 from scb.evaluation import Episodes
 from scb.files import plain
 from scb.keys import root_key, split_key
-from scb.machine import package_versions
+from scb.machine import arithmetic, package_versions
 from scb.objectives import Objective, programs_for
 from scb.own import code_of, code_of_names
 from scb.population import map_population
@@ -297,7 +297,7 @@ def measure(
         "points": points,
         "episodes": episodes,
         "actions": list(actions),
-        "versions": package_versions(),
+        "versions": package_versions() | arithmetic(),
     }
 
     named: Mapping[str | None, Objective | None] = {o.name: o for o in objectives} or {None: None}

@@ -25,7 +25,7 @@ from scb.configurations import as_if_shorter, config_dict, first_difference, wit
 from scb.errors import UserError, needed_for, of_class
 from scb.files import as_json, cannot_write, make_folder, plain, write_json, write_text
 from scb.locks import lock, release
-from scb.machine import machine_description
+from scb.machine import arithmetic, machine_description
 
 _LOCK = ".lock"
 
@@ -72,7 +72,8 @@ class Run:
         folder = Path(folder)
         if wandb_project:
             _wandb()  # that a missing package leaves no folder behind
-        config = as_json(config)
+        told = arithmetic()
+        config = as_json({**config, **({"arithmetic": told} if told else {})})
         if resume:
             stored, asked = ({**c, "command": None} for c in (read_config(folder), config))
             if settings is not None and "config" in stored:

@@ -50,10 +50,16 @@ class AgentConfig(ABC):
                 f"hidden_sizes is {self.hidden_sizes!r}: give one size a layer, (64, 64) in Python, and [64,64] in "
                 "words."
             )
-        counts = [(f.name, getattr(self, f.name)) for f in fields(self) if f.type is int]
-        counts += [(f"hidden_sizes[{i}]", size) for i, size in enumerate(self.hidden_sizes)]
-        for name, value in counts:
-            at_least(1, **{name: counted(name, value)})
+        sizes = tuple(
+            counted(f"hidden_sizes[{i}]", size) for i, size in enumerate(self.hidden_sizes)
+        )
+        counts = {
+            f.name: counted(f.name, getattr(self, f.name)) for f in fields(self) if f.type is int
+        }
+        at_least(1, **counts, **{f"hidden_sizes[{i}]": size for i, size in enumerate(sizes)})
+        # Python's own numbers: NumPy's have no bit_length, and are none of JSON's.
+        for name, value in {**counts, "hidden_sizes": sizes}.items():
+            object.__setattr__(self, name, value)
         for name in (f.name for f in fields(self) if f.type is bool):
             if not isinstance(getattr(self, name), bool):
                 raise UserError(f"{name} is {getattr(self, name)!r}: it must be true or false.")

@@ -5,6 +5,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from scb.errors import UserError
 
@@ -24,6 +25,7 @@ _SHARES = (
 
 def check_value(name: str, value: Any) -> None:
     """Raises a UserError for a value that the hyperparameter cannot have."""
+    value = value.item() if isinstance(value, np.generic) else value
     number = isinstance(value, int | float) and not isinstance(value, bool)
     if not number or not abs(value) <= _LARGEST:
         raise UserError(
@@ -36,11 +38,13 @@ def check_value(name: str, value: Any) -> None:
 
 def check_values(hyperparameters: Any) -> None:
     """As `check_value`, of every field; of what is traced its shape alone is known. A drift's are its own."""
-    for name in (field.name for field in fields(hyperparameters) if field.name != "drift"):
-        value = getattr(hyperparameters, name)
+    for field in fields(hyperparameters):
+        name, value = field.name, getattr(hyperparameters, field.name)
+        if name == "drift" or (value is None and field.default is None):
+            continue
         if shape := getattr(value, "shape", ()):
             raise UserError(
                 f"{name} has the shape {shape}: give one number; each agent's is drawn from a spec's lists."
             )
-        if value is not None and not isinstance(value, jax.core.Tracer):
+        if not isinstance(value, jax.core.Tracer):
             check_value(name, value.item() if hasattr(value, "item") else value)

@@ -80,10 +80,10 @@ def _check(name: str, env: environment.Environment[Any, Any], params: Any) -> No
             "has parameters whose max_steps_in_episode is gymnax's own, so that its episodes end after one step: give "
             "them that field with its value, though it be 1"
         )
-    if params.max_steps_in_episode < 1:
+    if not 1 <= params.max_steps_in_episode < 2**31:
         raise wrong(
             f"has a max_steps_in_episode of {params.max_steps_in_episode}, after which an episode ends: it must be at "
-            "least 1"
+            "least 1, and below 2^31"
         )
     observations, actions = env.observation_space(params), env.action_space(params)
     for kind, space in {"observations": observations, "actions": actions}.items():

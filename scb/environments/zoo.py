@@ -169,6 +169,10 @@ def save_bandit(
             f"the weights of {synthetic.name} are of the class {type(weights).__name__}: give a dict of arrays, as the "
             "weights of its parameters are."
         )
+    if not isinstance(metadata, Mapping):
+        raise UserError(
+            f"the metadata of {synthetic.name} are of the class {type(metadata).__name__}: give a dict, {{}} for none."
+        )
     kind = SYNTHETIC_MDP if isinstance(synthetic, SyntheticMDP) else BANDIT
     config = {
         **metadata.get("config", {}),

@@ -270,6 +270,29 @@ def test_a_comparison_keeps_its_rows_in_a_file(tmp_path, tiny_agent):
         compare("Synthetic-Pendulum-v1", ["ppo"], [0], spec, rows=tmp_path / "rows.json")
     with pytest.raises(UserError, match=r"rows are 3: give the path of a \.jsonl file, or None"):
         compare("Synthetic-Pendulum-v1", ["ppo"], [0], spec, rows=3)
+    for folder in ("", "."):
+        with pytest.raises(UserError, match=r"are kept in a \.jsonl file"):
+            compare("Synthetic-Pendulum-v1", ["ppo"], [0], spec, rows=folder)
+
+
+def test_agents_of_another_arithmetic_are_no_pairs(tmp_path, tiny_agent, monkeypatch):
+    spec = AgentSpec("ppo", tiny_agent, PPOHyperparameters())
+    file = tmp_path / "rows.jsonl"
+    compare("Synthetic-Pendulum-v1", ["ppo"], [0], spec, points=1, rows=file)
+    monkeypatch.setattr("scb.measurement.arithmetic", lambda: {"jax_enable_x64": "True"})
+    with pytest.raises(UserError, match=r"differs at versions\.jax_enable_x64"):
+        compare("Synthetic-Pendulum-v1", ["ppo"], [0, 1], spec, points=1, rows=file)
+
+
+def test_rows_are_kept_at_home(tmp_path, tiny_agent, monkeypatch):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    spec = AgentSpec(
+        "ppo",
+        tiny_agent.__class__(num_envs=np.int64(2), num_steps=1, total_steps=4, num_minibatches=1),
+        PPOHyperparameters(),
+    )
+    compare("Synthetic-Pendulum-v1", ["ppo"], [0], spec, points=1, rows="~/rows.jsonl")
+    assert (tmp_path / "rows.jsonl").exists()
 
 
 def test_rows_replace_no_json_of_something_else(tmp_path, tiny_agent):

@@ -83,6 +83,13 @@ def test_meta_train_writes_an_objective_that_loads(
     sums = longer["config"]["bandit_sha256"]
     assert stored == {"command": longer["command"], "config": longer_config, "inputs": sums}
 
+    # A log that was lost leaves nothing to draw, and the objective is there all the same.
+    (working_folder / "learned" / "metrics.jsonl").unlink()
+    for file in ("objective.npz", "objective.json"):
+        (working_folder / "learned" / file).unlink()
+    assert cli.main(["meta-train", "--resume=learned"]) == 0
+    assert (working_folder / "learned" / "objective.npz").exists()
+
 
 def test_a_process_that_is_not_the_first_is_told_what_it_resumes(monkeypatch):
     monkeypatch.setattr("scb.processes.first", lambda: False)

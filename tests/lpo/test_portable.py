@@ -416,6 +416,12 @@ class TestTorch:
         message = one_sentence(str(error.value))
         assert f"{wrong} is no tensor of PyTorch but" in message and "loss_function" in message
 
+    def test_progress_may_be_jaxs(self, torch):
+        drift, x = torch_drift("ta-lpo"), torch.tensor([0.3, -0.2])
+        assert torch.equal(drift(x, x, jnp.float32(0.5)), drift(x, x, 0.5))
+        with pytest.raises(UserError, match=r"progress is 2\.0: it is the fraction"):
+            drift(x, x, jnp.float32(2.0))
+
     @pytest.mark.slow
     @pytest.mark.parametrize("objective", ["ppo", "dpo", "lpo-pendulum"])
     def test_the_example_trains(self, objective):

@@ -19,7 +19,7 @@ from gymnax.environments import spaces
 from jax.errors import JaxRuntimeError
 
 from scb import artefacts, judgement, listing
-from scb.cli import main
+from scb.cli import main, run_program
 from scb.command_line import SharedOutput
 from scb.commands import Discover, Judgement, TrainConfig
 from scb.configurations import config_dict
@@ -638,3 +638,23 @@ def test_out_of_memory_is_a_sentence(monkeypatch, bandit_file):
     monkeypatch.setattr("scb.commands.judge", another)
     with pytest.raises(JaxRuntimeError):
         call("train", "--bandit", bandit_file)
+
+
+def test_a_path_after_an_equals_sign_may_begin_at_home(monkeypatch, tmp_path):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    found = []
+
+    def show(out: str, *, of: str) -> None:
+        """Shows."""
+        found.extend([out, of])
+
+    assert (
+        run_program(
+            "show",
+            "Shows.",
+            lambda: {"show": show, "hide": show},
+            ["show", "--out=~/a", "--of=b=~"],
+        )
+        == 0
+    )
+    assert found == [str(tmp_path / "a"), "b=~"]

@@ -169,6 +169,9 @@ class OwnStepNoTime(NoTime):
 def no_steps():
     return Pendulum(), Pendulum().default_params.replace(max_steps_in_episode=0)
 
+def forever():
+    return Pendulum(), Pendulum().default_params.replace(max_steps_in_episode=float("inf"))
+
 instance = Pendulum()
 
 def endless():
@@ -364,6 +367,7 @@ def test_the_physics_that_a_factory_takes_is_part_of_the_place(module):
         ("{}:NoTime", "has a state without time, the steps of its episode: give it that field"),
         ("{}:OwnStepNoTime", "has a state without time, the steps of its episode: give it that"),
         ("{}:no_steps", "has a max_steps_in_episode of 0, after which an episode ends"),
+        ("{}:forever", "of inf, after which an episode ends: it must be at least 1, and below"),
         ("{}:endless", "without max_steps_in_episode"),
         ("{}:wrong", "returned a str: it must return a gymnax"),
         ("{}:number", "is a int, which cannot be called: give a class or a function"),

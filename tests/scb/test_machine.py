@@ -2,7 +2,9 @@ import json
 import platform
 from pathlib import Path
 
-from scb.machine import machine_description, package_versions
+import jax
+
+from scb.machine import arithmetic, machine_description, package_versions
 
 
 def test_versions_name_everything_that_decides_the_numbers():
@@ -11,6 +13,12 @@ def test_versions_name_everything_that_decides_the_numbers():
     assert set(versions) == {
         *("python", "jax", "jaxlib", "flax", "optax", "evosax", "gymnax", "brax", "numpy", "lpo")
     }
+
+
+def test_arithmetic_is_told_where_it_is_not_the_default():
+    assert arithmetic() == {}
+    with jax.enable_x64(True), jax.default_prng_impl("rbg"):
+        assert arithmetic() == {"jax_enable_x64": "True", "jax_default_prng_impl": "rbg"}
 
 
 def test_the_machine_is_described_without_saying_whose_it_is():

@@ -15,6 +15,7 @@ import lpo
 import scb
 from lpo.inner_loop import MetaTrainingConfig
 from lpo.meta_training import meta_train
+from scb.configurations import config_dict
 from scb.discovery import BanditDiscovery, DiscoveryConfig, discover
 from scb.errors import UserError, at_least
 from scb.evolution import EvolutionConfig
@@ -80,6 +81,52 @@ def test_what_no_agent_can_be_trained_with_is_refused(values, message, bandit):
     spec = scb.environment_agent("ppo", "Pendulum-v1")
     with pytest.raises(UserError, match=message):
         spec.with_values(**values)
+
+
+@pytest.mark.parametrize(
+    ("agent", "hyperparameters"),
+    [
+        (scb.PPO, scb.PPOHyperparameters(learning_rate=None)),
+        (scb.PPO, scb.PPOHyperparameters(entropy_coefficient=None)),
+        (scb.SAC, scb.SACHyperparameters(learning_rate=None)),
+        (scb.TD3, scb.TD3Hyperparameters(exploration_noise=None)),
+    ],
+)
+def test_a_number_that_is_none_is_refused(agent, hyperparameters, bandit):
+    env, params = bandit
+    config = {scb.PPO: scb.PPOConfig, scb.SAC: scb.SACConfig, scb.TD3: scb.TD3Config}[agent]()
+    with pytest.raises(UserError, match=r"has the value None, which is no number"):
+        agent(env, config).init(KEY, hyperparameters, params)
+
+
+def test_numpys_numbers_are_pythons_in_a_configuration():
+    config = scb.PPOConfig(num_envs=np.int64(4), hidden_sizes=(np.int32(8),))
+    assert {type(config.num_envs), type(config.hidden_sizes[0])} == {int}
+    meta = MetaTrainingConfig(
+        contexts=np.int64(20),
+        reward_noise=np.float32(5),
+        hyperparameters={"learning_rate": tuple(np.float32([1e-3, 1e-2]))},
+        evolution=EvolutionConfig(seed=np.int64(1)),
+    )
+    stored = config_dict(meta)
+    assert (stored["contexts"], stored["reward_noise"], stored["evolution"]["seed"]) == (20, 5.0, 1)
+
+
+def test_an_objective_is_certified_with_its_own_parameters():
+    objective = lpo.load_objective("lpo-pendulum")
+    with pytest.raises(UserError, match="comes with its own parameters: leave them out, or give"):
+        lpo.certify(objective, objective.parameters)
+
+
+def test_a_path_may_begin_at_home(tmp_path, monkeypatch, bandit):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    env, params = bandit
+    with pytest.raises(
+        UserError, match="the metadata of Synthetic-Pendulum-v1 are of the class No"
+    ):
+        scb.save_bandit("~/mine.npz", env, params.weights, None)
+    assert scb.save_bandit("~/mine.npz", env, params.weights, {}) == tmp_path / "mine.npz"
+    assert scb.load_bandit("~/mine.npz").config == env.config
 
 
 def test_numbers_of_any_library_are_hyperparameters(bandit):

@@ -147,6 +147,12 @@ def test_another_config_cannot_resume_a_run(run, change, message):
         Run.open(run.folder, {**CONFIG, **change}, resume=True)
 
 
+def test_another_arithmetic_cannot_resume_a_run(run, monkeypatch):
+    monkeypatch.setattr("scb.runs.arithmetic", lambda: {"jax_enable_x64": "True"})
+    with pytest.raises(UserError, match=r"differs at arithmetic \(None there, {'jax_enable_x64'"):
+        Run.open(run.folder, CONFIG, resume=True)
+
+
 GROWING = ["seed", "evolution.sigma", "hidden_sizes"]
 
 
