@@ -203,7 +203,7 @@ def _evaluate(
             )
         progress = 0.0
     if isinstance(progress, jax.Array) and xp is not jnp:
-        progress = np.asarray(progress)  # a tensor cannot be made of JAX's
+        progress = np.array(progress)  # a tensor cannot be made of JAX's
     # A tensor's or a traced array's values are not looked at: that would wait for a device.
     inside = True
     # A number apart, for torch.compile cannot follow a branch on an array.
