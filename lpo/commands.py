@@ -127,8 +127,9 @@ class MetaTrain(LongRun):
         )  # before the folder, which a mistake must not leave behind
         run = self.open()
         objective = learn_objective(problem, run, self.command)
-        if processes.first() and run.metrics():  # a log that was lost is no reason to fail
-            curve = search_figures.meta_training_curve(run.metrics(), self.config)
+        # A log that was lost is no reason to fail.
+        if processes.first() and (metrics := run.metrics()):
+            curve = search_figures.meta_training_curve(metrics, self.config)
             plotting.save(curve, run.folder / "figures" / "meta_training.png")
         return objective
 
