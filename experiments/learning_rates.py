@@ -171,8 +171,30 @@ def _asked(report: Report) -> dict[str, Rates]:
     }
 
 
-def compared(report: Report) -> list[tuple[str, str, str, Claim]]:
-    """(objective, the other, at which rates in words, claim), over the environments that it was not learned for.
+@dataclass(frozen=True)
+class Compared:
+    """Two objectives, and how much more the first earns.
+
+    Attributes:
+      name, other: of both.
+      who: the first in words, with the environment where that is one which it was learned for.
+      words: at which rates.
+      places: the environments.
+      rates: {environment: {objective: rates}} in each.
+      claim: that it earns more.
+    """
+
+    name: str
+    other: str
+    who: str
+    words: str
+    places: Sequence[str]
+    rates: Rates
+    claim: Claim
+
+
+def compared(report: Report) -> list[Compared]:
+    """What is claimed, over the environments that an objective was not learned for.
 
     Every objective is compared with PPO's clip. Where each has the rate chosen for it, learned ones are compared with
     DPO too, and also in each environment that they were learned for.
@@ -194,9 +216,15 @@ def compared(report: Report) -> list[tuple[str, str, str, Claim]]:
                     if at_best and place in homes
                 }
                 for where, (who, places) in sets.items() if name != other else ():
-                    evidence = _more(scored, places, name, other, rates)
-                    found.append((who, other, words, Claim(f"{text}, {where}", evidence)))
+                    claim = Claim(f"{text}, {where}", _more(scored, places, name, other, rates))
+                    found.append(Compared(name, other, who, words, places, rates, claim))
     return found
+
+
+def judged(report: Report) -> list[tuple[Compared, Judged]]:
+    """What is claimed, and what becomes of it."""
+    found = compared(report)
+    return list(zip(found, judge([x.claim for x in found]), strict=True))
 
 
 def _more(
@@ -219,7 +247,33 @@ def _more(
 
 def claims(report: Report) -> list[Claim]:
     """Those of `compared`."""
-    return [claim for *_, claim in compared(report)]
+    return [x.claim for x in compared(report)]
+
+
+def without_one(report: Report) -> list[tuple[Compared, Judged, dict[str, Estimate]]]:
+    """What is decided over several environments, and the difference without each of them; each for itself.
+
+    One of them may be all that a mean shows.
+    """
+    scored, found = scores(report), []
+    for x, of_it in judged(report):
+        if of_it.outcome in (HOLDS, FAILS) and len(x.places) > 1:
+            less = {
+                place: _more(scored, [y for y in x.places if y != place], x.name, x.other, x.rates)
+                for place in x.places
+            }
+            found.append((x, of_it, {place: y() for place, y in less.items() if callable(y)}))
+    return found
+
+
+def at_the_ends(report: Report) -> dict[tuple[str, float], list[str]]:
+    """{(environment, rate): objectives} whose chosen rate is the smallest or the largest of those that were tried."""
+    scored, found = scores(report, CHOOSING), dict[tuple[str, float], list[str]]()
+    for place, objectives in chosen(report).items():
+        for name, (rate,) in objectives.items():
+            if rate in (min(scored[place][name]), max(scored[place][name])):
+                found.setdefault((place, rate), []).append(name)
+    return found
 
 
 def at_home(report: Report) -> dict[tuple[str, str], dict[float, Estimate]]:
@@ -260,11 +314,18 @@ def facts(report: Report) -> dict[str, Any]:
                 else None,
             }
         )
-    found = compared(report)
-    pairs = list(zip(found, judge([claim for *_, claim in found]), strict=True))
+    pairs, less = judged(report), without_one(report)
+    leads = [(x, without) for x, of_it, without in less if of_it.outcome == HOLDS]
     return {
         "rows": rows,
         "at_home": at_home(report),
+        "without_one": less,
+        "leaning": {
+            f"{x.name}, {x.words}": on
+            for x, without in leads
+            if (on := [place for place, lead in without.items() if (lead.low or 0.0) <= 0])
+        },
+        "at_the_ends": at_the_ends(report),
         "more": _shown(pairs, HOLDS),
         "less": {where: names for where, names in _shown(pairs, FAILS).items() if names},
         "own": {place: entry["own"] for place, entry in entries.items()},
@@ -274,16 +335,12 @@ def facts(report: Report) -> dict[str, Any]:
     }
 
 
-def _shown(
-    pairs: Sequence[tuple[tuple[str, str, str, Claim], Judged]], outcome: str
-) -> dict[str, list[str]]:
+def _shown(pairs: Sequence[tuple[Compared, Judged]], outcome: str) -> dict[str, list[str]]:
     """{at which rates, in words: objectives} of the comparisons with PPO's clip that end so."""
-    found: dict[str, list[str]] = {
-        words: [] for (_, _, words, _), judged in pairs if judged.outcome != UNTESTED
-    }
-    for (name, other, words, _), judged in pairs:
-        if other == REFERENCE and judged.outcome == outcome:
-            found[words].append(name)
+    found: dict[str, list[str]] = {x.words: [] for x, of_it in pairs if of_it.outcome != UNTESTED}
+    for x, of_it in pairs:
+        if x.other == REFERENCE and of_it.outcome == outcome:
+            found[x.words].append(x.who)
     return found
 
 

@@ -123,6 +123,43 @@ def test_objectives_are_compared_where_they_were_not_learned_at_the_same_rates_a
     assert len([axes for axes in figure.axes if axes.axison]) == 4
 
 
+def test_what_is_decided_over_several_is_told_without_each_of_them(report):
+    best = "each at the rate chosen for it"
+    found = {
+        (x.name, x.other, x.words): {place: round(e.value, 2) for place, e in without.items()}
+        for x, _, without in module.without_one(report)
+    }
+    # Neither what is undecided nor what is of one environment.
+    assert ("dpo", "ppo", "at rates of 0.0003 and less") not in found
+    assert found["dpo", "ppo", best] == {
+        "Pendulum-v1": 0.1,
+        "Acrobot-v1": 0.15,
+        "MountainCar-v0": 0.15,
+    }
+    # Not where it was learned.
+    assert found["lpo-pendulum", "ppo", best] == {"Acrobot-v1": 0.4, "MountainCar-v0": 0.4}
+    page = module.EXPERIMENT.page(report)
+    assert "| dpo minus ppo, each at the rate chosen for it | +0.10 [" in page
+    assert "not shown without one of them" not in page
+    # All of its lead is of one environment now.
+    for place in ("Acrobot-v1", "MountainCar-v0"):
+        reported = report["environments"][place][module.REPORTED]
+        reported["ppo"]["0.003"] = reported["dpo"]["0.01"]
+    assert f"not shown without one of them: dpo, {best}, without Pendulum-v1." in page_of(report)
+
+
+def page_of(report):
+    return module.EXPERIMENT.page(report)
+
+
+def test_a_rate_at_an_end_of_those_that_were_tried_is_told(report):
+    assert module.at_the_ends(report) == {
+        ("Pendulum-v1", 0.0003): ["ppo"],
+        **{(place, 0.01): ["dpo", "lpo-pendulum"] for place in report["environments"]},
+    }
+    assert "0.01 on Acrobot-v1 by dpo and lpo-pendulum" in page_of(report)
+
+
 def test_an_objective_that_an_environment_lacks_is_drawn_and_named_where_it_is(report):
     for role in (module.CHOOSING, module.REPORTED):
         for name in ("dpo", "lpo-pendulum"):
