@@ -1,6 +1,5 @@
 """What a report holds and what is asked of it: a JSON object that a measurement goes on filling in."""
 
-import json
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,7 @@ from scb.environments.registry import environment_spec
 from scb.environments.synthetic import SyntheticBandit
 from scb.environments.zoo import bandit_metadata, load_bandit, zoo_names
 from scb.errors import UserError
-from scb.files import as_json
+from scb.files import as_json, read_object
 from scb.measurement import Place, as_random
 from scb.rows import Rows
 
@@ -25,16 +24,11 @@ def read(path: Path, missing_is_new: bool = False, keys: Iterable[str] = ()) -> 
     if missing_is_new and not path.exists():
         return {}
     try:
-        report: Any = json.loads(path.read_text())
-        if not isinstance(report, dict):
-            raise ValueError("it is no JSON object")
-        if lacking := [key for key in keys if key not in report]:
-            raise ValueError(f"it lacks {', '.join(lacking)}")
+        return read_object(path, keys)
     except (OSError, ValueError) as error:
         raise UserError(
             f"{path} is no report of this command ({error}): measure first, or choose another --out."
         ) from error
-    return report
 
 
 def complete(report: Report) -> bool:

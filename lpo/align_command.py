@@ -1,11 +1,11 @@
 """What `lpo align` does: which inner loop on a bandit ranks objectives as an environment does."""
 
 import itertools
-import json
 from dataclasses import dataclass, field
 from functools import partial
+from pathlib import Path
 from types import MappingProxyType
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 from rich.table import Table
@@ -20,7 +20,7 @@ from scb import plotting
 from scb.console import console
 from scb.environments.registry import environment_spec
 from scb.errors import UserError
-from scb.files import write_json
+from scb.files import read_object, write_json
 from scb.measurement import Place
 from scb.statistics import correlation_text, few_agents
 
@@ -117,7 +117,7 @@ class Align(OfObjectives):
             policy_output_scale=config.policy_output_scale,
             tell=printer.print,
             rows=rows,
-            done=json.loads(stored.read_text()) if stored and stored.exists() else None,
+            done=_measured(stored) if stored and stored.exists() else None,
             keep=partial(write_json, stored) if stored else lambda report: None,
         )
         table = Table("regime", *LABELS, title=f"Spearman's correlation with {target} [95 %]")
@@ -129,3 +129,14 @@ class Align(OfObjectives):
             printer.print(few)
         if folder is not None:
             plotting.save(figures.alignment_heatmap(report), folder / "alignment.png")
+
+
+def _measured(path: Path) -> dict[str, Any]:
+    """What a killed measurement has kept."""
+    try:
+        return read_object(path, ("outcome", "outcome_iqm", "regimes"))
+    except (OSError, ValueError) as error:
+        raise UserError(
+            f"{path} is damaged ({error}): delete it. The environment's agents are kept in rows.jsonl, and the "
+            "bandits are measured again."
+        ) from error

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import partial
+from pathlib import Path
 from typing import Annotated, Any
 
 import jax
@@ -110,6 +111,8 @@ class MetaTrainingConfig:
         tasks: Any = self.tasks
         if isinstance(tasks, str):
             raise UserError(f"the tasks are {self.tasks!r}, a text: give a tuple of names.")
+        names = tuple(str(task) if isinstance(task, Path) else task for task in tasks)
+        object.__setattr__(self, "tasks", names)
         hyperparameters: Any = self.hyperparameters
         if not isinstance(hyperparameters, Mapping):
             raise UserError(

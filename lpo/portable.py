@@ -177,6 +177,10 @@ def _converted(
     progress: ArrayLike | None = None,
 ) -> Any:
     """`_evaluate` of whatever is like an array, in the floating-point type that it has together."""
+    for name, value in (("log_ratio", log_ratio), ("advantage", advantage)):
+        kind = getattr(getattr(value, "dtype", None), "kind", "f")
+        if isinstance(value, str) or kind in "USO":
+            raise UserError(f"{name} is {value!r}, which is no array of numbers: give one.")
     dtype = xp.result_type(xp.asarray(log_ratio), xp.asarray(advantage), xp.float32)
     log_ratio, advantage = xp.asarray(log_ratio, dtype), xp.asarray(advantage, dtype)
     return xp.asarray(_evaluate(xp, drift, parameters, log_ratio, advantage, progress))

@@ -113,6 +113,8 @@ def named(name: str | Path, folder: Path, what: str, others: Sequence[str] = ())
     Raises:
       UserError: neither, with near matches, or with the folder's files where it is a folder.
     """
+    if not isinstance(name, str | os.PathLike):
+        raise UserError(f"a {what} is {name!r}: give a name, or a file, path.npz.")
     text, names = os.path.expanduser(name), names_in(folder)
     if text in names:
         return folder / f"{text}.npz"
@@ -363,6 +365,8 @@ def _problem(array: np.ndarray | bytes) -> str | None:
     number_bad = array.size - int(np.isfinite(array).sum())
     if number_bad:
         return f"has {number_bad} NaN or infinite among its {array.size} numbers"
+    if array.dtype.kind == "f" and array.size and np.abs(array).max() > np.finfo(np.float32).max:
+        return "has numbers that are infinite in 32 bits"
     return None
 
 

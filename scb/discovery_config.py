@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
+from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
@@ -147,6 +148,9 @@ class DiscoveryConfig:
         return self.start is not None and self.bandit.form == "linear" and given
 
     def __post_init__(self) -> None:
+        start: Any = self.start
+        if isinstance(start, Path):
+            object.__setattr__(self, "start", str(start))
         algorithms: Any = self.algorithms
         if isinstance(algorithms, str):
             raise UserError(f"the algorithms are {algorithms!r}, a text: give a tuple of names.")

@@ -65,6 +65,16 @@ def strict_json(text: str | bytes) -> Any:
     return json.loads(text, parse_constant=refuse)
 
 
+def read_object(path: Path, keys: Iterable[str] = ()) -> dict[str, Any]:
+    """A file's JSON object with these keys at least; a ValueError, or an OSError, where it is none."""
+    found: Any = json.loads(path.read_text())
+    if not isinstance(found, dict):
+        raise ValueError("it is no JSON object")
+    if lacking := [key for key in keys if key not in found]:
+        raise ValueError(f"it lacks {', '.join(lacking)}")
+    return found
+
+
 def as_json(content: Any) -> Any:
     """What comes back of it from a JSON file: lists for tuples."""
     return json.loads(json.dumps(content, default=_number))

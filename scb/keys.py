@@ -7,7 +7,10 @@ position, never both, and is split at one place only; whatever else hangs on it 
 import hashlib
 
 import jax
+import numpy as np
 from jax.typing import ArrayLike
+
+from scb.errors import UserError
 
 # Positions are smaller.
 FIRST_NAME = 2**31
@@ -19,7 +22,13 @@ def root_key(seed: ArrayLike) -> jax.Array:
 
 
 def split_key(key: jax.Array, number: int = 2) -> jax.Array:
-    """[number] keys of their own; a longer split begins with the keys of a shorter one."""
+    """[number] keys of their own; a longer split begins with the keys of a shorter one.
+
+    Raises:
+      UserError: it is no key, but a seed for instance.
+    """
+    if not isinstance(key, jax.Array | np.ndarray):
+        raise UserError(f"the key is {key!r}: give one of JAX's, such as jax.random.key(0).")
     return jax.random.split(key, number)
 
 

@@ -69,7 +69,7 @@ class Run:
           UserError: the folder can't be written, holds something already, isn't a run, is another
             process's, or its config differs.
         """
-        folder = Path(folder)
+        folder = Path(folder).expanduser()
         if wandb_project:
             _wandb()  # that a missing package leaves no folder behind
         told = arithmetic()
@@ -238,7 +238,7 @@ def _has_room(folder: Path) -> bool:
 
 def read_config(folder: str | Path) -> dict[str, Any]:
     """The config that a run was started with; a UserError if the folder isn't a run."""
-    path = Path(folder) / "config.json"
+    path = Path(folder).expanduser() / "config.json"
     try:
         return dict(json.loads(path.read_text()))
     except (OSError, TypeError, ValueError) as error:
@@ -268,7 +268,7 @@ def run_of(
     if folder is None or isinstance(folder, Run):
         yield folder
         return
-    path = Path(folder)
+    path = Path(folder).expanduser()
     begun = path.exists() and not _has_room(path)
     command = read_config(path).get("command") if begun else None  # of whoever began it
     stored = {

@@ -179,9 +179,12 @@ def _encoding(space: spaces.Box | spaces.Discrete) -> Callable[[Array], Array]:
 
     # minimum and maximum are quicker than clip, of which there is one a step.
     def clipped(action: Array) -> Array:
-        action = np.asarray(action, np.float32)
-        if action.shape[1:] != space.shape:
-            raise misfit(action.shape[1:], action.dtype, space)
-        return np.minimum(np.maximum(action, low), high).reshape(len(action), -1)
+        try:
+            numbers = np.asarray(action, np.float32)
+        except (TypeError, ValueError) as error:  # a text, for instance
+            raise misfit(action.shape[1:], action.dtype, space) from error
+        if numbers.shape[1:] != space.shape:
+            raise misfit(numbers.shape[1:], numbers.dtype, space)
+        return np.minimum(np.maximum(numbers, low), high).reshape(len(numbers), -1)
 
     return clipped

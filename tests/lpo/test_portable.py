@@ -231,6 +231,15 @@ def test_shapes_that_would_broadcast_are_refused(make, one_sentence):
     assert "(5, 1)" in message and "(5,)" in message
 
 
+def test_what_is_no_number_is_refused(one_sentence):
+    for function in (numpy_drift, drift_function):
+        with pytest.raises(UserError) as caught:
+            function("dpo")(0.0, "b")
+        assert "advantage is 'b', which is no array of numbers" in one_sentence(str(caught.value))
+    with pytest.raises(UserError, match="log_ratio is array"):
+        numpy_drift("dpo")(np.array(["a"]), np.zeros(1))
+
+
 @pytest.mark.parametrize("make", [numpy_drift, drift_function, loss_function])
 def test_an_unknown_name_is_refused_as_everywhere(make):
     with pytest.raises(UserError, match="unknown objective 'dppo'"):

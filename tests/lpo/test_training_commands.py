@@ -228,6 +228,7 @@ def test_align_measures_every_combination_and_stores_it(monkeypatch, working_fol
             "environment": environment,
             "agents": 2,
             "outcome_iqm": {o.name: 0.0 for o in objectives},
+            "outcome": {o.name: [0.0, 0.0] for o in objectives},
             "regimes": [{"name": str(r), "bandit": r.bandit, **measured} for r in regimes],
         }
         keep(report)
@@ -249,6 +250,16 @@ def test_align_measures_every_combination_and_stores_it(monkeypatch, working_fol
     assert cli.main(["align", "--resume=aligned"]) == 0
     assert told == [(0, "rows.jsonl"), (4, "rows.jsonl")]
     assert asked[4:] == asked[:4]
+    for damage, said in (
+        ('{"a', "Unterminated string"),
+        ("{}", "it lacks outcome"),
+        ("3", "no JSON obj"),
+    ):
+        (working_folder / "aligned" / "alignment.json").write_text(damage)
+        assert cli.main(["align", "--resume=aligned"]) == 2
+        message = capsys.readouterr().err
+        assert "aligned/alignment.json is damaged" in message and said in message
+    assert len(told) == 2
 
 
 def test_objectives_are_compared_with_the_hyperparameters_that_are_given(

@@ -176,6 +176,7 @@ def test_metadata_may_hold_numpy_numbers_jax_arrays_and_dataclasses(tmp_path):
     ("arrays", "message"),
     [
         ({"w": np.array([1.0, np.nan, np.inf])}, "2 NaN or infinite among its 3 numbers"),
+        ({"w": np.array([1e39])}, "has numbers that are infinite in 32 bits"),
         ({"w": np.array([object()])}, "is of type object"),
         ({"w": np.array(["a"])}, "is of type <U1"),
         ({"w": jnp.ones(2, jnp.bfloat16)}, "is of type bfloat16"),
@@ -322,6 +323,11 @@ def test_members_that_are_not_arrays_of_numbers_are_refused(saved):
 def test_weights_that_are_not_finite_are_refused(saved):
     rewrite(saved, npz(w=np.array([1.0, np.nan])))
     assert "array 'w' has 1 NaN or infinite among its 2 numbers" in load_error(saved)
+
+
+def test_weights_that_32_bits_cannot_hold_are_refused(saved):
+    rewrite(saved, npz(w=np.array([1.0, -1e39])))
+    assert "array 'w' has numbers that are infinite in 32 bits" in load_error(saved)
 
 
 def test_a_name_that_is_both_array_and_group_is_refused(saved):

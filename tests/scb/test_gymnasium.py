@@ -184,6 +184,7 @@ def test_an_action_that_is_none_is_refused(action):
             r"an action has shape \(\) and type float32: it must be of shape \(3,\)\.",
         ),
         ("hopper", [0.5], r"an action has shape \(1,\) and type"),
+        ("hopper", "a", r"an action has shape \(\) and type <U1: it must be of shape \(3,\)"),
         (
             "hopper",
             [np.nan] * 3,

@@ -1,6 +1,8 @@
 """What a caller in Python gets wrong is told in a sentence, before anything is trained."""
 
+import json
 from dataclasses import dataclass
+from pathlib import Path
 
 import gymnasium
 import gymnax
@@ -19,6 +21,7 @@ from scb.configurations import config_dict
 from scb.discovery import BanditDiscovery, DiscoveryConfig, discover
 from scb.errors import UserError, at_least
 from scb.evolution import EvolutionConfig
+from scb.runs import read_config, run_of
 
 KEY = jax.random.key(0)
 
@@ -129,6 +132,25 @@ def test_a_path_may_begin_at_home(tmp_path, monkeypatch, bandit):
     assert scb.load_bandit("~/mine.npz").config == env.config
 
 
+def test_a_run_may_begin_at_home(tmp_path, monkeypatch):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.chdir(tmp_path)
+    config = EvolutionConfig()
+    for _ in range(2):  # made, and found
+        with run_of("~/runs/mine", config, {}, ()) as run:
+            assert run.folder == tmp_path / "runs" / "mine"
+    assert read_config("~/runs/mine")["config"] == config_dict(config)
+    assert not (tmp_path / "~").exists()
+
+
+def test_a_bandit_may_be_named_by_a_path():
+    path = Path(scb.__file__).parent / "zoo" / "Synthetic-Pendulum-v1.npz"
+    assert DiscoveryConfig(environment="Pendulum-v1", start=path).start == str(path)
+    meta = MetaTrainingConfig(tasks=[path, "Synthetic-CartPole-v1"])
+    assert meta.tasks == (str(path), "Synthetic-CartPole-v1")
+    json.dumps(config_dict(meta))
+
+
 def test_numbers_of_any_library_are_hyperparameters(bandit):
     env, params = bandit
     agent = scb.PPO(env, scb.PPOConfig())
@@ -150,6 +172,13 @@ def test_numbers_of_any_library_are_hyperparameters(bandit):
         (lambda: MetaTrainingConfig(drift=lpo.LearnedDrift), "drift is the class LearnedDrift its"),
         (lambda: lpo.compare("CartPole-v1", ["ppo"], [0], episodes=1.5), "episodes is 1.5: it mus"),
         (lambda: lpo.compare("CartPole-v1", ["ppo"], [0], points=1.5), "points is 1.5: it must be"),
+        (lambda: scb.load_bandit(3), "a bandit is 3: give a name, or a file"),
+        (
+            lambda: scb.PPO(gymnax.make("Pendulum-v1")[0], scb.PPOConfig()).init(
+                0, scb.PPOHyperparameters(), gymnax.make("Pendulum-v1")[1]
+            ),
+            r"the key is 0: give one of JAX's, such as jax\.random\.key\(0\)",
+        ),
         (lambda: lpo.compare("CartPole-v1", {"ppo", "dpo"}, [0]), "are a set, which has no order"),
     ],
 )
