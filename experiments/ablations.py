@@ -209,7 +209,8 @@ def draw(report: Mapping[str, Any]) -> Figure:
         axes.set(xlabel="generation", ylabel="return of agents")
         axes.legend(fontsize=7, handlelength=1.8)
     plotting.figure_title(
-        figure, "Meta-training curves: mean over searches, 95 % interval over searches"
+        figure,
+        "Meta-training curves: mean over searches, 95 % interval over them; of two or three, their range",
     )
     return figure
 

@@ -104,7 +104,11 @@ def draw(report: Mapping[str, Any]) -> Figure:
         label = f"{shape} ({number} {'search' if number == 1 else 'searches'})"
         plotting.search_curve(right, list(curves.values()), label, look, iqm)
     left.set(title="Evaluation episodes' length", xlabel="generation", ylabel="steps")
-    right.set(title="Meta-training on Hopper", xlabel="generation", ylabel="return of agents")
+    right.set(
+        title="Meta-training on Hopper;\nbands: the range of searches",
+        xlabel="generation",
+        ylabel="return of agents",
+    )
     right.legend(fontsize=8)
     return figure
 

@@ -10,6 +10,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -42,6 +43,7 @@ class Claim:
       margin: by how much it may be inferior.
       reason: why that margin is none that matters.
       places: of the estimate where it is written.
+      of: what it is about, for whoever looks it up.
     """
 
     text: str
@@ -50,6 +52,7 @@ class Claim:
     margin: float = 0.0
     reason: str = ""
     places: int = 2
+    of: Any = None
 
     def __post_init__(self) -> None:
         if self.margin < 0 or bool(self.margin) != bool(self.reason):
@@ -120,11 +123,7 @@ def _judge(claim: Claim, confidence: float) -> Judged:
         return Judged(claim, None, HOLDS if found else FAILS)
     if callable(found):
         found = found(confidence=confidence)
-    if found.low is None or found.high is None:
-        return Judged(claim, found, UNDECIDED)
-    if found.low > claim.least:
-        return Judged(claim, found, HOLDS)
-    return Judged(claim, found, FAILS if found.high < claim.least else UNDECIDED)
+    return Judged(claim, found, {1: HOLDS, -1: FAILS, 0: UNDECIDED}[found.side(claim.least)])
 
 
 def outcome(judged: Sequence[Judged]) -> str:

@@ -4,7 +4,7 @@ python -m experiments experts
 """
 
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict
 from functools import partial
 from typing import Any
@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 import scb
 from experiments.claims import Claim, of_the_way
 from experiments.harness import Experiment
-from experiments.parts import InParts, Part
+from experiments.parts import by_environment
 from experiments.reports import Report
 from scb import plotting
 from scb.agents.spec import environment_agent
@@ -40,15 +40,6 @@ def train(environment: str, number: int, episodes: int) -> tuple[SACExpert, Any,
     return train_sac_expert(environment, env, env_params, key, number, episodes), env, env_params
 
 
-def parts(plan: Mapping[str, Any], report: dict[str, Any]) -> Iterator[Part]:
-    """Environments."""
-    for name in plan["environments"]:
-        yield Part(("environments", name), partial(_trained, name, plan))
-
-
-measure = InParts(parts)
-
-
 def _trained(environment: str, plan: Mapping[str, Any]) -> dict[str, Any]:
     start = time.monotonic()
     expert, env, env_params = train(environment, plan["agents"], plan["selection_episodes"])
@@ -65,6 +56,9 @@ def _trained(environment: str, plan: Mapping[str, Any]) -> dict[str, Any]:
         "setting": spec.source,
         "seconds": round(seconds, 1),
     }
+
+
+measure = by_environment(_trained)
 
 
 def paper(environment: str) -> Reference:

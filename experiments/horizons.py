@@ -110,8 +110,8 @@ def facts(report: Report) -> dict[str, Any]:
     }
     sides = {
         name: {
-            "ahead": [h for h, x in of_it.items() if x.low is not None and x.low > 0],
-            "behind": [h for h, x in of_it.items() if x.high is not None and x.high < 0],
+            "ahead": [h for h, x in of_it.items() if x.side() > 0],
+            "behind": [h for h, x in of_it.items() if x.side() < 0],
         }
         for name, of_it in found.items()
     }

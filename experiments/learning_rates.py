@@ -173,7 +173,7 @@ def _asked(report: Report) -> dict[str, Rates]:
 
 @dataclass(frozen=True)
 class Compared:
-    """Two objectives, and how much more the first earns.
+    """What a claim that an objective earns more than another is about.
 
     Attributes:
       name, other: of both.
@@ -181,7 +181,6 @@ class Compared:
       words: at which rates.
       places: the environments.
       rates: {environment: {objective: rates}} in each.
-      claim: that it earns more.
     """
 
     name: str
@@ -190,11 +189,10 @@ class Compared:
     words: str
     places: Sequence[str]
     rates: Rates
-    claim: Claim
 
 
-def compared(report: Report) -> list[Compared]:
-    """What is claimed, over the environments that an objective was not learned for.
+def claims(report: Report) -> list[Claim]:
+    """Of what is `Compared`, over the environments that an objective was not learned for.
 
     Every objective is compared with PPO's clip. Where each has the rate chosen for it, learned ones are compared with
     DPO too, and also in each environment that they were learned for.
@@ -216,15 +214,10 @@ def compared(report: Report) -> list[Compared]:
                     if at_best and place in homes
                 }
                 for where, (who, places) in sets.items() if name != other else ():
-                    claim = Claim(f"{text}, {where}", _more(scored, places, name, other, rates))
-                    found.append(Compared(name, other, who, words, places, rates, claim))
+                    evidence = _more(scored, places, name, other, rates)
+                    of_it = Compared(name, other, who, words, places, rates)
+                    found.append(Claim(f"{text}, {where}", evidence, of=of_it))
     return found
-
-
-def judged(report: Report) -> list[tuple[Compared, Judged]]:
-    """What is claimed, and what becomes of it."""
-    found = compared(report)
-    return list(zip(found, judge([x.claim for x in found]), strict=True))
 
 
 def _more(
@@ -245,24 +238,24 @@ def _more(
     return of_agents(more, min(map(len, ours)))
 
 
-def claims(report: Report) -> list[Claim]:
-    """Those of `compared`."""
-    return [x.claim for x in compared(report)]
-
-
-def without_one(report: Report) -> list[tuple[Compared, Judged, dict[str, Estimate]]]:
+def without_one(
+    judged: Sequence[Judged], scored: Scores
+) -> list[tuple[Judged, dict[str, Estimate]]]:
     """What is decided over several environments, and the difference without each of them; each for itself.
 
     One of them may be all that a mean shows.
     """
-    scored, found = scores(report), []
-    for x, of_it in judged(report):
-        if of_it.outcome in (HOLDS, FAILS) and len(x.places) > 1:
+    found = []
+    for x in judged:
+        of: Compared = x.claim.of
+        if x.outcome in (HOLDS, FAILS) and len(of.places) > 1:
             less = {
-                place: _more(scored, [y for y in x.places if y != place], x.name, x.other, x.rates)
-                for place in x.places
+                place: _more(
+                    scored, [y for y in of.places if y != place], of.name, of.other, of.rates
+                )
+                for place in of.places
             }
-            found.append((x, of_it, {place: y() for place, y in less.items() if callable(y)}))
+            found.append((x, {place: y() for place, y in less.items() if callable(y)}))
     return found
 
 
@@ -314,20 +307,21 @@ def facts(report: Report) -> dict[str, Any]:
                 else None,
             }
         )
-    pairs, less = judged(report), without_one(report)
-    leads = [(x, without) for x, of_it, without in less if of_it.outcome == HOLDS]
+    judged = judge(claims(report))
+    less = without_one(judged, scored)
     return {
         "rows": rows,
         "at_home": at_home(report),
         "without_one": less,
         "leaning": {
-            f"{x.name}, {x.words}": on
-            for x, without in leads
-            if (on := [place for place, lead in without.items() if (lead.low or 0.0) <= 0])
+            f"{x.claim.of.name}, {x.claim.of.words}": on
+            for x, without in less
+            if x.outcome == HOLDS
+            and (on := [place for place, lead in without.items() if lead.side() <= 0])
         },
         "at_the_ends": at_the_ends(report),
-        "more": _shown(pairs, HOLDS),
-        "less": {where: names for where, names in _shown(pairs, FAILS).items() if names},
+        "more": _shown(judged, HOLDS),
+        "less": {where: names for where, names in _shown(judged, FAILS).items() if names},
         "own": {place: entry["own"] for place, entry in entries.items()},
         "steps": {place: entry["steps"] for place, entry in entries.items()},
         "failed": lost(entries),
@@ -335,12 +329,12 @@ def facts(report: Report) -> dict[str, Any]:
     }
 
 
-def _shown(pairs: Sequence[tuple[Compared, Judged]], outcome: str) -> dict[str, list[str]]:
+def _shown(judged: Sequence[Judged], outcome: str) -> dict[str, list[str]]:
     """{at which rates, in words: objectives} of the comparisons with PPO's clip that end so."""
-    found: dict[str, list[str]] = {x.words: [] for x, of_it in pairs if of_it.outcome != UNTESTED}
-    for x, of_it in pairs:
-        if x.other == REFERENCE and of_it.outcome == outcome:
-            found[x.words].append(x.who)
+    found: dict[str, list[str]] = {x.claim.of.words: [] for x in judged if x.outcome != UNTESTED}
+    for x in judged:
+        if x.claim.of.other == REFERENCE and x.outcome == outcome:
+            found[x.claim.of.words].append(x.claim.of.who)
     return found
 
 

@@ -23,19 +23,19 @@ from matplotlib.figure import Figure
 
 from experiments.claims import HOLDS
 from experiments.harness import Experiment, Keeping
-from experiments.locomotion_claims import ASKED, STATED, claims, confirmed, leading, since, texts
+from experiments.locomotion_claims import ASKED, STATED, claims, confirmed, leading, since
 from experiments.parts import InParts, Keys, Part, file_name
 from experiments.reports import Report, rows_in, same_objectives
 from lpo import figures
 from lpo.comparison import Comparison, LearningCurves, changed, compare, ppo_spec
-from lpo.full_size import as_comparison, looked_at
+from lpo.full_size import as_comparison, comparisons
 from lpo.objectives import CLIPS, REFERENCE, learned_in, load_objective, zoo_names
 from scb.agents.spec import AgentSpec
 from scb.agents.values import check_value
 from scb.errors import at_least, unused
 from scb.files import packed, plain
 from scb.seeds import reporting, validation
-from scb.statistics import DECIDING, Estimate, iqm
+from scb.statistics import DECIDING, Estimate, iqm, paired_difference
 
 
 @dataclass(frozen=True)
@@ -281,14 +281,13 @@ def kept(curves: LearningCurves) -> dict[str, dict[str, Any]]:
 
 def facts(report: Report) -> dict[str, Any]:
     """The curves by environment."""
-    comparisons = {name: as_comparison(name, entry) for name, entry in looked_at(report).items()}
-    found = confirmed(report)
+    shown, found = comparisons(report), confirmed(report)
     decided = [judged for _, _, judged in found if judged]
     return {
-        "comparisons": comparisons,
-        "figures": {name: figure_of(name) for name in comparisons},
+        "comparisons": shown,
+        "figures": {name: figure_of(name) for name in shown},
         "deciding": DECIDING,
-        "learned_here": _learned_here(comparisons),
+        "learned_here": _learned_here(shown),
         "confirmations": [
             (
                 asked,
@@ -302,25 +301,45 @@ def facts(report: Report) -> dict[str, Any]:
         # What all pairs together may show, and those that were trained to confirm it do not.
         "unconfirmed": {x.claim.text for x in decided if x.outcome != HOLDS},
         "asked": {of: asked.beside() for of, asked in ASKED.items()},
-        "texts": texts(report),
         "sweeps": {
             name: (sweep, len(entry["sweep"][REFERENCE]), tuned(sweep))
             for name, entry in report["environments"].items()
             if (sweep := swept(entry))
         },
+        "beside_papers": beside_papers(shown),
         "at_rates": _told(at_rates, report),
         "leads_at_rates": _told(leads_at_rates, report),
         "led": {
             name: leading(curves)
-            for name, comparison in comparisons.items()
+            for name, comparison in shown.items()
             if (curves := _comparable(comparison))
         },
         "diagnosed": {
             name: {curve.objective: width(curve) for curve in curves}
-            for name, comparison in comparisons.items()
+            for name, comparison in shown.items()
             if (curves := _diagnosed(comparison))
         },
     }
+
+
+def beside_papers(
+    shown: Mapping[str, Comparison],
+) -> list[tuple[str, str, dict[str, Estimate]]]:
+    """(entry, objective, {measure: difference}) of agents at other learning rates and PPO's clip at the paper's.
+
+    Beside a clip that its learning rate makes worse, a lead is less than it seems.
+    """
+    found = []
+    for name, comparison in shown.items():
+        usual = shown.get(comparison.curves[0].environment)
+        if usual is None or usual is comparison:
+            continue
+        for curves in comparison.curves:
+            ours = {of: curves.paired(usual.curves[0], of) for of in ("final", "late", "area")}
+            if len(ours["final"][0]) >= DECIDING:
+                apart = {of: paired_difference(*both) for of, both in ours.items()}
+                found.append((name, curves.objective, apart))
+    return found
 
 
 def _told(of: Callable[[str, Report], Any], report: Report) -> dict[str, Any]:
@@ -331,8 +350,7 @@ def _told(of: Callable[[str, Report], Any], report: Report) -> dict[str, Any]:
 def draw(report: Mapping[str, Any]) -> dict[str, Figure]:
     """Learning curves of each environment, leads over PPO, and what an iteration does to the policy, where known."""
     drawn = {}
-    for name, entry in looked_at(report).items():
-        comparison = as_comparison(name, entry)
+    for name, comparison in comparisons(report).items():
         figure = figure_of(name)
         drawn[figure] = figures.learning_curves(comparison.curves)
         if curves := _comparable(comparison):
@@ -347,9 +365,9 @@ def figure_of(name: str) -> str:
     return "locomotion_" + file_name(name)
 
 
-def _learned_here(comparisons: Mapping[str, Comparison]) -> list[str]:
+def _learned_here(shown: Mapping[str, Comparison]) -> list[str]:
     """Objectives of the zoo among these that were learned for one of these environments."""
-    curves = [curve for comparison in comparisons.values() for curve in comparison.curves]
+    curves = [curve for comparison in shown.values() for curve in comparison.curves]
     names, here = {x.objective for x in curves}, {x.environment for x in curves}
     return [
         name

@@ -218,8 +218,8 @@ def ranked_elsewhere(report: Report) -> dict[str, dict[str, dict[str, Alignment]
 def reporting_there(report: Report, environment: str) -> dict[str, LearningCurves]:
     """{objective: its agents that report in an environment} of those that were trained in all others as well."""
     whole = full_size(environment)
-    curves = {} if whole is None else {curve.objective: curve for curve in whole.curves}
     known = ranked(environment, report["environments"][environment])
+    curves = {curve.objective: curve for curve in whole.curves} if whole else {}
     return _everywhere(report, {name: curve for name, curve in curves.items() if name in known})
 
 
@@ -229,82 +229,50 @@ def _everywhere(report: Report, curves: Mapping[str, LearningCurves]) -> dict[st
 
 
 def facts(report: Report) -> dict[str, Any]:
-    """The correlations as tables, the best regime, those shown to rank, what objectives earn in the environments."""
-    found, elsewhere = aligned(report), ranked_elsewhere(report)
-    earned = {
-        environment: {
-            name: {of: float(iqm(getattr(curve, of))) for of in OUTCOMES} | {"n": len(curve.seeds)}
-            for name, curve in ranked(environment, report["environments"][environment]).items()
-        }
-        for environment in found
-    }
-    tables = {
-        environment: {
-            outcome: {
-                name: [_text(row[label]) for label in LABELS] for name, row in regimes.items()
-            }
-            for outcome, regimes in of.items()
-        }
-        for environment, of in found.items()
-    }
-    # By what a search judges candidates by, against the whole training.
-    in_order = {
-        environment: sorted(
-            ((name, row[FITNESS]) for name, row in of["area"].items()),
-            key=lambda pair: pair[1].spearman or 0.0,
-            reverse=True,
-        )
-        for environment, of in found.items()
-    }
+    """{environment: what its section says} of those that regimes were measured for."""
+    elsewhere = ranked_elsewhere(report)
     return {
-        "tables": tables,
-        "best": {
-            environment: (pairs[0][0], _text(pairs[0][1]), len(pairs))
-            for environment, pairs in in_order.items()
-            if pairs
-        },
-        "shown": {
-            environment: [name for name, x in pairs if x.shown]
-            for environment, pairs in in_order.items()
-        },
-        "missing": {
-            environment: [name for name in REGIMES if name not in entry]
-            for environment, entry in report["environments"].items()
-        },
-        "earned": earned,
-        "agree": {
-            environment: {
-                outcome: _agree(ranked(environment, report["environments"][environment]), outcome)
-                for outcome in OUTCOMES
-            }
-            for environment in found
+        "found": {
+            environment: _section(report, environment, of, elsewhere.get(environment, {}))
+            for environment, of in aligned(report).items()
+            if of["area"]
         },
         "attainable": attainable,
-        "elsewhere": {
-            environment: {
-                other: [_text(x) for x in of_it.values()] for other, of_it in others.items()
-            }
-            for environment, others in elsewhere.items()
-        },
-        "elsewhere_shown": {
-            environment: [
-                other
-                for other, of_it in elsewhere.get(environment, {}).items()
-                if of_it["area"].shown
-            ]
-            for environment in found
-        },
-        "columns": {
-            environment: [
-                OUTCOMES.get(column)
-                or f"over the training, {len(reporting_there(report, environment))} objectives, agents that report"
-                for column in others[TOGETHER]
-            ]
-            for environment, others in elsewhere.items()
-        },
         "labels": LABELS,
         "judged_by": FITNESS,
         "outcomes": OUTCOMES,
+    }
+
+
+def _section(
+    report: Report,
+    environment: str,
+    found: Mapping[str, Mapping[str, Mapping[str, Alignment]]],
+    others: Mapping[str, Mapping[str, Alignment]],
+) -> dict[str, Any]:
+    """The correlations as tables, the best regime, those shown to rank, what objectives earn in the environment."""
+    regimes = report["environments"][environment]
+    curves, reporting = ranked(environment, regimes), len(reporting_there(report, environment))
+    words = {**OUTCOMES, REPORTED: f"over the training, {reporting} objectives, agents that report"}
+    # By what a search judges candidates by, against the whole training.
+    pairs = [(name, row[FITNESS]) for name, row in found["area"].items()]
+    pairs.sort(key=lambda pair: pair[1].spearman or 0.0, reverse=True)
+    return {
+        "tables": {
+            outcome: {name: [_text(x) for x in row.values()] for name, row in rows.items()}
+            for outcome, rows in found.items()
+        },
+        "best": (pairs[0][0], _text(pairs[0][1])),
+        "shown": [name for name, x in pairs if x.shown],
+        "missing": [name for name in REGIMES if name not in regimes],
+        "earned": {
+            name: {of: float(iqm(getattr(curve, of))) for of in OUTCOMES} | {"n": len(curve.seeds)}
+            for name, curve in curves.items()
+        },
+        "agree": {outcome: _agree(curves, outcome) for outcome in OUTCOMES},
+        "elsewhere": {name: [_text(x) for x in of_it.values()] for name, of_it in others.items()},
+        "elsewhere_shown": [name for name, of_it in others.items() if of_it["area"].shown],
+        "columns": [words[column] for column in others.get(TOGETHER, ())],
     }
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from experiments.claims import Claim, Judged, corrected, judge, of_agents
 from experiments.reports import Report
 from lpo.comparison import LearningCurves
-from lpo.full_size import Confirmation, as_comparison, looked_at, with_pairs
+from lpo.full_size import Confirmation, as_comparison, comparisons, looked_at, with_pairs
 from lpo.objectives import REFERENCE
 from scb.statistics import DECIDING, Estimate, paired_difference
 
@@ -52,22 +52,12 @@ def paired(
 def claims(report: Report) -> list[Claim]:
     """Of every objective but the reference, by each of `ASKED`."""
     found = []
-    for environment, entry in looked_at(report).items():
-        curves = as_comparison(environment, entry).by_name
+    for environment, comparison in comparisons(report).items():
+        curves = comparison.by_name
         reference = curves.pop(REFERENCE)
         for of_it in curves.values():
             found += [_claim(environment, of_it, reference, of) for of in ASKED]
     return found
-
-
-def texts(report: Report) -> dict[tuple[str, str], dict[str, str]]:
-    """{(entry, objective): {one of `ASKED`: text of the claim}}."""
-    return {
-        (entry, objective): {of: _text(entry, objective, of) for of in ASKED}
-        for entry, found in looked_at(report).items()
-        for objective in as_comparison(entry, found).by_name
-        if objective != REFERENCE
-    }
 
 
 def confirmed(report: Report) -> list[tuple[Confirmation, int, Judged | None]]:
@@ -128,28 +118,22 @@ def leading(curves: Sequence[LearningCurves]) -> tuple[int, dict[str, dict[str, 
         for steps, one, other in zip(reference.steps, ours.T, theirs.T, strict=True):
             if not steps:
                 continue
-            apart = paired_difference(one, other, corrected(number))
-            assert apart.low is not None and apart.high is not None
-            if apart.low > 0 or apart.high < 0:
-                side = found["ahead" if apart.low > 0 else "behind"]
-                side.setdefault(curve.objective, []).append(int(steps))
+            if side := paired_difference(one, other, corrected(number)).side():
+                where = found["ahead" if side > 0 else "behind"]
+                where.setdefault(curve.objective, []).append(int(steps))
     return number, found
-
-
-def _text(entry: str, objective: str, of: str, reference: str = REFERENCE, where: str = "") -> str:
-    return f"{entry}: {objective} {STATED[of].beside(reference, where)}"
 
 
 def _claim(
     entry: str, curves: LearningCurves, reference: LearningCurves, of: str, where: str = ""
 ) -> Claim:
     asked, evidence = STATED[of], paired(curves, reference, of)
-    text = _text(entry, curves.objective, of, reference.objective, where)
+    text = f"{entry}: {curves.objective} {asked.beside(reference.objective, where)}"
     if not asked.margin:
-        return Claim(text, evidence, places=0)
+        return Claim(text, evidence, places=0, of=(entry, curves.objective))
     margin = float(f"{asked.margin * abs(float(getattr(reference, asked.measure).mean())):.4g}")
     reason = f"a twentieth of what {_called(reference.objective)} earns"
-    return Claim(text, evidence, 0.0, margin, reason, places=0)
+    return Claim(text, evidence, 0.0, margin, reason, 0, (entry, curves.objective))
 
 
 def _called(reference: str) -> str:

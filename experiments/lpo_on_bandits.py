@@ -138,25 +138,24 @@ def _judge(
     if not any(lacking.values()):
         return
     seeds = reporting(agents)
-    curves = compare(
+    comparison = compare(
         environment,
         [objective for group in lacking.values() for objective in group],
         seeds,
         spec=spec,
         points=15,
         rows=rows,
-    ).curves
-    of = {curve.objective: curve for curve in curves}
+    )
     for name, group in lacking.items():
         for returns, kind in ((finals, "final"), (areas, "area")):
             returns.setdefault(name, []).extend(
-                np.round(getattr(of[o.name], kind), 2).tolist() for o in group
+                np.round(getattr(comparison.by_name[o.name], kind), 2).tolist() for o in group
             )
     for kind in ("finals", "areas"):
         table[kind] = {name: table[kind][name] for name in lacking}
     table["seeds"] = seeds
     table["protocol"] = (
-        f"{environment}: {agents} agents an objective (and search), {curves[0].steps[-1]:,} steps, policy's "
+        f"{environment}: {agents} agents an objective (and search), {comparison.curves[0].steps[-1]:,} steps, policy's "
         f"last layer times {spec.hyperparameters.policy_output_scale:g} at initialisation."
     )
 

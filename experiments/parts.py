@@ -117,6 +117,16 @@ class InParts:
                 save()
 
 
+def by_environment(measured: Callable[[str, Any], Any]) -> InParts:
+    """A part for each of the plan's environments."""
+
+    def parts(plan: Any, report: dict[str, Any]) -> Iterator[Part]:
+        for name in plan["environments"]:
+            yield Part(("environments", name), partial(measured, name, plan))
+
+    return InParts(parts)
+
+
 @dataclass(frozen=True)
 class Jobs:
     """Where an experiment's parts are measured."""

@@ -180,8 +180,8 @@ def claims(report: Report) -> list[Claim]:
                 if shared:
                     here, there = (returns_of(cell, shared)[:, point] for cell in both)
                     evidence = of_agents(partial(paired_difference, here, there), len(shared))
-                text = _claimed(name, algorithm, steps[point])
-                found.append(Claim(text, evidence, places=0))
+                text = f"{name}, {algorithm.upper()} after {thousands(steps[point])} steps"
+                found.append(Claim(text, evidence, places=0, of=point == len(steps) - 1))
     return found
 
 
@@ -217,20 +217,11 @@ def facts(report: Report) -> dict[str, Any]:
 
 def _outcomes(report: Report) -> list[str]:
     """What becomes of the claims after the most steps, of the algorithms that have enough agents."""
-    ends = {
-        _claimed(name, algorithm, report["steps"][algorithm][-1])
-        for name, algorithms in report["agents"].items()
-        for algorithm in algorithms
-    }
     return [
         x.outcome
         for x in judge(claims(report))
-        if x.claim.text in ends and x.estimate and x.estimate.n >= DECIDING
+        if x.claim.of and x.estimate and x.estimate.n >= DECIDING
     ]
-
-
-def _claimed(environment: str, algorithm: str, steps: int) -> str:
-    return f"{environment}, {algorithm.upper()} after {thousands(steps)} steps"
 
 
 def draw(report: Mapping[str, Any]) -> Figure:

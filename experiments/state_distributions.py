@@ -5,7 +5,7 @@
 The experts are those of `experiments.experts`, trained again.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -18,7 +18,7 @@ from experiments import experts
 from experiments.claims import Claim
 from experiments.harness import Experiment
 from experiments.interpretability import action_bar, draw_actions
-from experiments.parts import InParts, Part
+from experiments.parts import by_environment
 from experiments.reports import Report, bandit_of
 from scb import plotting
 from scb.analysis.components import ReplacedBandit, q_reward
@@ -39,15 +39,6 @@ SEED = ILLUSTRATING[1_000]
 BANDIT_COVERAGE, EXPERT_COVERAGE = "bandit's coverage", "expert's coverage"
 OUTSIDE = "contexts off the plane"
 BANDIT_ROUGHNESS, EXPERT_ROUGHNESS = "bandit's roughness", "expert's roughness"
-
-
-def parts(plan: Mapping[str, Any], report: dict[str, Any]) -> Iterator[Part]:
-    """Environments."""
-    for name in plan["environments"]:
-        yield Part(("environments", name), partial(_examine, name, plan))
-
-
-measure = InParts(parts)
 
 
 def _examine(environment: str, plan: Mapping[str, Any]) -> dict[str, Any]:
@@ -88,6 +79,9 @@ def _examine(environment: str, plan: Mapping[str, Any]) -> dict[str, Any]:
         "bandit_actions": best(bandit),
         "expert_actions": best(ReplacedBandit(bandit, q_reward(expert, space))),
     }
+
+
+measure = by_environment(_examine)
 
 
 def stored_points(points: np.ndarray, limits: Any) -> list[str]:

@@ -101,14 +101,13 @@ def difference(
     return of_searches(first, second, paired=not reference)
 
 
-def compared(report: Report) -> list[tuple[str, str]]:
-    """(objective, evaluation) of every claim."""
-    return [(name, e["name"]) for name in report["objectives"] for e in report["evaluations"]]
-
-
 def claims(report: Report) -> list[Claim]:
     """Of every objective and evaluation: above the default."""
-    return [Claim(f"{name}, {e}", difference(report, name, e)) for name, e in compared(report)]
+    return [
+        Claim(f"{name}, {e['name']}", difference(report, name, e["name"]), of=(name, e["name"]))
+        for name in report["objectives"]
+        for e in report["evaluations"]
+    ]
 
 
 def summary(report: Report) -> list[dict[str, Any]]:
@@ -116,7 +115,7 @@ def summary(report: Report) -> list[dict[str, Any]]:
 
     Intervals of the differences are corrected for their number.
     """
-    found = dict(zip(compared(report), judge(claims(report)), strict=True))
+    found = {x.claim.of: x for x in judge(claims(report))}
     rows = []
     for name, entry in report["objectives"].items():
         row: dict[str, Any] = {

@@ -218,7 +218,7 @@ def suite_scores(scores: "SuiteScores", suite: str) -> Figure:
 
     Args:
       scores: of `lpo.suite.run_suite`.
-      suite: its name.
+      suite: its name, and what is left out of it.
     """
     style = looks(scores.objectives)
     thresholds = np.linspace(-0.1, 1.3, 141)

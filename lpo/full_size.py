@@ -211,6 +211,11 @@ def looked_at(report: Mapping[str, Any]) -> dict[str, Any]:
     return {name: entry for name, entry in found.items() if REFERENCE in entry["agents"]}
 
 
+def comparisons(report: Mapping[str, Any]) -> dict[str, Comparison]:
+    """{entry: its curves} of what is `looked_at`."""
+    return {name: as_comparison(name, entry) for name, entry in looked_at(report).items()}
+
+
 def longer(comparison: Comparison) -> Comparison | None:
     """What was measured at full size where a comparison trained for fewer steps."""
     whole = full_size(comparison.curves[0].environment)

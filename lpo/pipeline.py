@@ -222,11 +222,11 @@ def _figures(
     for name, comparison in whole.items():
         drawn[f"{name}_full_size"] = figures.learning_curves(comparison.curves)
     drawn["drift_and_gradient"] = drift_figures.drift_and_gradient(objectives)
-    paths = {}
-    for name, figure in drawn.items():
-        path = run.folder / "figures" / f"{name.replace('/', '-')}.png"
-        paths[name] = plotting.save(figure, path)
-    return paths
+    folder = run.folder / "figures"
+    return {
+        name: plotting.save(figure, folder / f"{name.replace('/', '-')}.png")
+        for name, figure in drawn.items()
+    }
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -15,11 +15,12 @@ import jinja2
 
 from lpo.certificate import LARGEST_KINK, Certificate
 from scb.plotting import ratio_text, thousands
-from scb.statistics import DECIDING, places_apart, places_of, typeset
+from scb.statistics import DECIDING, Estimate, places_apart, places_of, typeset
 
 Verdict = Literal["better", "worse", "undecided", "few seeds", "not compared"]
 
 _NAMES = {"ppo": "PPO's clip"}
+_VERDICTS: dict[int, Verdict] = {1: "better", 0: "undecided", -1: "worse"}
 
 
 @dataclass(frozen=True)
@@ -119,11 +120,10 @@ def _sentence(name: str, environment: str, comparison: Mapping[str, Any]) -> Hea
 
 
 def _verdict(difference: Mapping[str, Any]) -> Verdict:
-    if difference["low"] is None or difference["n"] < DECIDING:
+    found = Estimate(**difference)
+    if found.low is None or found.n < DECIDING:
         return "few seeds"
-    if difference["low"] > 0:
-        return "better"
-    return "worse" if difference["high"] < 0 else "undecided"
+    return _VERDICTS[found.side()]
 
 
 def _rows(comparison: Mapping[str, Any], learned: str | None) -> list[dict[str, Any]]:

@@ -240,6 +240,9 @@ class Evaluate(Comparing):
             }
             write_json(folder / "suite.json", content)
             plotting.save(figures.suite_scores(scores, name), folder / "suite.png")
+            if elsewhere is not None:
+                drawn = figures.suite_scores(elsewhere, f"{name} without {', '.join(homes)}")
+                plotting.save(drawn, folder / "suite_elsewhere.png")
 
 
 def _scores_table(scores: SuiteScores, where: str) -> Table:

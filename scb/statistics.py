@@ -44,6 +44,12 @@ class Estimate:
             f"{self.value:.{places}f} [{self.low:.{places}f}, {self.high:.{places}f}] (n={self.n})"
         )
 
+    def side(self, of: float = 0.0) -> int:
+        """1 where the whole interval lies above a number, -1 where it lies below, and 0 where nothing is decided."""
+        if self.low is None or self.high is None:
+            return 0
+        return int(self.low > of) - int(self.high < of)
+
     def without_interval(self) -> "Estimate":
         """The value alone, of what is too few to tell its spread."""
         return replace(self, low=None, high=None)

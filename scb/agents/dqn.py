@@ -1,7 +1,6 @@
 """Deep Q-learning (Mnih et al., 2015) and double Q-learning (van Hasselt et al., 2015), one traced flag apart."""
 
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 
 import jax
@@ -133,6 +132,5 @@ class DQN(OffPolicyAgent):
 
 
 DQN_ALGORITHM = Algorithm("dqn", DQN, DQNConfig, DQNHyperparameters, actions=("discrete",))
-DDQN_ALGORITHM = Algorithm(
-    "ddqn", DQN, DQNConfig, partial(DQNHyperparameters, double=1.0), actions=("discrete",)
-)
+# Whose hyperparameters are double DQN's by default.
+DDQN_ALGORITHM = Algorithm("ddqn", DQN, DQNConfig, DQNHyperparameters, actions=("discrete",))

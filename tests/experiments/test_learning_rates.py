@@ -126,8 +126,10 @@ def test_objectives_are_compared_where_they_were_not_learned_at_the_same_rates_a
 def test_what_is_decided_over_several_is_told_without_each_of_them(report):
     best = "each at the rate chosen for it"
     found = {
-        (x.name, x.other, x.words): {place: round(e.value, 2) for place, e in without.items()}
-        for x, _, without in module.without_one(report)
+        (x.claim.of.name, x.claim.of.other, x.claim.of.words): {
+            place: round(e.value, 2) for place, e in without.items()
+        }
+        for x, without in module.facts(report)["without_one"]
     }
     # Neither what is undecided nor what is of one environment.
     assert ("dpo", "ppo", "at rates of 0.0003 and less") not in found

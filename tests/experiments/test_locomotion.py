@@ -311,6 +311,25 @@ def test_agents_that_report_at_another_rate_stand_apart(tmp_path, trained_at):
     assert "--environments hopper`" in page and "`--learning-rate` for those" in page
 
 
+def test_agents_at_another_rate_stand_beside_the_clip_at_the_papers():
+    made = report(10)
+    usual = made["environments"]["hopper"]
+    # Of the same seeds as PPO's there, and of too few others.
+    agents = {"ppo": usual["agents"]["dpo"], "dpo": module.kept(curves("dpo", range(100, 104)))}
+    other = {"environment": "hopper", "hyperparameters": {"learning_rate": 0.001}}
+    made["environments"]["hopper at 0.001"] = {**usual, **other, "agents": agents}
+    ((name, objective, apart),) = module.facts(made)["beside_papers"]
+    assert (name, objective, apart["final"].n) == ("hopper at 0.001", "ppo", 10)
+    assert {of: round(x.value) for of, x in apart.items()} == {
+        "final": 100,
+        "late": 100,
+        "area": 50,
+    }
+    row = "| hopper at 0.001: ppo | 10 | +100 [100, 100] | +100 [100, 100] | +50 [50, 50] |"
+    assert row in module.EXPERIMENT.page(made)
+    assert "at the paper's learning rate" not in module.EXPERIMENT.page(report(10))
+
+
 def test_agents_whose_learning_rate_falls_to_zero_stand_apart(tmp_path, compared, monkeypatch):
     settings, stub = [], module.compare
 

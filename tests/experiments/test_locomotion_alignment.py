@@ -158,12 +158,12 @@ def test_others_are_environments_with_an_expert(tmp_path, environment, trained, 
 def test_regimes_are_compared_over_the_objectives_that_all_have(tmp_path, environment, trained):
     report, _ = run(tmp_path)
     del report["environments"]["hopper"]["its own"]["fitness"]["dpo"]
-    facts = module.facts(report)
-    assert facts["earned"]["hopper"].keys() == EARNED.keys() - {"dpo"}
-    assert facts["best"]["hopper"][2] == len(module.REGIMES)
-    assert facts["missing"] == {"hopper": []}
+    found = module.facts(report)["found"]["hopper"]
+    assert found["earned"].keys() == EARNED.keys() - {"dpo"}
+    assert len(found["tables"]["area"]) == len(module.REGIMES)
+    assert found["missing"] == []
     del report["environments"]["hopper"]["Pendulum's"]["fitness"]["ppo"]
-    assert module.facts(report)["best"] == {}  # two objectives rank nothing
+    assert module.facts(report)["found"] == {}  # two objectives rank nothing
 
 
 def test_what_was_measured_of_a_bandit_that_was_replaced_is_measured_again(

@@ -233,6 +233,7 @@ def test_a_killed_suite_is_completed_to_the_same_scores(tmp_path, tiny_agent, mo
     first = json.loads((out / "suite.json").read_text())
     assert (first["objectives"], first["seeds"]) == (["ppo"], [1000, 1001])
     assert (out / "suite.png").stat().st_size > 5000
+    assert first["elsewhere"] is None and not (out / "suite_elsewhere.png").exists()
 
     rows = (out / "rows.jsonl").read_bytes()
     (out / "rows.jsonl").write_bytes(rows[: len(rows) * 2 // 3])
@@ -247,7 +248,12 @@ def test_a_killed_suite_is_completed_to_the_same_scores(tmp_path, tiny_agent, mo
     with pytest.raises(UserError, match=r"differs at config.objectives \(\['ppo'\] there"):
         training_commands.Evaluate.parse(["--suite=classic", f"--out={out}"]).run()
 
+    # And what is over the environments that none was learned for has a figure of its own.
+    monkeypatch.setattr(training_commands, "learned_in", lambda _: ["Synthetic-CartPole-v1"])
     training_commands.Evaluate.parse([f"--resume={out}", "--seeds=3"]).run()
+    (left,) = json.loads((out / "suite.json").read_text())["elsewhere"]["environments"]
+    assert left["name"] == "Synthetic-Pendulum-v1"
+    assert (out / "suite_elsewhere.png").stat().st_size > 5000
     assert (out / "rows.jsonl").read_bytes().startswith(rows)
     assert json.loads((out / "suite.json").read_text())["seeds"] == [1000, 1001, 1002]
 
