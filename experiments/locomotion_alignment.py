@@ -252,8 +252,8 @@ def _section(
 ) -> dict[str, Any]:
     """The correlations as tables, the best regime, those shown to rank, what objectives earn in the environment."""
     regimes = report["environments"][environment]
-    curves, reporting = ranked(environment, regimes), len(reporting_there(report, environment))
-    words = {**OUTCOMES, REPORTED: f"over the training, {reporting} objectives, agents that report"}
+    curves, number = ranked(environment, regimes), len(reporting_there(report, environment))
+    words = {**OUTCOMES, REPORTED: f"over the training, {number} objectives, agents that report"}
     # By what a search judges candidates by, against the whole training.
     pairs = [(name, row[FITNESS]) for name, row in found["area"].items()]
     pairs.sort(key=lambda pair: pair[1].spearman or 0.0, reverse=True)
