@@ -111,8 +111,9 @@ class MetaTrainingConfig:
         tasks: Any = self.tasks
         if isinstance(tasks, str):
             raise UserError(f"the tasks are {self.tasks!r}, a text: give a tuple of names.")
-        names = tuple(str(task) if isinstance(task, Path) else task for task in tasks)
-        object.__setattr__(self, "tasks", names)
+        if isinstance(tasks, tuple | list):
+            names = tuple(str(task) if isinstance(task, Path) else task for task in tasks)
+            object.__setattr__(self, "tasks", names)
         hyperparameters: Any = self.hyperparameters
         if not isinstance(hyperparameters, Mapping):
             raise UserError(

@@ -172,6 +172,7 @@ def test_numbers_of_any_library_are_hyperparameters(bandit):
         (lambda: MetaTrainingConfig(drift=lpo.LearnedDrift), "drift is the class LearnedDrift its"),
         (lambda: lpo.compare("CartPole-v1", ["ppo"], [0], episodes=1.5), "episodes is 1.5: it mus"),
         (lambda: lpo.compare("CartPole-v1", ["ppo"], [0], points=1.5), "points is 1.5: it must be"),
+        (lambda: MetaTrainingConfig(tasks=None), "the list of tasks is empty"),
         (lambda: scb.load_bandit(3), "a bandit is 3: give a name, or a file"),
         (
             lambda: scb.PPO(gymnax.make("Pendulum-v1")[0], scb.PPOConfig()).init(
