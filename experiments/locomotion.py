@@ -23,7 +23,7 @@ from matplotlib.figure import Figure
 
 from experiments.claims import HOLDS
 from experiments.harness import Experiment, Keeping
-from experiments.locomotion_claims import ASKED, STATED, claims, confirmed, leading, since
+from experiments.locomotion_claims import ASKED, STATED, claims, confirmed, leading, paired, since
 from experiments.parts import InParts, Keys, Part, file_name
 from experiments.reports import Report, rows_in, same_objectives
 from lpo import figures
@@ -35,7 +35,7 @@ from scb.agents.values import check_value
 from scb.errors import at_least, unused
 from scb.files import packed, plain
 from scb.seeds import reporting, validation
-from scb.statistics import DECIDING, Estimate, iqm, paired_difference
+from scb.statistics import DECIDING, Estimate, iqm
 
 
 @dataclass(frozen=True)
@@ -335,9 +335,8 @@ def beside_papers(
         if usual is None or usual is comparison:
             continue
         for curves in comparison.curves:
-            ours = {of: curves.paired(usual.curves[0], of) for of in ("final", "late", "area")}
-            if len(ours["final"][0]) >= DECIDING:
-                apart = {of: paired_difference(*both) for of, both in ours.items()}
+            measured = {of: paired(curves, usual.curves[0], of) for of in ("final", "late", "area")}
+            if apart := {of: x() for of, x in measured.items() if callable(x)}:
                 found.append((name, curves.objective, apart))
     return found
 
