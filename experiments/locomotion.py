@@ -23,19 +23,36 @@ from matplotlib.figure import Figure
 
 from experiments.claims import HOLDS
 from experiments.harness import Experiment, Keeping
-from experiments.locomotion_claims import ASKED, STATED, claims, confirmed, leading, paired, since
+from experiments.locomotion_claims import (
+    ASKED,
+    STATED,
+    claims,
+    confirmed,
+    leading,
+    since,
+    summary,
+)
+from experiments.locomotion_rates import (
+    at_rates,
+    beside_papers,
+    label,
+    leads_at_rates,
+    named,
+    swept,
+    tuned,
+)
 from experiments.parts import InParts, Keys, Part, file_name
 from experiments.reports import Report, rows_in, same_objectives
 from lpo import figures
 from lpo.comparison import Comparison, LearningCurves, changed, compare, ppo_spec
-from lpo.full_size import as_comparison, comparisons
+from lpo.full_size import comparisons
 from lpo.objectives import CLIPS, REFERENCE, learned_in, load_objective, zoo_names
 from scb.agents.spec import AgentSpec
 from scb.agents.values import check_value
 from scb.errors import at_least, unused
 from scb.files import packed, plain
 from scb.seeds import reporting, validation
-from scb.statistics import DECIDING, Estimate, iqm
+from scb.statistics import DECIDING
 
 
 @dataclass(frozen=True)
@@ -119,7 +136,7 @@ def parts(options: Options, report: dict[str, Any]) -> Iterator[Part]:
             for rate in options.rates:
                 at_rate = partial(_of, environment, objectives, seeds, options, report)
                 setting = options.setting(rate)
-                yield from at_rate(("rates", _label(setting)), setting)
+                yield from at_rate(("rates", label(setting)), setting)
             best = tuned(swept(report.get("environments", {}).get(environment, {})))
             names = (*names, best) if best and best not in names else names
         yield from _of(
@@ -132,20 +149,6 @@ def parts(options: Options, report: dict[str, Any]) -> Iterator[Part]:
             given,
             named(environment, given),
         )
-
-
-ANNEALED = "annealed"
-
-
-def _label(setting: Mapping[str, Any]) -> str:
-    """What it is called, such as "0.001" or "0.001, annealed"."""
-    return f"{setting['learning_rate']}" + (f", {ANNEALED}" if len(setting) > 1 else "")
-
-
-def named(environment: str, setting: Mapping[str, Any]) -> str:
-    """The entry of what reports there: "hopper", "hopper at 0.001", "hopper at 0.001, annealed"."""
-    own = {"learning_rate": float(ppo_spec(environment).hyperparameters.learning_rate)}
-    return environment if setting in ({}, own) else f"{environment} at {_label(setting)}"
 
 
 def _of(
@@ -170,65 +173,6 @@ def _of(
 
 
 measure = InParts(parts)
-
-
-def swept(entry: Report) -> dict[str, float]:
-    """{clip: what it earns over the last quarter of the training}, as soon as all have as many agents."""
-    found = entry.get("sweep", {})
-    numbers = {len(found.get(clip, ())) for clip in CLIPS}
-    if len(numbers) > 1 or numbers == {0}:
-        return {}
-    curves = as_comparison("", entry, {clip: found[clip] for clip in CLIPS}).curves
-    return {curve.objective: float(iqm(curve.late)) for curve in curves}
-
-
-def at_rates(environment: str, entry: Report) -> dict[str, dict[str, tuple[float, float, int]]]:
-    """{learning rate: {objective: (over the training, over the last quarter, agents)}} of those that report nothing."""
-    if not (rates := entry.get("rates")):
-        return {}
-    own = str(float(ppo_spec(environment).hyperparameters.learning_rate))
-    there = {name for of_it in rates.values() for name in of_it}
-    found = {own: {k: x for k, x in entry.get("sweep", {}).items() if k in there}, **rates}
-    return {
-        rate: {
-            curve.objective: (float(iqm(curve.area)), float(iqm(curve.late)), len(curve.seeds))
-            for curve in as_comparison(environment, entry, found[rate]).curves
-        }
-        for rate in sorted(found, key=lambda rate: (float(rate.partition(",")[0]), rate))
-    }
-
-
-def leads_at_rates(
-    environment: str, entry: Report
-) -> list[tuple[str, str, int, Estimate, Estimate]]:
-    """Of objectives with enough agents at another rate: (rate, name, pairs, more than PPO over the training, late).
-
-    Where the rate falls in others, they are beside PPO with it too, as "0.001 beside PPO at 0.001, annealed".
-    """
-    found = []
-    rates = entry.get("rates", {})
-    for rate, agents in rates.items():
-        falling = f"{rate}, {ANNEALED}"
-        for other in (rate, falling) if falling in rates else (rate,):
-            if REFERENCE not in rates[other]:
-                continue
-            where = rate if other == rate else f"{rate} beside PPO at {other}"
-            (reference,) = as_comparison(
-                environment, entry, {REFERENCE: rates[other][REFERENCE]}
-            ).curves
-            ours = as_comparison(environment, entry, agents).curves
-            comparison = Comparison(
-                [reference, *(x for x in ours if other != rate or x.objective != REFERENCE)]
-            )
-            area, late = (comparison.differences(of) for of in ("area", "late"))
-            enough = {name: x.n for name, x in area.items() if x.n >= DECIDING}
-            found += [(where, name, n, area[name], late[name]) for name, n in enough.items()]
-    return found
-
-
-def tuned(sweep: Mapping[str, float]) -> str | None:
-    """The clip that earns most; None where not all have been measured."""
-    return max(sweep, key=lambda clip: sweep[clip]) if sweep else None
 
 
 def _trained(
@@ -301,6 +245,7 @@ def facts(report: Report) -> dict[str, Any]:
         # What all pairs together may show, and those that were trained to confirm it do not.
         "unconfirmed": {x.claim.text for x in decided if x.outcome != HOLDS},
         "asked": {of: asked.beside() for of, asked in ASKED.items()},
+        "summary": partial(summary, decided),
         "sweeps": {
             name: (sweep, len(entry["sweep"][REFERENCE]), tuned(sweep))
             for name, entry in report["environments"].items()
@@ -320,25 +265,6 @@ def facts(report: Report) -> dict[str, Any]:
             if (curves := _diagnosed(comparison))
         },
     }
-
-
-def beside_papers(
-    shown: Mapping[str, Comparison],
-) -> list[tuple[str, str, dict[str, Estimate]]]:
-    """(entry, objective, {measure: difference}) of agents at other learning rates and PPO's clip at the paper's.
-
-    Beside a clip that its learning rate makes worse, a lead is less than it seems.
-    """
-    found = []
-    for name, comparison in shown.items():
-        usual = shown.get(comparison.curves[0].environment)
-        if usual is None or usual is comparison:
-            continue
-        for curves in comparison.curves:
-            measured = {of: paired(curves, usual.curves[0], of) for of in ("final", "late", "area")}
-            if apart := {of: x() for of, x in measured.items() if callable(x)}:
-                found.append((name, curves.objective, apart))
-    return found
 
 
 def _told(of: Callable[[str, Report], Any], report: Report) -> dict[str, Any]:

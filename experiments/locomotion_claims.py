@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from experiments.claims import Claim, Judged, corrected, judge, of_agents
+from experiments.claims import FAILS, HOLDS, Claim, Judged, corrected, judge, of_agents
 from experiments.reports import Report
 from lpo.comparison import LearningCurves
 from lpo.full_size import Confirmation, as_comparison, comparisons, looked_at, with_pairs
@@ -74,6 +74,56 @@ def confirmed(report: Report) -> list[tuple[Confirmation, int, Judged | None]]:
             )
         found.append((asked, len(seeds), judged))
     return found
+
+
+@dataclass(frozen=True)
+class Shown:
+    """What is shown of an objective, in words such as "ends no lower than PPO".
+
+    Attributes:
+      entry, objective: whose it is.
+      stated: what was stated first, and confirmed.
+      pooled: what all pairs together show beside that; nothing that new pairs were to confirm, and did not.
+      refuted: what all pairs together show not to be so.
+    """
+
+    entry: str
+    objective: str
+    stated: list[str]
+    pooled: list[str]
+    refuted: list[str]
+
+
+def summary(decided: Sequence[Judged], judged: Sequence[Judged]) -> list[Shown]:
+    """Of every objective of which anything is: by claims that were stated first, and by those that are asked of all."""
+    held = {x.claim.text for x in decided if x.outcome == HOLDS}
+    # Who earns more earns no less.
+    known = {x.claim.text for x in decided} | {
+        x.replace("earns more", "earns no less") for x in held
+    }
+    new = [x for x in judged if x.claim.text not in known]
+
+    def words(
+        entry: str, objective: str, outcomes: Sequence[Judged], outcome: str = HOLDS
+    ) -> list[str]:
+        texts = [
+            x.claim.text
+            for x in outcomes
+            if x.claim.of == (entry, objective) and x.outcome == outcome
+        ]
+        return [text.removeprefix(f"{entry}: {objective} ") for text in texts]
+
+    rows = [
+        Shown(
+            entry,
+            name,
+            words(entry, name, decided),
+            words(entry, name, new),
+            words(entry, name, judged, FAILS),
+        )
+        for entry, name in dict.fromkeys(x.claim.of for x in (*judged, *decided))
+    ]
+    return [row for row in rows if row.stated or row.pooled or row.refuted]
 
 
 def since(report: Report, asked: Confirmation) -> tuple[list[int], Estimate] | None:

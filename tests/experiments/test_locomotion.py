@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments import claims, locomotion_claims
+from experiments import claims, locomotion_claims, locomotion_rates
 from experiments import locomotion as module
 from lpo import figures, full_size
 from lpo.comparison import Comparison
@@ -93,7 +93,7 @@ def test_a_clip_is_chosen_on_seeds_that_report_nothing_and_compared(
     limit[0] = 9
     with pytest.raises(ConnectionError):
         module.EXPERIMENT.main([*flags, "--out", str(out)])
-    assert module.swept(json.loads(out.read_text())["environments"]["hopper"]) == {}
+    assert locomotion_rates.swept(json.loads(out.read_text())["environments"]["hopper"]) == {}
     limit[0] = 100
     assert module.EXPERIMENT.main([*flags, "--out", str(out)]) == 0
     judged = tuple(REPORTING[:2])
@@ -114,7 +114,7 @@ def test_further_objectives_are_trained_on_seeds_that_report_nothing(tmp_path, c
     validating = [(name, seeds) for _, name, seeds in asked if seeds == (VALIDATING[0],)]
     assert {name for name, _ in validating} == {*module.CLIPS, "none", "dpo-4-1.2"}
     entry = json.loads(out.read_text())["environments"]["hopper"]
-    assert set(module.swept(entry)) == set(module.CLIPS)
+    assert set(locomotion_rates.swept(entry)) == set(module.CLIPS)
     assert "dpo-4-1.2" not in (tmp_path / "locomotion.md").read_text()
     with pytest.raises(UserError, match=r"validated is .*give tuning_agents"):
         module.Options(validated=("none",))
@@ -234,7 +234,7 @@ def test_objectives_are_trained_at_other_rates_by_agents_that_report_nothing(
     entry = json.loads(out.read_text())["environments"]["hopper"]
     assert entry["rates"]["0.001"].keys() == {"ppo", "dpo"} and "ppo" in entry["sweep"]
     assert {*entry["agents"]["ppo"]}.isdisjoint(map(str, seeds))
-    rates = module.at_rates("hopper", entry)
+    rates = locomotion_rates.at_rates("hopper", entry)
     assert [*rates] == ["0.00025", "0.001"] and [*rates["0.001"]] == ["ppo", "dpo"]
     area, late, agents = rates["0.001"]["dpo"]
     assert (area, late, agents) == (275.25, 500.5, 2)
@@ -252,7 +252,9 @@ def test_enough_pairs_at_another_rate_are_told_with_their_intervals():
     entry["sweep"] = {name: entry["agents"][name] for name in CLIPS if name in entry["agents"]}
     few = {name: dict(list(of_it.items())[:9]) for name, of_it in entry["agents"].items()}
     entry["rates"] = {"0.001": entry["agents"], "0.002": few}
-    ((rate, name, pairs, area, late), (_, other, *_)) = module.leads_at_rates("hopper", entry)
+    ((rate, name, pairs, area, late), (_, other, *_)) = locomotion_rates.leads_at_rates(
+        "hopper", entry
+    )
     assert (rate, name, pairs, other) == ("0.001", "dpo", 10, "lpo-pendulum")
     ours, theirs = (full_size.as_comparison("hopper", entry).by_name[x] for x in ("dpo", "ppo"))
     assert area == paired_difference(ours.area, theirs.area)
@@ -264,7 +266,7 @@ def test_enough_pairs_at_another_rate_are_told_with_their_intervals():
     entry["rates"] = {"0.001": entry["agents"], "0.001, annealed": falling}
     leads = {
         (rate, name): area.value
-        for rate, name, _, area, _ in module.leads_at_rates("hopper", entry)
+        for rate, name, _, area, _ in locomotion_rates.leads_at_rates("hopper", entry)
     }
     beside = "0.001 beside PPO at 0.001, annealed"
     assert leads == pytest.approx(
@@ -361,7 +363,7 @@ def test_agents_whose_learning_rate_falls_to_zero_stand_apart(tmp_path, compared
         "learning_rate": 0.001,
         "anneal_learning_rate": True,
     }
-    assert [*module.at_rates("hopper", entries["hopper"])] == [
+    assert [*locomotion_rates.at_rates("hopper", entries["hopper"])] == [
         "0.00025",
         "0.0005, annealed",
         "0.001, annealed",

@@ -11,6 +11,13 @@ from lpo import full_size
 from tests.experiments.hoppers import report
 
 
+def shown(made):
+    """The lines of the page's first table."""
+    page = module.EXPERIMENT.page(made)
+    assert page.index("stated first, and confirmed") < page.index("![Learning curves")
+    return page.partition("![Learning curves")[0].splitlines()
+
+
 def test_a_confirmation_is_decided_by_its_own_agents_when_all_are_there(monkeypatch):
     asked = full_size.Confirmation("hopper", "dpo", range(4, 14))
     monkeypatch.setattr(full_size, "CONFIRMATIONS", (asked,))
@@ -61,20 +68,40 @@ def test_what_only_all_pairs_together_show_is_not_said_to_be_shown(monkeypatch):
     monkeypatch.setattr(full_size, "CONFIRMATIONS", (asked,))
     made = report(40)
     agents = made["environments"]["hopper"]["agents"]
-    shown, row = (
-        "Shown to earn more than it over the training: dpo on hopper",
-        "dpo earns more over the training",
-    )
-    assert shown in module.EXPERIMENT.page(made)
+    row = "dpo earns more over the training"
+    known = "ends no lower than PPO; earns no less over the last quarter than PPO"
+    assert f"| hopper: dpo | earns more over the training than PPO | {known} |  |" in shown(made)
     for seed in asked.seeds:  # the new pairs are level
         agents["dpo"][str(seed)] = agents["ppo"][str(seed)]
     page = module.EXPERIMENT.page(made)
-    assert "Shown to earn more than it over the training: none" in page
+    assert f"| hopper: dpo |  | {known} |  |" in shown(made)
     assert "all pairs together have an interval above: dpo on hopper earns more over the" in page
     (line,) = [x for x in page.splitlines() if x.startswith("| hopper: dpo | 40 |")]
     assert line.endswith(" not confirmed |") and line.count("**") == 2 * 2
     (stated,) = [x for x in page.splitlines() if x.startswith(f"| hopper: {row}")]
     assert "| not confirmed: " in stated
+
+
+def test_what_is_shown_stands_in_one_table_whether_it_was_stated_first_or_not(monkeypatch):
+    monkeypatch.setattr(full_size, "CONFIRMATIONS", ())
+    said = ["ends no lower", "earns no less over the last quarter", "earns more over the training"]
+    words = "; ".join(f"{x} than PPO" for x in said)
+    lines = shown(report(10))
+    assert lines[2].startswith(
+        "**By all pairs together, and not stated first, this is shown:** PPO"
+    )
+    assert lines[-3:-1] == [
+        f"| hopper: dpo |  | {words} |  |",
+        f"| hopper: lpo-pendulum |  |  | {words} |",
+    ]
+    level = report(10)
+    agents = level["environments"]["hopper"]["agents"]
+    agents["dpo"] = agents["lpo-pendulum"] = {
+        seed: agents["ppo"][str(9 - int(seed))] for seed in agents["ppo"]
+    }
+    page = module.EXPERIMENT.page(level)
+    assert "**Not shown: no objective is shown to differ from PPO's clip, by 10 agents" in page
+    assert "stated first, and confirmed" not in page
 
 
 def test_a_claim_stated_of_another_rate_is_of_its_agents_alone(monkeypatch):
@@ -150,8 +177,10 @@ def test_a_confirmation_has_a_reference_of_its_own(monkeypatch):
     for agents in made["environments"]["hopper"]["agents"]["lpo-pendulum"].values():
         agents["returns"] = "0 50 9000"
     page = module.EXPERIMENT.page(made)
-    said = "Confirmed: lpo-pendulum on hopper earns no less over the last quarter than dpo."
-    assert f"**{said} " in page and "** PPO has" in page
+    said = "| hopper: lpo-pendulum | earns no less over the last quarter than dpo | "
+    assert sum(line.startswith(said) for line in shown(made)) == 1
+    verdict = "**In part: of the claims that were stated first 1 of 1 are confirmed.** PPO has"
+    assert verdict in page
 
 
 def test_a_lead_that_is_asked_of_one_objective_alone_has_no_margin_and_stands_beside_what_is_asked_of_all(
@@ -164,9 +193,11 @@ def test_a_lead_that_is_asked_of_one_objective_alone_has_no_margin_and_stands_be
         agents["returns"] = "0 50 9000"
     ((_, _, judged),) = locomotion_claims.confirmed(made)
     assert judged.claim.least == 0 and judged.estimate.low > 0
-    assert "lpo-pendulum on hopper earns more over the last quarter than PPO." in (
-        module.EXPERIMENT.page(made)
-    )
+    (row,) = [line for line in shown(made) if line.startswith("| hopper: lpo-pendulum | ")]
+    # Who earns more earns no less, which is not said again.
+    stated, pooled = row.split(" | ")[1:3]
+    assert stated == "earns more over the last quarter than PPO"
+    assert "ends no lower" in pooled and "last quarter" not in pooled
     texts = {claim.text for claim in locomotion_claims.claims(made)}
     assert not any("more over the last quarter" in text for text in texts)
 
