@@ -4,7 +4,8 @@
 
 PPO has each environment's own setting but for the learning rate. For every objective apart agents on seeds that report
 nothing choose the rate, and others are reported. What --out holds is not measured again: the same command goes on
-where it was, and with other environments or objectives adds to it.
+where it was, and with other environments or objectives adds to it. Where choices fall on an end of the rates,
+`--beyond` adds some to choose from.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -53,6 +54,8 @@ class Options(Keeping):
     """as `lpo evaluate` takes them; all are compared with PPO's clip"""
     rates: tuple[float, ...] = (0.0001, 0.0003, 0.001, 0.003, 0.01)
     """learning rates"""
+    beyond: tuple[float, ...] = ()
+    """others that may be chosen, and are in no comparison at large or small ones: for choices at an end of the rates"""
     agents: int = 20
     """that are reported, of each objective at each rate"""
     choosing: int = 10
@@ -72,6 +75,9 @@ class Options(Keeping):
 def parts(options: Options, report: dict[str, Any]) -> Iterator[Part]:
     """The agents of one objective at one rate in one environment: those that choose, and those that are reported."""
     settled(report, agents=options.agents, choosing=options.choosing, rates=options.rates)
+    if options.beyond:
+        known = {*report.get("beyond", ()), *options.beyond} - {*options.rates}
+        report["beyond"] = sorted(known)
     names = tuple(dict.fromkeys((*REFERENCES, *options.objectives)))
     loaded = [load_objective(name) for name in names]
     check_names(loaded)  # that nobody waits for a mistake
@@ -83,7 +89,7 @@ def parts(options: Options, report: dict[str, Any]) -> Iterator[Part]:
     specs = {
         (environment, rate): ppo_spec(environment, hyperparameters={"learning_rate": rate})
         for environment in options.environments
-        for rate in options.rates
+        for rate in dict.fromkeys((*options.rates, *options.beyond))
     }
     for (environment, rate), spec in specs.items():
         for name in names:
@@ -157,10 +163,9 @@ def _asked(report: Report) -> dict[str, Rates]:
 
     def those(wanted: Callable[[float], bool]) -> Rates:
         # The same for all objectives.
+        asked = set(filter(wanted, report["rates"]))
         return {
-            place: dict.fromkeys(
-                of_it, tuple(filter(wanted, sorted(set.intersection(*map(set, of_it.values())))))
-            )
+            place: dict.fromkeys(of_it, sorted(asked.intersection(*of_it.values())))
             for place, of_it in scored.items()
         }
 
@@ -322,6 +327,8 @@ def facts(report: Report) -> dict[str, Any]:
         "at_the_ends": at_the_ends(report),
         "more": _shown(judged, HOLDS),
         "less": {where: names for where, names in _shown(judged, FAILS).items() if names},
+        "tried": sorted({*report["rates"], *report.get("beyond", ())}),
+        "beyond": report.get("beyond", []),
         "own": {place: entry["own"] for place, entry in entries.items()},
         "steps": {place: entry["steps"] for place, entry in entries.items()},
         "failed": lost(entries),

@@ -157,6 +157,7 @@ ENVIRONMENT.filters |= {
     "on": on,
     "percent": percent,
     "plain": plain,
+    "positional": lambda x: np.format_float_positional(x, trim="-"),
     "said": said,
     "short": lambda x: typeset(f"{x:g}"),
     "spaced": lambda x: f"{x:,}".replace(",", " "),

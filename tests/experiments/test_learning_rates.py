@@ -162,6 +162,35 @@ def test_a_rate_at_an_end_of_those_that_were_tried_is_told(report):
     assert "0.01 on Acrobot-v1 by dpo and lpo-pendulum" in page_of(report)
 
 
+def test_rates_beyond_the_others_may_be_chosen_and_are_in_no_other_claim(report):
+    before = judged(report)
+    best = "dpo earns more than ppo, each at the rate chosen for it, over 3 environments"
+    for place in report["environments"].values():
+        for role in (module.CHOOSING, module.REPORTED):
+            for name, of_it in place[role].items():
+                # Where it is not best at 0.0003 the clip is best at the smallest of all.
+                at = {"ppo": "0.01", "dpo": "0.0003", "lpo-pendulum": "0.0003"}[name]
+                of_it["1e-05"] = of_it[at]
+            place[role]["ppo"]["1e-05"] = place[role]["lpo-pendulum"]["0.003"]
+        place[module.CHOOSING]["ppo"]["1e-05"] = place[module.CHOOSING]["lpo-pendulum"]["0.01"]
+    report["beyond"] = [1e-05]
+    assert module.chosen(report)["Acrobot-v1"] == {
+        "ppo": [1e-05],
+        "dpo": [0.01],
+        "lpo-pendulum": [0.01],
+    }
+    after = judged(report)
+    assert before[best][0] == claims.HOLDS and after[best] == (claims.FAILS, -0.13)
+    at_rates = {text: x for text, x in before.items() if " at rates of " in text}
+    assert len(at_rates) == 4 and at_rates.items() <= after.items()
+    page = page_of(report)
+    assert "0.00001: 0." in page and "0.00001 on Acrobot-v1 by ppo" in page
+    assert (
+        "| rates | 0.0003, 0.003, 0.01; to choose from and in nothing else 0.00001, added" in page
+    )
+    assert "`python -m experiments learning_rates --beyond 0.00001`" in page
+
+
 def test_an_objective_that_an_environment_lacks_is_drawn_and_named_where_it_is(report):
     for role in (module.CHOOSING, module.REPORTED):
         for name in ("dpo", "lpo-pendulum"):
@@ -239,6 +268,11 @@ def test_a_measurement_that_was_cut_off_goes_on_and_keeps_to_its_agents(
     assert asked == [("dpo", 0.01, seeds)]
     kept = json.loads(out.read_text())["environments"]["Pendulum-v1"]
     assert kept[module.REPORTED]["dpo"]["0.01"] == " ".join(str(seed % 7) for seed in seeds[2:])
+    asked.clear()
+    further = [*flags, "--beyond", "0.03", "0.01"]
+    assert module.EXPERIMENT.main(further) == module.EXPERIMENT.main(flags) == 0
+    assert asked == [("ppo", 0.03, seeds), ("dpo", 0.03, seeds)]
+    assert json.loads(out.read_text())["beyond"] == [0.03]
     assert module.EXPERIMENT.main([*flags, "--agents=4"]) == 2
     assert "measured with agents 3, and 4 is asked for" in capsys.readouterr().err
 
