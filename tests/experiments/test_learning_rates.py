@@ -160,6 +160,14 @@ def test_a_rate_at_an_end_of_those_that_were_tried_is_told(report):
         **{(place, 0.01): ["dpo", "lpo-pendulum"] for place in report["environments"]},
     }
     assert "0.01 on Acrobot-v1 by dpo and lpo-pendulum" in page_of(report)
+    for role in (module.CHOOSING, module.REPORTED):
+        for place in report["environments"].values():
+            for of_it in place[role].values():
+                of_it |= dict.fromkeys(("1e-05", "0.1"), of_it["0.0003"])
+            place[role]["ppo"] |= dict.fromkeys(("1e-05", "0.1"), place[role]["dpo"]["0.0003"])
+    report["beyond"] = [1e-05, 0.1]
+    assert module.at_the_ends(report) == {}
+    assert "No choice is at an end of the rates that were tried." in page_of(report)
 
 
 def test_rates_beyond_the_others_may_be_chosen_and_are_in_no_other_claim(report):
