@@ -20,6 +20,7 @@ from jax.typing import ArrayLike
 
 from scb.agents.agent import Agent, evaluated_after
 from scb.agents.spec import AgentSpec
+from scb.environments.alike import representative
 from scb.environments.registry import environment_spec
 from scb.errors import UserError, count_at_least, one_of
 from scb.evaluation import Episodes
@@ -376,13 +377,21 @@ def _program_of(
 ) -> tuple[Callable[..., Any], list[Any]]:
     """The program that trains and judges, and the arrays in the parameters, which it takes after the agents.
 
-    Arrays (a bandit's weights) are arguments, so that bandits which differ in them share a program.
+    Arrays (a bandit's weights) are arguments, so that parameters which differ in them share a program; and so do
+    environments that are alike.
     """
     leaves, structure = jax.tree.flatten(params)
     arrays = [x if isinstance(x, jax.Array | np.ndarray) else None for x in leaves]
     numbers = tuple(x if a is None else None for x, a in zip(leaves, arrays, strict=True))
-    made_of = tuple(getattr(agent, field.name) for field in fields(agent))
-    program = _program(type(agent), made_of, structure, numbers, judge_env, *static)
+    made_of = (getattr(agent, field.name) for field in fields(agent))
+    program = _program(
+        type(agent),
+        tuple(representative(x) if x is agent.env else x for x in made_of),
+        structure,
+        numbers,
+        representative(judge_env),
+        *static,
+    )
     return program, [x for x in arrays if x is not None]
 
 
