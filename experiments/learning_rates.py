@@ -319,7 +319,7 @@ def facts(report: Report) -> dict[str, Any]:
         "at_home": at_home(report),
         "without_one": less,
         "leaning": {
-            f"{x.claim.of.name}, {x.claim.of.words}": on
+            f"{x.claim.of.name} over {x.claim.of.other}, {x.claim.of.words}": on
             for x, without in less
             if x.outcome == HOLDS
             and (on := [place for place, lead in without.items() if lead.side() <= 0])

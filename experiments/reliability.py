@@ -39,7 +39,7 @@ from scb.environments import zoo
 from scb.environments.registry import environment_spec
 from scb.errors import UserError, at_least, one_of
 from scb.gymnasium import SyntheticEnv
-from scb.rows import Rows
+from scb.rows import Rows, pivot
 
 SMALL = [
     "--population-size=4",
@@ -275,21 +275,31 @@ def targets(
 
         yield f"configuration of {command.program}", in_config, resume
 
-    rows = folder / "rows.jsonl"
+    rows, whole = folder / "rows.jsonl", folder / "whole.jsonl"
+    agent = {"environment": "x", "backend": None, "trained_in": "y", "algorithm": "ppo"}
+    columns = {**agent, "objective": None}
+    configuration = {"agent": {"config": 1}, "objective": None}
+    measured = Rows(whole).cell(columns, configuration, 2)
+    for number in range(2):
+        earned = {"actions": "mode", "return": 1.0}
+        measured.add((1, number), [{"step": step, **earned} for step in (0, 10)])
 
     def in_rows(rng: random.Random) -> str:
-        row = {"seed": 1, "agent": 0, "configuration": "abc", "return": 1.0, "step": 10}
-        lines, said = mutated([row, row | {"agent": 1}], rng)
+        lines, said = mutated([*map(json.loads, whole.read_text().splitlines())], rng)
         listed = lines if isinstance(lines, list) else [lines]
         text = "".join(json.dumps(x) + "\n" for x in listed)
-        described, also = mutated({"abc": {"agent": {"config": 1}}}, rng)
+        described, also = json.loads(whole.with_suffix(".json").read_text()), "none"
+        if rng.random() < 0.5:  # else few are read as far as the rows
+            described, also = mutated(described, rng)
         cut = rng.randrange(len(text) + 1) if rng.random() < 0.3 else len(text)
         rows.write_text(text[:cut])
         rows.with_suffix(".json").write_text(json.dumps(described))
         return f"{said}, {also}, cut at {cut}"
 
     def use_rows() -> None:
-        Rows(rows).cell({"environment": "x"}, {"agent": {"config": 2}}, 1)
+        found = Rows(rows).cell(columns, configuration, 2)
+        for of_it in found.done.values():
+            pivot(of_it, "step")
 
     yield "rows of a measurement", in_rows, use_rows
 

@@ -200,11 +200,12 @@ def difference(
 ) -> Callable[..., Estimate] | Estimate:
     """How far the searches of one kind end above those of another, as evidence of a claim.
 
-    There is no interval of fewer than five searches, and none where one of the first failed, which is worse
-    than any return.
+    There is no interval of fewer than five searches, and none where one of either failed, which is worse than any
+    return: what the others earn then says too little for it or too much.
     """
     above, below = last(one), last(other)
-    if len(above) == len(one) and min(len(above), len(below)) >= ENOUGH:
+    whole = len(above) == len(one) and len(below) == len(other)
+    if whole and min(len(above), len(below)) >= ENOUGH:
         return partial(
             stratified_estimate,
             [above],

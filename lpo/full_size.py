@@ -69,7 +69,7 @@ CONFIRMATIONS = (
         "hopper",
         "ta-lpo",
         reporting(30, offset=20),
-        suggested="10, over the last quarter +204 [\u2212131, 568], which ten more took back",
+        suggested="10, over the last quarter +204 [\u2212131, 568], corrected, which ten more took back",
     ),
     Confirmation(
         "hopper",
@@ -80,10 +80,18 @@ CONFIRMATIONS = (
         suggested="10, +167",
     ),
     Confirmation(
-        "hopper", "ta-lpo", reporting(60, offset=50), "area", suggested="50, +91 [\u221213, 216]"
+        "hopper",
+        "ta-lpo",
+        reporting(60, offset=50),
+        "area",
+        suggested="50, +91 [\u221213, 216], corrected",
     ),
     Confirmation(
-        "hopper", "ta-lpo", reporting(40, offset=110), "early", suggested="110, +173 [60, 286]"
+        "hopper",
+        "ta-lpo",
+        reporting(40, offset=110),
+        "early",
+        suggested="110, +173 [60, 286], corrected",
     ),
     Confirmation(
         "hopper",
@@ -116,7 +124,7 @@ CONFIRMATIONS = (
         reporting(60),
         "area",
         known=REFERENCE,
-        suggested="4 that report nothing, +110",
+        suggested="4 that report nothing and were not kept, +110",
     ),
     Confirmation(
         "hopper",

@@ -354,8 +354,11 @@ class BanditDiscovery:
             results[f"fitness/{OPTIMAL_POLICY}"] = self._optimal_return(
                 candidate, key, self.place.params
             )
-        # As in the search an optimal policy counts as one of a candidate's agents.
-        weights = [self.config.agents_per_candidate] * len(self.specs) + [1]
+        # As in the search, where an optimal policy counts as one of the agents that a generation trains: in the mode
+        # sequential these are of one algorithm.
+        number, sequential = self.config.agents_per_candidate, self.config.mode == "sequential"
+        each = number / len(self.specs) if sequential else number
+        weights = [each] * len(self.specs) + [1]
         worth = jnp.average(
             jnp.stack(list(results.values())), weights=jnp.array(weights[: len(results)])
         )

@@ -21,11 +21,22 @@ from scb.files import make_folder, write_json, write_text
 Row = dict[str, Any]
 _DIGEST = re.compile("[0-9a-f]{12}")  # of a configuration
 _AGENT = ("environment", "backend", "trained_in", "algorithm", "objective", "seed", "agent")
+# All other columns are numbers, or None where one is not known.
+_WHOLE = ("seed", "agent", "step")
+_TEXTS = (*_AGENT[:5], "actions", "configuration")
 
 
 def _row(line: str, where: str) -> Row:
     try:
-        return dict(json.loads(line))
+        row = dict(json.loads(line))
+        for name, value in row.items():
+            if name in _TEXTS:
+                right = value is None or isinstance(value, str)
+            else:
+                right = isinstance(value, int if name in _WHOLE else int | float | None)
+            if not right or isinstance(value, bool):
+                raise ValueError(f"{name} is {value!r}")
+        return row
     except (TypeError, ValueError) as error:
         raise UserError(
             f"{where}, is damaged ({error}): take the line out, and its agent is measured again, or choose another "
@@ -66,7 +77,7 @@ class Rows:
             for number, line in enumerate(lines[:-1], 1):
                 self.rows.append(_row(line, f"{self.path}, line {number}"))
             complete = all(
-                row.keys() >= {*_AGENT, "configuration"}
+                row.keys() >= {*_AGENT, "step", "configuration"}
                 and row["configuration"] in self._configurations
                 for row in self.rows
             )
@@ -126,11 +137,18 @@ class Rows:
         done: dict[tuple[int, int], list[Row]] = {}
         for row in there:
             done.setdefault((row["seed"], row["agent"]), []).append(row)
-        if other := {name: of_it for name, of_it in done.items() if len(of_it) != number}:
+        points = {
+            name: {(row["step"], row.get("actions")): row for row in reversed(of_it)}
+            for name, of_it in done.items()
+        }
+        if other := {
+            name: of_it
+            for name, of_it in done.items()
+            if not len(of_it) == len(points[name]) == number
+        }:
             dropped = set()
             for name, of_it in other.items():
-                first = {(row.get("step"), row.get("actions")): row for row in reversed(of_it)}
-                kept = [row for row in of_it if row is first[row.get("step"), row.get("actions")]]
+                kept = [x for x in of_it if x is points[name][x["step"], x.get("actions")]]
                 done[name] = kept if len(kept) == number else []
                 dropped |= {id(row) for row in of_it} - {id(row) for row in done[name]}
             done = {name: of_it for name, of_it in done.items() if of_it}

@@ -156,6 +156,12 @@ def test_a_line_says_how_many_of_its_searches_failed():
     assert outcomes(found)[0] == "undecided"
     said = ablations.EXPERIMENT.block("body", found)
     assert "| TI | −100.0 [−100.0, −100.0] (1 of 5 failed) |" in said
+    # And where T's others are better than all of TI's, so is one that failed.
+    found = report(**{name_of("T", "normal", NONE): -100.0})
+    assert outcomes(found)[0] == "does not hold"
+    for environment in found["environments"].values():
+        environment[name_of("T", "normal", NONE)]["3"]["fitness"][-1] = None
+    assert outcomes(found)[0] == "undecided"
 
 
 @pytest.mark.parametrize(

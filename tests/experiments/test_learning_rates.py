@@ -147,7 +147,9 @@ def test_what_is_decided_over_several_is_told_without_each_of_them(report):
     for place in ("Acrobot-v1", "MountainCar-v0"):
         reported = report["environments"][place][module.REPORTED]
         reported["ppo"]["0.003"] = reported["dpo"]["0.01"]
-    assert f"not shown without one of them: dpo, {best}, without Pendulum-v1." in page_of(report)
+    assert f"not shown without one of them: dpo over ppo, {best}, without Pendulum-v1." in page_of(
+        report
+    )
 
 
 def page_of(report):

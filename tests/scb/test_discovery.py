@@ -327,6 +327,19 @@ def test_in_the_mode_sequential_the_others_are_not_run():
 
 
 @pytest.mark.slow
+def test_an_optimal_policy_counts_in_a_judgement_as_in_the_generations_of_a_search(discovered):
+    _, outcome = discovered
+    config = replace(ALL, agents_per_candidate=3, optimal_policy_episodes=2)
+    # Beside three agents of each of two algorithms, and beside three of the one whose turn it is.
+    for mode, share in (("all", 1 / 7), ("sequential", 1 / 4)):
+        problem = BanditDiscovery(replace(config, mode=mode))
+        judged = jax.jit(problem.evaluate_mean)(outcome.mean, jax.random.key(5))
+        agents = (judged["fitness/ppo"] + judged["fitness/dqn"]) / 2
+        expected = (1 - share) * agents + share * judged["fitness/optimal policy"]
+        assert float(judged["fitness"]) == pytest.approx(float(expected), rel=1e-5)
+
+
+@pytest.mark.slow
 def test_in_the_mode_sequential_the_mean_is_judged_by_every_algorithm(trained_in_turns):
     judged = trained_in_turns[2].metrics[0]
     both = judged["mean/fitness/ppo"] + judged["mean/fitness/dqn"]

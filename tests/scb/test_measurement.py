@@ -476,3 +476,39 @@ def test_rows_in_memory_refuse_another_configuration_too():
 def test_seeds_of_any_kind_become_pythons_integers(seeds):
     found = check_seeds(seeds)
     assert found == [0, 1] and {type(x) for x in found} == {int}
+
+
+@pytest.mark.parametrize(
+    ("column", "value"),
+    [
+        ("seed", [0]),
+        ("agent", {"x": 1}),
+        ("step", 1.5),
+        ("step", True),
+        ("return", "much"),
+        ("length", [1.0]),
+        ("actions", 3),
+        ("configuration", ["a"]),
+    ],
+)
+def test_a_column_of_another_kind_is_a_damaged_row(copy, column, value):
+    lines = copy.read_text().splitlines(keepends=True)
+    row = json.loads(lines[1]) | {column: value}
+    copy.write_text("".join([lines[0], json.dumps(row) + "\n", *lines[2:]]))
+    with pytest.raises(UserError, match=rf"line 2, is damaged \({column} is .*: take the line out"):
+        Rows(copy)
+
+
+def test_a_point_that_is_there_twice_in_place_of_another_is_measured_again(copy, file, measured):
+    lines = copy.read_text().splitlines(keepends=True)
+    copy.write_text("".join([lines[1], *lines[1:]]))
+    points = [(row["seed"], row["step"], row["objective"]) for row in measured(copy)]
+    assert points == [(row["seed"], row["step"], row["objective"]) for row in file[1]]
+
+
+def test_rows_without_their_step_are_refused(copy):
+    lines = copy.read_text().splitlines(keepends=True)
+    row = {k: x for k, x in json.loads(lines[0]).items() if k != "step"}
+    copy.write_text("".join([json.dumps(row) + "\n", *lines[1:]]))
+    with pytest.raises(UserError, match="holds no rows of a measurement"):
+        Rows(copy)
