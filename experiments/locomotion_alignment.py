@@ -24,7 +24,7 @@ from experiments.harness import Experiment
 from experiments.parts import InParts, Keys, Part
 from experiments.reports import Report, forget_other, same_objectives, settled
 from lpo.alignment import Alignment, Regime, alignment, regime_fitness
-from lpo.comparison import LearningCurves, compare
+from lpo.comparison import LearningCurves, compare, ppo_spec
 from lpo.fitness import FITNESSES, LABELS
 from lpo.full_size import full_size, validated
 from lpo.objectives import load_objective
@@ -34,7 +34,7 @@ from scb.environments.registry import environment_spec
 from scb.environments.zoo import bandit_metadata
 from scb.errors import UserError, at_least
 from scb.files import packed, unpacked_row
-from scb.statistics import correlation_text, halves_agree, iqm, typeset
+from scb.statistics import DECIDING, correlation_text, halves_agree, iqm, typeset
 
 PENDULUM, CARTPOLE = "Pendulum-v1", "CartPole-v1"
 FIRST_SEED = CONFIRMATION_SEED  # on which no regime was chosen
@@ -43,7 +43,7 @@ REGIMES: dict[str, dict[str, Any]] = {
     "its own": {},
     "its own, noise of 2": {"reward_noise": 2.0},
     "its own, without noise": {"reward_noise": 0.0},
-    "its own, a tenth of the batches": {"iterations": 512},
+    "its own, a tenth of the batches": {"iterations": 1 / 10},  # a share of the environment's own
     "Pendulum's": {"bandit": environment_spec(PENDULUM).bandit},
     "Pendulum's, without noise": {
         "bandit": environment_spec(PENDULUM).bandit,
@@ -86,7 +86,12 @@ class Options:
 def regime(environment: str, name: str) -> Regime:
     """One of `REGIMES`, for an environment."""
     own: dict[str, Any] = {"bandit": environment_spec(environment).bandit}
-    return Regime(**(own | REGIMES[name]))
+    other = dict(REGIMES[name])
+    if "iterations" in other:
+        other["iterations"] = round(
+            other["iterations"] * ppo_spec(environment).config.num_iterations
+        )
+    return Regime(**(own | other))
 
 
 def parts(options: Options, report: dict[str, Any]) -> Iterator[Part]:
@@ -238,6 +243,7 @@ def facts(report: Report) -> dict[str, Any]:
             if of["area"]
         },
         "attainable": attainable,
+        "deciding": DECIDING,
         "labels": LABELS,
         "judged_by": FITNESS,
         "outcomes": OUTCOMES,
@@ -269,6 +275,7 @@ def _section(
             name: {of: float(iqm(getattr(curve, of))) for of in OUTCOMES} | {"n": len(curve.seeds)}
             for name, curve in curves.items()
         },
+        "fewest": min(len(curve.seeds) for curve in curves.values()),
         "agree": {outcome: _agree(curves, outcome) for outcome in OUTCOMES},
         "elsewhere": {name: [_text(x) for x in of_it.values()] for name, of_it in others.items()},
         "elsewhere_shown": [name for name, of_it in others.items() if of_it["area"].shown],

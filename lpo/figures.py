@@ -183,7 +183,8 @@ def diagnosis(curves: "Sequence[LearningCurves]") -> Figure:
     """What an iteration does to the policy along the training: mean over agents, with 95 % intervals.
 
     Args:
-      curves: of one environment, one an objective; agents that were not diagnosed are left out.
+      curves: of one environment, one an objective; agents that were not diagnosed are left out. The last point is
+        of iterations beyond the training: where the learning rate has fallen to zero there it is left out too.
 
     Raises:
       UserError: an objective has no diagnosed agent.
@@ -200,8 +201,10 @@ def diagnosis(curves: "Sequence[LearningCurves]") -> Figure:
                     )
                 values = curve.diagnosis[name] if curve.diagnosis else np.empty((0, 0))
                 known = values[~np.isnan(values).any(axis=1)]
-                points = [estimate(column, np.mean) for column in known.T]
-                estimate_curve(axes, curve.steps, points, style[curve.objective], curve.objective)
+                annealed = curve.hyperparameters.get("anneal_learning_rate", False)
+                steps = curve.steps[:-1] if annealed else curve.steps
+                points = [estimate(column, np.mean) for column in known.T[: len(steps)]]
+                estimate_curve(axes, steps, points, style[curve.objective], curve.objective)
             axes.set_title(label, fontsize=10, weight="normal")
             axes.xaxis.set_major_formatter(EngFormatter(sep=""))
             axes.margins(x=0.02)

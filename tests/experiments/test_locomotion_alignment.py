@@ -81,6 +81,13 @@ def test_a_regime_that_ranks_as_the_environment_is_told_from_one_that_does_not(
         assert found[outcome]["Pendulum's"][module.FITNESS].spearman == pytest.approx(-sign)
     assert "Of 8 regimes 4 are shown to rank 4 objectives" in page
     assert "its own, a tenth of the batches" in page.split("\n")[2]
+    assert "fewer than 10 agents of each decide nothing" in page
+    # Of the 5120 on Hopper, and of the swimmer's 640.
+    found = [
+        module.regime(x, "its own, a tenth of the batches").iterations
+        for x in ("hopper", "swimmer")
+    ]
+    assert found == [512, 64]
     assert "as the other half does with 1.00 over the training" in page
     assert "| dpo | 4 | 4 | \N{MINUS SIGN}4 |" in page
     regimes = [regime for regime, *_ in trained]

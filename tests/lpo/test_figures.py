@@ -132,6 +132,10 @@ def test_only_diagnosed_agents_are_drawn_and_an_objective_without_any_is_refused
         np.testing.assert_allclose(line(axes, "ppo").get_ydata(), [0.2, 0.3, 0.6])
         assert len(bands(axes)) == 1
     assert kl.get_yscale() == "log" and made.diagnosed == 2
+    # Beyond a training whose learning rate has fallen to zero an iteration does nothing.
+    falling = replace(made, hyperparameters={"anneal_learning_rate": True})
+    for axes in figures.diagnosis([falling]).axes[:-1]:
+        np.testing.assert_allclose(line(axes, "ppo").get_ydata(), [0.2, 0.3])
     with pytest.raises(UserError, match="no agent of dpo was diagnosed"):
         figures.diagnosis([made, curve("dpo", returns)])
 
