@@ -195,7 +195,8 @@ def facts(report: Report) -> dict[str, Any]:
             label = {"environment": environment, "kind": kind, "label": f"{environment}, {kind}"}
             come = way(*(estimates[name] for name in ACTING))
             rows.append({**label, **entry[kind], **estimates, "way": come, "dots": dots})
-    return {"rows": rows}
+    left = [row["clipped"].value / row["apart"].value for row in rows]
+    return {"rows": rows, "takes_most": rows[int(np.argmin(left))]["label"]}
 
 
 def draw(report: Mapping[str, Any]) -> Figure:

@@ -14,7 +14,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -30,7 +30,6 @@ from lpo.meta_training import MetaTraining
 from scb import processes
 from scb.discovery import BanditDiscovery, DiscoveryConfig
 from scb.errors import UserError, at_least
-from scb.evolution import EvolutionConfig
 from scb.keys import root_key
 from scb.runs import log_lines
 from scb.stopwatch import Stopwatch
@@ -154,7 +153,8 @@ def _strategy(kind: str, population: int) -> dict[str, Any]:
         else BanditDiscovery(DiscoveryConfig("Pendulum-v1", init="random"))
     )
     solution = problem.initial_solution(root_key(0))
-    config = EvolutionConfig(population_size=population)
+    # With the strategy that each of both searches has.
+    config = replace(problem.config.evolution, population_size=population)
     strategy = strategy_for(config, solution)
     state = strategy.start(root_key(1), solution)
     fitness, watch, seconds = np.arange(population, dtype=np.float32), Stopwatch(), []

@@ -79,6 +79,15 @@ def test_the_page_tells_errors_of_all_from_an_agents_own():
         in page
     )
     assert "beyond an end: 95 % in halfcheetah, published." in page
+    assert "the clip takes a part away, most where most of what agents would do" in page
+    elsewhere = {"hopper": {"ours": entry(0.2, 0.5, 0.04, returns=250, together=500, best=510)}}
+    page_of_it = saturation.EXPERIMENT.page(
+        {**report, "environments": {**report["environments"], **elsewhere}}
+    )
+    assert (
+        "a part away, most in hopper, ours; most of what agents would do lies beyond an end: 95 % in halfcheetah"
+        in page_of_it
+    )
     assert (
         "| hopper, ours | 250 [210, 290] | 500 [460, 540] | 510 [470, 550] | 0.96 [0.65, 1.39] | 0.20 [0.16, 0.24] | "
         "0.50 [0.46, 0.54] | 0.40 [0.36, 0.44] | 2.0 of 6 |" in page
