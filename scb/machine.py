@@ -13,7 +13,11 @@ _PACKAGES = ("jax", "jaxlib", "flax", "optax", "evosax", "gymnax", "brax", "nump
 
 
 # What JAX is told about numbers, and how it is told nothing.
-_ARITHMETIC = {"jax_enable_x64": False, "jax_default_prng_impl": "threefry2x32"}
+_ARITHMETIC = {
+    "jax_enable_x64": False,
+    "jax_default_prng_impl": "threefry2x32",
+    "jax_threefry_partitionable": True,
+}
 
 
 def arithmetic() -> dict[str, str]:

@@ -19,6 +19,8 @@ def test_arithmetic_is_told_where_it_is_not_the_default():
     assert arithmetic() == {}
     with jax.enable_x64(True), jax.default_prng_impl("rbg"):
         assert arithmetic() == {"jax_enable_x64": "True", "jax_default_prng_impl": "rbg"}
+    with jax.threefry_partitionable(False):
+        assert arithmetic() == {"jax_threefry_partitionable": "False"}
 
 
 def test_the_machine_is_described_without_saying_whose_it_is():
